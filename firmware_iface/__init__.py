@@ -1,0 +1,8 @@
+"""Devices of a holographic headset, and virtual ones with a simulated bench behind them.
+
+At most numpy is imported here; vendor libraries are imported when a device is opened.
+"""
+
+from .errors import InputError
+
+__all__ = ["InputError"]

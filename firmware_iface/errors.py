@@ -1,0 +1,23 @@
+"""The project's one error for bad input."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class InputError(ValueError):
+    """Input that cannot be used: one sentence that says what is wrong, where, and what to change."""
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """A hint that names the known word nearest to `word`, or lists all known words when none is near.
+
+    word : str, what was written
+    known : iterable of str, what could have been written
+    """
+    names = list(known)
+    close = difflib.get_close_matches(str(word), names, n=1, cutoff=0.5)
+    if close:
+        return f"did you mean '{close[0]}'?"
+    return "known are " + ", ".join(names)

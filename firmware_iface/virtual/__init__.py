@@ -1,0 +1,22 @@
+"""A virtual headset: devices with a simulated bench behind them, whose defects are hidden."""
+
+from .defects import CATALOGUE_KINDS, DEFECT_KINDS, Defect, make_defect
+from .description import BenchDescription, load_bench, read_bench
+from .headset import VirtualCamera, VirtualHeadset, VirtualLasers, VirtualPanel, open_headset
+from .named import named_benches
+
+__all__ = [
+    "CATALOGUE_KINDS",
+    "DEFECT_KINDS",
+    "BenchDescription",
+    "Defect",
+    "VirtualCamera",
+    "VirtualHeadset",
+    "VirtualLasers",
+    "VirtualPanel",
+    "load_bench",
+    "make_defect",
+    "named_benches",
+    "open_headset",
+    "read_bench",
+]

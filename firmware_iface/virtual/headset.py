@@ -1,0 +1,245 @@
+"""A virtual headset: a panel, lasers and a camera in front of a simulated bench.
+
+headset = open_headset("virtual:demo", seed=1)
+headset.lasers.set_power("green", 1.0)
+headset.panel.show(gray)
+counts = headset.camera.capture()
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from . import defects, oracle
+from .description import BenchDescription, load_bench
+from .optics import BenchOptics
+from .sensor import Drift, Integrator, Sensor
+
+Gray = NDArray[np.uint8]
+
+
+class VirtualPanel:
+    """The phase panel. It shows gray 0 until told otherwise.
+
+    shape : (H, W), pixels
+    """
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self.shape = shape
+        self._gray: Gray = np.zeros(shape, np.uint8)
+
+    @property
+    def gray(self) -> Gray:
+        """What is shown, uint8 [H, W]; a copy."""
+        return self._gray.copy()
+
+    def show(self, gray: NDArray[np.generic]) -> None:
+        """Show gray levels, uint8 [H, W]; raises InputError for another type or size."""
+        self._gray = checked_gray(gray, self.shape).copy()
+
+
+class VirtualLasers:
+    """The lasers, all off at first.
+
+    channels : names
+    """
+
+    def __init__(self, channels: tuple[str, ...]) -> None:
+        self.channels = channels
+        self._power = dict.fromkeys(channels, 0.0)
+
+    def set_power(self, channel: str, fraction: float) -> None:
+        """Set a laser to a fraction of full power, 0 to 1; raises InputError where either is unknown."""
+        if channel not in self._power:
+            raise InputError(f"there is no laser '{channel}'; use one of {', '.join(self.channels)}.")
+        if not (isinstance(fraction, int | float | np.floating) and 0 <= fraction <= 1):
+            raise InputError(f"power {fraction!r} of laser '{channel}' is not a fraction; give 0 to 1.")
+        self._power[channel] = float(fraction)
+
+    def power(self, channel: str) -> float:
+        """A laser's power, fraction of full."""
+        if channel not in self._power:
+            raise InputError(f"there is no laser '{channel}'; use one of {', '.join(self.channels)}.")
+        return self._power[channel]
+
+    def off(self) -> None:
+        """Switch every laser off."""
+        self._power = dict.fromkeys(self._power, 0.0)
+
+
+class VirtualCamera:
+    """The camera; 10 ms at first.
+
+    shape : (h, w), pixels
+    bit_depth : bits of a count
+    """
+
+    def __init__(
+        self, shape: tuple[int, int], bit_depth: int, take: Callable[[], NDArray[np.uint16]]
+    ) -> None:
+        self.shape, self.bit_depth = shape, bit_depth
+        self._take = take
+        self._exposure_ms = 10.0
+
+    @property
+    def exposure_ms(self) -> float:
+        """Exposure time, ms; setting it raises InputError unless above 0 and at most 10 s."""
+        return self._exposure_ms
+
+    @exposure_ms.setter
+    def exposure_ms(self, value: float) -> None:
+        if not (isinstance(value, int | float | np.floating) and 0 < value <= 10000):
+            raise InputError(f"exposure {value!r} ms is out of range; give more than 0 and at most 10000.")
+        self._exposure_ms = float(value)
+
+    def capture(self) -> NDArray[np.uint16]:
+        """One picture, uint16 counts [h, w], black level included."""
+        return self._take()
+
+
+class VirtualHeadset:
+    """All devices of one headset and the simulated bench they stand on.
+
+    description : the bench
+    seed : fixes noise and drift; a capture's noise depends on the seed and on how many captures came before
+
+    Attributes: panel, lasers, camera, plane_mm (where the camera focuses), time_s (clock; runs on with each
+    capture), captures (how many were taken). The focus is the bench's distance at first.
+    """
+
+    def __init__(self, description: BenchDescription, seed: int = 0) -> None:
+        self.description, self.seed = description, seed
+        self.panel = VirtualPanel((description.panel.height, description.panel.width))
+        self.lasers = VirtualLasers(tuple(c.name for c in description.channels))
+        shape = (description.camera.height, description.camera.width)
+        self.camera = VirtualCamera(shape, description.camera.bit_depth, self._capture)
+        self.plane_mm = description.propagation.distance_mm
+        self.time_s = 0.0
+        self.captures = 0
+        self._optics = BenchOptics(description)
+        self._sensor = Sensor(description)
+        self._drift = Drift(description.defect(defects.LaserDrift), seed)
+        self._integrators: OrderedDict[tuple[int, int, int], Integrator] = OrderedDict()
+
+    def move_to_plane(self, plane_mm: float) -> None:
+        """Focus the camera on another plane, mm from the panel; raises InputError unless within 2 m."""
+        self.plane_mm = checked_plane(plane_mm)
+
+    def _capture(self) -> NDArray[np.uint16]:
+        dose = self.camera.exposure_ms / 10 * self._drift.gain(self.captures)
+        electrons = np.zeros(self.camera.shape)
+        for channel in self.lasers.channels:
+            power = self.lasers.power(channel)
+            if power > 0:
+                seen = self._camera_irradiance(self.panel.gray, channel, self.plane_mm)
+                electrons = electrons + self._sensor.electrons(seen, dose * power)
+        rng = np.random.default_rng([self.seed, 11, self.captures])
+        counts = self._sensor.expose(self._sensor.respond(electrons), rng)
+        self.time_s += max(self.description.simulation.capture_interval_s, self.camera.exposure_ms * 1e-3)
+        self.captures += 1
+        return counts
+
+    def expected_counts(
+        self, gray: NDArray[np.generic], channel: str, plane_mm: float | None = None
+    ) -> NDArray[np.float64]:
+        """Noise-free counts [h, w] at full power and 10 ms: without drift, not rounded, not clipped."""
+        gray, plane = checked_gray(gray, self.panel.shape), self._plane(plane_mm)
+        electrons = self._sensor.electrons(self._camera_irradiance(gray, channel, plane), 1.0)
+        return self._sensor.counts(self._sensor.respond(electrons))
+
+    def true_irradiance(
+        self, gray: NDArray[np.generic], channel: str, plane_mm: float | None = None
+    ) -> NDArray[np.float64]:
+        """Noise-free irradiance over panel-sized pixels, [H, W], before any fault of the camera.
+
+        A perfect panel under a uniform beam gives about 1. Raises InputError for a wrong size or channel.
+        """
+        gray, plane = checked_gray(gray, self.panel.shape), self._plane(plane_mm)
+        return (
+            self._integrator(channel, plane)
+            .display(self._optics.irradiance(gray, channel, plane))
+            .astype(np.float64)
+        )
+
+    def oracle_pattern(
+        self,
+        target_irradiance: NDArray[np.floating],
+        channel: str,
+        plane_mm: float | None = None,
+        iterations: int = 80,
+        start: NDArray[np.generic] | None = None,
+        progress: Callable[[int, float], None] | None = None,
+    ) -> Gray:
+        """The best pattern, uint8 [H, W], by someone who knows the true bench. For tests and demonstrations.
+
+        target_irradiance : [H, W], any unit, not negative
+        start : gray levels to start from; none: a smooth random phase at the image
+        progress : called with the iteration and the loss
+        """
+        target = np.asarray(target_irradiance, np.float64)
+        if (
+            target.shape != self.panel.shape
+            or not np.isfinite(target).all()
+            or target.min() < 0
+            or target.max() <= 0
+        ):
+            raise InputError(
+                f"the target, {target.shape}, must be an array of the panel's size {self.panel.shape}, "
+                "finite, nowhere negative and not all zero; correct it."
+            )
+        first = None if start is None else checked_gray(start, self.panel.shape).astype(np.float64)
+        plane = self._plane(plane_mm)
+        return oracle.descend(
+            self._optics,
+            self._integrator(channel, plane),
+            target,
+            channel,
+            plane,
+            iterations,
+            first,
+            progress=progress,
+        )
+
+    def _plane(self, plane_mm: float | None) -> float:
+        return self.plane_mm if plane_mm is None else checked_plane(plane_mm)
+
+    def _camera_irradiance(self, gray: Gray, channel: str, plane_mm: float) -> NDArray[np.float64]:
+        return self._integrator(channel, plane_mm).camera(self._optics.irradiance(gray, channel, plane_mm))
+
+    def _integrator(self, channel: str, plane_mm: float) -> Integrator:
+        band = self._optics.path(channel, plane_mm).band
+        key = (*band.samples, band.oversampling)
+        if key not in self._integrators:
+            self._integrators[key] = Integrator(self.description, band.samples, band.oversampling)
+            if len(self._integrators) > 4:
+                self._integrators.popitem(last=False)
+        return self._integrators[key]
+
+
+def checked_gray(gray: NDArray[np.generic], shape: tuple[int, int]) -> Gray:
+    """`gray` if it is uint8 of this shape; raises InputError."""
+    if not isinstance(gray, np.ndarray) or gray.dtype != np.uint8:
+        found = gray.dtype if isinstance(gray, np.ndarray) else type(gray).__name__
+        raise InputError(f"the pattern is {found}; give the panel uint8 gray levels.")
+    if gray.shape != shape:
+        raise InputError(f"the pattern is {gray.shape}; the panel takes (rows, columns) = {shape}.")
+    return np.asarray(gray, np.uint8)
+
+
+def checked_plane(plane_mm: float) -> float:
+    """A plane in mm; raises InputError unless it is a finite number within 2 m."""
+    number = isinstance(plane_mm, int | float | np.floating | np.integer) and not isinstance(plane_mm, bool)
+    if not number or not math.isfinite(plane_mm) or abs(plane_mm) > 2000:
+        raise InputError(f"plane {plane_mm!r} mm is out of range; give a number from -2000 to 2000.")
+    return float(plane_mm)
+
+
+def open_headset(spec: str, seed: int = 0) -> VirtualHeadset:
+    """Open the virtual headset of `virtual:NAME` or of a bench's TOML file. Raises InputError."""
+    return VirtualHeadset(load_bench(spec), seed)

@@ -1,0 +1,56 @@
+"""The benches that `virtual:NAME` names."""
+
+from __future__ import annotations
+
+from ..errors import InputError, nearest
+from .defects import CATALOGUE_KINDS, make_defect
+from .description import BenchDescription, ChannelDescription, SimulationDescription
+
+_RGB = (
+    ChannelDescription("red", 638.0),
+    ChannelDescription("green", 520.0),
+    ChannelDescription("blue", 450.0),
+)
+
+
+def _benches() -> dict[str, BenchDescription]:
+    make = make_defect
+    benches = [BenchDescription("ideal")]
+    benches += [BenchDescription(kind, defects=(make(kind),)) for kind in CATALOGUE_KINDS]
+    benches += [
+        BenchDescription(
+            "demo",
+            defects=(
+                make("zero_order", fill_factor=0.94, surface_amplitude=0.12),
+                make("illumination", waist_x_share=1.9, waist_y_share=2.1),
+                make("phase_response", gain=1.08, s_curvature=0.12),
+            ),
+        ),
+        BenchDescription("pair", defects=(make("phase_response"), make("pupil_aberration"))),
+        BenchDescription("triple", defects=(make("crosstalk"), make("illumination"), make("distance"))),
+        BenchDescription("colour", channels=_RGB, defects=(make("phase_response"),)),
+        BenchDescription(
+            "planes",
+            simulation=SimulationDescription(planes_mm=(24.0, 30.0, 36.0)),
+            defects=(make("spatial_coherence"),),
+        ),
+        BenchDescription("specks", defects=(make("specks"),)),
+        BenchDescription("fringes", defects=(make("fringes"),)),
+        BenchDescription("stripes", defects=(make("stripes"),)),
+        BenchDescription("outside", defects=(make("specks"), make("fringes"))),
+        BenchDescription("convention", defects=(make("convention", phase_sign=-1),)),
+    ]
+    return {b.name: b for b in benches}
+
+
+def named_benches() -> list[str]:
+    """Names that `virtual:NAME` takes."""
+    return list(_benches())
+
+
+def named_bench(name: str) -> BenchDescription:
+    """The bench of this name; raises InputError that suggests the nearest."""
+    benches = _benches()
+    if name not in benches:
+        raise InputError(f"there is no virtual bench '{name}'; {nearest(name, benches)}")
+    return benches[name]

@@ -1,0 +1,124 @@
+"""Free-space propagation of a panel drawn on sub-pixels: one band of spatial frequencies, generously padded.
+
+Lengths are in panel pixels and frequencies in cycles a pixel unless a name says otherwise. Pixel (i, j) has
+its centre at (i, j); sub-pixel k of q lies at i + (k + 1/2) / q - 1/2. Only the iris's band is computed.
+The transfer is the exact angular spectrum (Goodman, Introduction to Fourier Optics, 3.10), without piston.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Complex = NDArray[np.complex64]
+Real = NDArray[np.float32]
+
+
+def smooth_size(least: int) -> int:
+    """The smallest even number of at least `least` whose only prime factors are 2, 3 and 5."""
+    n = max(2, least + least % 2)
+    while True:
+        m = n
+        for p in (2, 3, 5):
+            while m % p == 0:
+                m //= p
+        if m == 1:
+            return n
+        n += 2
+
+
+def _fft(a: Complex, n: int | None = None, axis: int = -1) -> Complex:
+    """sum a exp(-2 pi j ...), in single precision."""
+    return np.fft.fft(a, n=n, axis=axis).astype(np.complex64, copy=False)
+
+
+def _sum(a: Complex, axis: int = -1) -> Complex:
+    """sum a exp(+2 pi j ...) without a factor, in single precision."""
+    return np.fft.ifft(a, axis=axis, norm="forward").astype(np.complex64, copy=False)
+
+
+class Band:
+    """From sub-pixels to a band of frequencies, from the band to irradiance samples, and both adjoints.
+
+    shape : (H, W), panel pixels
+    q : sub-pixels across a pixel
+    border_px : empty pixels added to each axis, at least
+    half_band : the band's half width, cycles a pixel (0.5 is the panel's own); its edges are included
+    """
+
+    def __init__(self, shape: tuple[int, int], q: int, border_px: float, half_band: float) -> None:
+        self.shape, self.q = shape, q
+        self.padded = tuple(smooth_size(int(np.ceil(n + border_px))) for n in shape)
+        self.reach = tuple(min(int(np.floor(half_band * n * (1 + 1e-9))), q * n // 2) for n in self.padded)
+        # irradiance has twice the field's bandwidth: two samples a pixel hold the panel's own band
+        self.oversampling = max(2, int(np.ceil(4 * half_band * (1 - 1e-9))))
+        self.fy, self.fx = (np.arange(-k, k + 1) / n for k, n in zip(self.reach, self.padded, strict=True))
+        self._env_y, self._env_x = (self._envelope(f) for f in (self.fy, self.fx))
+        bins = [np.arange(-k, k + 1) for k in self.reach]
+        self._in_y, self._in_x = (b % (q * n) for b, n in zip(bins, self.padded, strict=True))
+        self._out_y, self._out_x = (
+            b % (self.oversampling * n) for b, n in zip(bins, self.padded, strict=True)
+        )
+
+    def _envelope(self, f: NDArray[np.float64]) -> Complex:
+        """Sub-pixels are squares of 1/q with their centres off the grid's origin."""
+        shift = 0.5 / self.q - 0.5
+        return (np.sinc(f / self.q) * np.exp(-2j * np.pi * f * shift) / self.q).astype(np.complex64)
+
+    @property
+    def samples(self) -> tuple[int, int]:
+        """Shape of the irradiance samples: the padded window, `oversampling` a pixel."""
+        return self.oversampling * self.padded[0], self.oversampling * self.padded[1]
+
+    def spectrum(self, field: Complex) -> Complex:
+        """Spectrum in the band, [Fy, Fx], of a field on sub-pixels, [qH, qW]."""
+        rows = _fft(field, n=self.q * self.padded[1], axis=1)[:, self._in_x] * self._env_x
+        columns = _fft(np.ascontiguousarray(rows.T), n=self.q * self.padded[0], axis=1)
+        return (columns[:, self._in_y] * self._env_y).T
+
+    def spectrum_adjoint(self, spectrum: Complex) -> Complex:
+        """Adjoint of `spectrum`: [Fy, Fx] to [qH, qW]."""
+        ny, nx = (self.q * n for n in self.padded)
+        work = np.zeros((len(self.fx), ny), np.complex64)
+        work[:, self._in_y] = spectrum.T * self._env_y.conj()
+        columns = _sum(work, axis=1)[:, : self.q * self.shape[0]]
+        work = np.zeros((self.q * self.shape[0], nx), np.complex64)
+        work[:, self._in_x] = columns.T * self._env_x.conj()
+        return _sum(work, axis=1)[:, : self.q * self.shape[1]]
+
+    def field(self, spectrum: Complex) -> Complex:
+        """Field samples [sY, sX] of a spectrum in the band; sample s i lies on pixel i's centre."""
+        ny, nx = self.samples
+        work = np.zeros((len(self.fx), ny), np.complex64)
+        work[:, self._out_y] = spectrum.T
+        columns = _sum(work, axis=1)
+        work = np.zeros((ny, nx), np.complex64)
+        work[:, self._out_x] = columns.T
+        scale = np.float32(1 / (self.padded[0] * self.padded[1]))
+        return _sum(work, axis=1) * scale
+
+    def field_adjoint(self, field: Complex) -> Complex:
+        """Adjoint of `field`: [sY, sX] to [Fy, Fx]."""
+        rows = _fft(field, axis=1)[:, self._out_x]
+        columns = _fft(np.ascontiguousarray(rows.T), axis=1)[:, self._out_y]
+        scale = np.float32(1 / (self.padded[0] * self.padded[1]))
+        return columns.T * scale
+
+    def transfer(self, wavelength_nm: float, pitch_um: float, distance_mm: float) -> NDArray[np.complex128]:
+        """Exact angular spectrum over the band, [Fy, Fx], of a distance (negative: backwards)."""
+        pitch = pitch_um * 1e-6
+        k = 1 / (wavelength_nm * 1e-9)
+        f2 = (self.fy[:, None] / pitch) ** 2 + (self.fx[None, :] / pitch) ** 2
+        travelling = np.clip(k**2 - f2, 0, None)
+        # sqrt(k^2 - f^2) - k, written so that nothing cancels
+        path = -np.where(f2 < k**2, f2, k**2) / (np.sqrt(travelling) + k)
+        return np.where(f2 < k**2, np.exp(2j * np.pi * distance_mm * 1e-3 * path), 0)
+
+
+def walk_px(wavelength_nm: float, pitch_um: float, distance_mm: float, half_band: float) -> float:
+    """How far light at the band's edge walks sideways over a distance, panel pixels.
+
+    half_band : cycles a pixel
+    """
+    sine = min(half_band * wavelength_nm * 1e-3 / pitch_um, 0.99)
+    return abs(distance_mm) * 1e3 / pitch_um * sine / np.sqrt(1 - sine**2)

@@ -1,0 +1,65 @@
+"""One-dimensional Fourier transforms along an axis, by the fastest library that fits the array.
+
+NumPy arrays go to ducc0 (SciPy where ducc0 is missing); any other array goes to its own namespace's ``fft``.
+Forward transforms are not scaled, inverse ones are divided by their length (NumPy's convention).
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+from array_api_compat import array_namespace
+
+try:
+    import ducc0.fft as _ducc
+except ImportError:  # pragma: no cover - exercised only where the wheel is missing
+    _ducc = None
+    import scipy.fft as _scipy
+
+Array = Any
+
+THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+
+
+def fft(x: Array, axis: int, n: int | None = None) -> Array:
+    """DFT of a complex array along `axis`, zero-padded at its end to `n` samples."""
+    return _transform(x, axis, n, forward=True)
+
+
+def ifft(x: Array, axis: int, n: int | None = None) -> Array:
+    """Inverse DFT of a complex array along `axis`, zero-padded at its end to `n` samples, divided by n."""
+    return _transform(x, axis, n, forward=False)
+
+
+def rfft2(x: Array) -> Array:
+    """DFT of a real array over its last two axes: [..., n, m] to [..., n, m//2 + 1]."""
+    if isinstance(x, np.ndarray) and _ducc is not None:
+        return _ducc.r2c(x, axes=(-2, -1), nthreads=THREADS)
+    return array_namespace(x).fft.rfftn(x, axes=(-2, -1))
+
+
+def irfft2(x: Array, shape: tuple[int, int]) -> Array:
+    """Inverse of `rfft2` with `shape` the last two axes of the real result."""
+    if isinstance(x, np.ndarray) and _ducc is not None:
+        return _ducc.c2r(x, lastsize=shape[1], axes=(-2, -1), forward=False, inorm=2, nthreads=THREADS)
+    return array_namespace(x).fft.irfftn(x, s=shape, axes=(-2, -1))
+
+
+def _transform(x: Array, axis: int, n: int | None, forward: bool) -> Array:
+    if not isinstance(x, np.ndarray):
+        transform = array_namespace(x).fft
+        return (transform.fft if forward else transform.ifft)(x, n=n, axis=axis)
+    length = x.shape[axis] if n is None else n
+    if length != x.shape[axis]:
+        padded = list(x.shape)
+        padded[axis] = length
+        whole = np.zeros(padded, x.dtype)
+        inside = [slice(None)] * x.ndim
+        inside[axis] = slice(0, x.shape[axis])
+        whole[tuple(inside)] = x
+        x = whole
+    if _ducc is None:  # pragma: no cover
+        return (_scipy.fft if forward else _scipy.ifft)(x, axis=axis, workers=THREADS)
+    return _ducc.c2c(x, axes=(axis,), forward=forward, inorm=0 if forward else 2, nthreads=THREADS)

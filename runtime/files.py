@@ -1,0 +1,150 @@
+"""Files and folders that appear whole or not at all.
+
+What is written goes to a temporary neighbour, named `.NAME.<random>.part`, that takes the final name when
+it is complete and on the disk. After an error nothing of it is left; after a crash only the neighbour is,
+and it can be deleted.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO, Any
+
+from firmware_iface.errors import InputError
+
+
+@contextmanager
+def whole_file(path: str | os.PathLike[str], mode: str = "wb") -> Iterator[IO[Any]]:
+    """Open `path` for writing; it is replaced when the block ends without error.
+
+    `mode` is "wb", or "w" for text: UTF-8, and lines end as they are written.
+    """
+    if mode not in ("wb", "w"):
+        raise ValueError(f"mode is 'wb' or 'w', not {mode!r}")
+    target = _resolved(path)
+    if target.is_dir():
+        raise InputError(f"{path} is a folder; give the name of a file")
+    temporary = _neighbour(target, "part")
+    try:
+        # "x" refuses a file that is there already and, unlike mkstemp, keeps to the person's umask
+        if mode == "wb":
+            file: IO[Any] = open(temporary, "xb")  # noqa: SIM115 - closed below, before the rename
+        else:
+            file = open(temporary, "x", encoding="utf-8", newline="\n")  # noqa: SIM115
+    except OSError as error:
+        raise _cannot_write(path, error) from error
+    try:
+        with file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        try:
+            os.replace(temporary, target)
+        except OSError as error:
+            raise _cannot_write(path, error) from error
+    except BaseException:
+        with suppress(OSError):
+            temporary.unlink()
+        raise
+    _sync(target.parent)
+
+
+@contextmanager
+def whole_folder(path: str | os.PathLike[str], *, replace: bool = False) -> Iterator[Path]:
+    """Give an empty temporary folder to fill; it is renamed to `path` when the block ends without error.
+
+    A folder that is there and not empty is refused, or with `replace` swapped for the new one and then
+    removed. The swap is two renames: a reader may find no folder for an instant, but never a mixture, and
+    if the second rename fails the old folder is put back.
+    """
+    target = _resolved(path)
+    _refuse_taken(path, target, replace)
+    temporary = _neighbour(target, "part")
+    try:
+        temporary.mkdir()
+    except OSError as error:
+        raise _cannot_write(path, error) from error
+    try:
+        yield temporary
+        for folder, _, names in os.walk(temporary):
+            for name in names:
+                _sync(Path(folder, name))
+            _sync(Path(folder))
+        _refuse_taken(path, target, replace)
+        try:
+            if replace and target.exists():
+                _swap(temporary, target)
+            else:
+                os.rename(temporary, target)
+        except OSError as error:
+            if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
+                raise _taken(path) from error
+            raise _cannot_write(path, error) from error
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+    _sync(target.parent)
+
+
+def _swap(new: Path, target: Path) -> None:
+    old = _neighbour(target, "old")
+    os.rename(target, old)
+    try:
+        os.rename(new, target)
+    except BaseException:
+        os.rename(old, target)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _resolved(path: str | os.PathLike[str]) -> Path:
+    """The path with its links followed, so that a link's target is replaced and not the link."""
+    target = Path(os.path.realpath(path))
+    if not target.name:
+        raise InputError(f"{path} cannot be written; give the name of something in a folder")
+    return target
+
+
+def _refuse_taken(path: str | os.PathLike[str], target: Path, replace: bool) -> None:
+    if not target.exists():
+        return
+    if not target.is_dir():
+        raise InputError(f"{path} is a file, and a folder is to be written; give another name or remove it")
+    try:
+        if not replace and any(target.iterdir()):
+            raise _taken(path)
+    except OSError as error:
+        raise _cannot_write(path, error) from error
+
+
+def _taken(path: str | os.PathLike[str]) -> InputError:
+    return InputError(f"{path} is there already and is not empty; give another name or remove it")
+
+
+def _neighbour(target: Path, suffix: str) -> Path:
+    return target.with_name(f".{target.name}.{secrets.token_hex(4)}.{suffix}")
+
+
+def _cannot_write(path: str | os.PathLike[str], error: OSError) -> InputError:
+    parent = Path(os.path.realpath(path)).parent
+    if isinstance(error, FileNotFoundError) and not parent.exists():
+        return InputError(f"{path} cannot be written: there is no folder {parent}; make it first")
+    return InputError(f"{path} cannot be written: {error.strerror or error}")
+
+
+def _sync(path: Path) -> None:
+    """Make what was written last through a power cut; some file systems cannot, and do no worse for it."""
+    if path.is_symlink():
+        return
+    with suppress(OSError):
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

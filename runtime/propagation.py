@@ -1,0 +1,136 @@
+"""Free-space propagation between the panel and an image plane: transfer functions, and where they hold.
+
+Three forms of the diffraction integral (seed sections 1.1-1.2): the band-limited angular spectrum (exact; seed
+eq. 5, Matsushima and Shimobaba 2009), Fresnel (paraxial) and Fraunhofer (far field). Written against the array
+API: NumPy in the headset, any differentiable namespace in the trainer. Lengths are in metres, frequencies in
+cycles per metre; frequency grids are the DFT's own.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from array_api_compat import array_namespace
+
+from firmware_iface.errors import InputError
+
+Array = Any
+
+METHODS = ("angular_spectrum", "fresnel", "fraunhofer")
+
+
+@dataclass(frozen=True)
+class Aperture:
+    """What a propagation starts from: rows x columns of samples `pitch` metres apart, zero-padded to `padded`."""
+
+    shape: tuple[int, int]
+    padded: tuple[int, int]
+    pitch: float
+
+    @property
+    def extent(self) -> float:
+        """Larger side of the lit area, metres."""
+        return max(self.shape) * self.pitch
+
+
+def transfer_function(
+    fy: Array, fx: Array, wavelength: Array, distance: Array, limits: tuple[float, float], method: str
+) -> Array:
+    """Complex transfer function of free space over a grid of spatial frequencies: [n, m].
+
+    fy [n, 1] and fx [1, m] are in cycles/m; `wavelength` and `distance` (m) are scalars or scalar arrays;
+    beyond `limits` (cycles/m, along y and x; see `band_limit`) the sampled function is aliased and set to zero.
+    Seed eq. 5 for "angular_spectrum"; its paraxial expansion (seed eq. 8) for "fresnel". Both without the plane
+    wave's own 2 pi z / lambda, which is thousands of turns and changes no irradiance. Evanescent frequencies
+    are zero. Raises InputError for another method.
+    """
+    xp = array_namespace(fy, fx)
+    sine2 = (wavelength * fy) ** 2 + (wavelength * fx) ** 2
+    passed = (sine2 < 1) & (xp.abs(fy) <= limits[0]) & (xp.abs(fx) <= limits[1])
+    if method == "angular_spectrum":
+        # sqrt(1 - s) - 1 written so that single precision keeps all of its digits for small s.
+        sine2 = xp.where(passed, sine2, xp.zeros_like(sine2))
+        cosine_less_one = -sine2 / (1 + xp.sqrt(1 - sine2))
+    elif method == "fresnel":
+        cosine_less_one = -sine2 / 2
+    else:
+        raise InputError(
+            f"propagation method '{method}' has no transfer function: use {' or '.join(METHODS[:2])}"
+        )
+    angle = (2 * math.pi) * (distance / wavelength) * cosine_less_one
+    inside = xp.where(passed, xp.ones_like(angle), xp.zeros_like(angle))
+    return inside * xp.cos(angle) + 1j * (inside * xp.sin(angle))
+
+
+def band_limit(wavelength: float, distance: float, side: float) -> float:
+    """Highest frequency (cycles/m) that a sampled transfer function carries over a field `side` metres wide.
+
+    Matsushima and Shimobaba 2009, eq. 13, with frequency samples 1/side apart.
+    """
+    return 1 / (wavelength * math.sqrt((2 * distance / side) ** 2 + 1))
+
+
+def far_field(u: Array, pitch: float, y: Array, x: Array, wavelength: Array, distance: Array) -> Array:
+    """Fraunhofer field of `u` [..., H, W] at the image-plane positions y [n] and x [m] (metres from the axis).
+
+    A matrix Fourier transform, so the image grid is free: [..., n, m]. Up to the quadratic phase in the image
+    plane, which changes no irradiance (Goodman, Introduction to Fourier Optics, eq. 4-25).
+    """
+    xp = array_namespace(u)
+    height, width = u.shape[-2:]
+
+    def kernel(positions: Array, count: int) -> Array:
+        samples = (xp.arange(count, dtype=positions.dtype) - (count - 1) / 2) * pitch
+        angle = -2 * math.pi / (wavelength * distance) * positions[:, None] * samples[None, :]
+        return xp.cos(angle) + 1j * xp.sin(angle)
+
+    scale = pitch**2 / (wavelength * distance)
+    return scale * (kernel(y, height) @ u @ xp.matrix_transpose(kernel(x, width)))
+
+
+def check_sampling(
+    method: str, aperture: Aperture, wavelength: float, distance: float, half_band: float
+) -> None:
+    """Raise InputError, saying which limit, by how much, and what would hold, where `method` cannot be sampled.
+
+    `half_band` (cycles/m) is the highest frequency that the iris lets through.
+    """
+    if method not in METHODS:
+        raise InputError(f"unknown propagation method '{method}': use one of {', '.join(METHODS)}")
+    if not (math.isfinite(wavelength) and wavelength > 0 and math.isfinite(distance) and distance != 0):
+        raise InputError(
+            f"propagation needs a positive wavelength and a distance that is not zero, not {wavelength:g} m "
+            f"and {distance:g} m"
+        )
+    z = abs(distance)
+    if method == "fraunhofer":
+        least = 2 * aperture.extent**2 / wavelength
+        if z < least:
+            raise InputError(
+                f"Fraunhofer propagation holds beyond 2 D^2 / lambda = {least:.3g} m for a panel "
+                f"{aperture.extent * 1e3:.3g} mm wide; the image plane is at {z:.3g} m: use angular_spectrum"
+            )
+        return
+    if wavelength * half_band >= 1:
+        raise InputError(
+            f"the iris passes {half_band * 1e-3:.4g} cycles/mm, beyond 1/lambda = {1e-3 / wavelength:.4g}: "
+            "use a coarser pitch or a smaller iris"
+        )
+    if method == "fresnel":
+        # The first term that the paraxial expansion drops must stay small for the steepest ray.
+        error = 2 * math.pi * z / wavelength * (2 * (wavelength * half_band) ** 2) ** 2 / 8
+        if error > 0.5:
+            farthest = z * 0.5 / error
+            raise InputError(
+                f"Fresnel propagation errs by {error:.3g} rad at the edge of the band (0.5 is the most that "
+                f"holds): use angular_spectrum, or a distance below {farthest * 1e3:.3g} mm"
+            )
+    limit = min(band_limit(wavelength, z, n * aperture.pitch) for n in aperture.padded)
+    if limit < 0.5 * half_band:
+        farthest = min(aperture.padded) * aperture.pitch / (wavelength * half_band)
+        raise InputError(
+            f"at {z * 1e3:.4g} mm the sampled transfer function carries {limit * 1e-3:.4g} cycles/mm of the "
+            f"{half_band * 1e-3:.4g} that the iris passes: use at most {farthest * 1e3:.3g} mm, or a larger panel"
+        )

@@ -1,0 +1,39 @@
+"""What every test shares: one thread a worker, and the folder of practice data beside the repository."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PARALLEL = "PYTEST_XDIST_WORKER" in os.environ
+
+if PARALLEL:  # before NumPy and torch are imported: workers that each take every core slow each other down
+    for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
+
+# after the variables: Hypothesis may bring NumPy in
+import hypothesis  # noqa: E402
+
+# a deadline measures the neighbours on a busy machine, not the code
+hypothesis.settings.register_profile("hololoop", deadline=None)
+hypothesis.settings.load_profile("hololoop")
+
+
+@pytest.fixture(autouse=True)
+def _one_torch_thread() -> None:
+    """Without importing torch for the tests that do not use it."""
+    if PARALLEL and (torch := sys.modules.get("torch")) is not None and torch.get_num_threads() != 1:
+        torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder `shared` beside the repository: contracts, practice capture sets, real data."""
+    folder = ROOT.parent / "shared"
+    if not folder.is_dir():
+        pytest.skip("there is no folder `shared` beside the repository")
+    return folder

@@ -1,0 +1,193 @@
+"""Trying effects on a model: a quick screen of all, and real fits of some. Each is a task that any process can run.
+
+The screen is a score test: how much of the residual lies in the span of the effect's derivative at "absent" (or at
+the best of its starting points, where the derivative at absent does not reach), with the gains and the parameters of
+all present effects projected out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from trainer.captures import Capture, CaptureSet, read_captures
+from trainer.effects.definition import Effect
+from trainer.evidence import Batch, load, load_batch
+from trainer.excess import Errors, errors_of, join
+from trainer.fit import (
+    Predictor,
+    _keys,
+    best_start,
+    columns,
+    fit,
+    raise_order,
+    start_points,
+    with_gain,
+)
+from trainer.model import Model, Present
+from trainer.starts import Evidence
+
+
+@dataclass(frozen=True)
+class Screened:
+    """What the screen expects of an effect: the excess that would remain, and where a fit should start."""
+
+    effect: str
+    start: Present
+    before: float
+    after: float
+
+    @property
+    def removed(self) -> float:
+        """Excess expected to go, on the captures that the screen saw."""
+        return self.before - self.after
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A fitted candidate: the model with it, and its held-out errors."""
+
+    effect: str
+    model: Model
+    fitted_excess: float
+    held_out: Errors
+
+
+@lru_cache(maxsize=4)
+def _captures(folder: Path) -> CaptureSet:
+    return read_captures(folder)
+
+
+def chosen(captures: CaptureSet, ids: Sequence[str]) -> list[Capture]:
+    """Captures by id, in the order of the set."""
+    wanted = set(ids)
+    return [c for c in captures.captures if c.capture in wanted]
+
+
+def evaluate_captures(captures: CaptureSet, rows: Sequence[Capture], model: Model) -> Errors:
+    """Errors of a model on captures, one in memory at a time."""
+    with torch.no_grad():
+        parts = []
+        for row in rows:
+            batch = load_batch(captures, [row])
+            parts.append(errors_of(batch, Predictor(model, batch).predict(model)))
+        return join(parts)
+
+
+def screen(folder: Path, ids: tuple[str, ...], model: Model, effects: tuple[Effect, ...]) -> list[Screened]:
+    """Screen effects on some captures, for a model with fitted gains."""
+    captures = _captures(folder)
+    batches = load(captures, chosen(captures, ids))
+    with torch.no_grad():
+        return _screen(batches, model, effects)
+
+
+def _screen(batches: list[Batch], model: Model, effects: tuple[Effect, ...]) -> list[Screened]:
+    results = []
+    known: dict[bool, tuple[list[Predictor], list, Tensor, Tensor]] = {}
+    for effect in effects:
+        wide = effect.touches_iris
+        if wide not in known:
+            reach = model if not wide else model.having(_absent(effect, model))
+            predictors = [Predictor(reach, b) for b in batches]
+            points = [p.trace(model) for p in predictors]
+            nuisance = _stacked(model, _keys(model, model.names), predictors, points)
+            known[wide] = (predictors, points, *nuisance)
+        predictors, points, residual, present = known[wide]
+        noise = sum(float((b.weight * b.noise).sum()) for b in batches)
+        scale = float(join([errors_of(b, torch.zeros_like(b.signal)) for b in batches]).variance.sum())
+        before = (_remaining(residual, present) - noise) / scale
+        start = _start(effect, model, predictors, points)
+        trial = model.having(start)
+        moved = [p.trace(trial, effect.stage, t) for p, t in zip(predictors, points, strict=True)]
+        trial = with_gain(trial, predictors, moved)
+        residual_there, slopes = _stacked(trial, _keys(trial, [effect.name]), predictors, moved)
+        after = (_remaining(residual_there, torch.cat([slopes, present])) - noise) / scale
+        # A start is only a start: a derivative there must not lose to the derivative at absent.
+        results.append(Screened(effect.name, start, before, after))
+    return results
+
+
+def _absent(effect: Effect, model: Model) -> Present:
+    from trainer.model import absent
+
+    return absent(effect, model.bench)
+
+
+def _start(effect: Effect, model: Model, predictors: list[Predictor], points: list) -> Present:
+    starts = start_points(effect, model)
+    if effect.starts is not None:
+        evidence = []
+        for predictor, point in zip(predictors, points, strict=True):
+            prediction = predictor.counts(model, predictor.light(model, point))
+            evidence.append(Evidence(predictor.scene, predictor.batch, prediction))
+        base = _absent(effect, model)
+        for values in effect.starts(evidence):
+            full = {n: np.array(values[n], dtype=float) if n in values else base.values[n] for n in base.values}
+            starts.append(base.with_values({n: v.reshape(base.values[n].shape) for n, v in full.items()}))
+    if len(starts) == 1:
+        return starts[0]
+    return best_start(model, predictors[:3], points[:3], starts)
+
+
+def _stacked(
+    model: Model, keys: Sequence[tuple[str, str, int]], predictors: list[Predictor], points: list
+) -> tuple[Tensor, Tensor]:
+    """Weighted residual [pixels] and derivatives [columns, pixels]; one gain column a colour."""
+    channels = list(dict.fromkeys(p.batch.channel for p in predictors))
+    residuals, blocks = [], []
+    for predictor, point in zip(predictors, points, strict=True):
+        base, slopes = columns(model, keys, predictor, point)
+        weight = predictor.batch.weight
+        residuals.append((weight * (predictor.batch.signal - base)).reshape(-1))
+        block = torch.zeros((len(keys) + len(channels), weight.numel()), dtype=weight.dtype)
+        for k, slope in enumerate(slopes[:-1]):
+            block[k] = (weight * slope).reshape(-1)
+        block[len(keys) + channels.index(predictor.batch.channel)] = (weight * slopes[-1]).reshape(-1)
+        blocks.append(block)
+    return torch.cat(residuals), torch.cat(blocks, dim=1)
+
+
+def _remaining(residual: Tensor, slopes: Tensor) -> float:
+    """Sum of squares of the residual outside the span of the columns."""
+    norms = torch.linalg.vector_norm(slopes, dim=1, dtype=torch.float64)
+    slopes = slopes[norms > 1e-9 * float(norms.max() + 1e-30)]
+    norms = norms[norms > 1e-9 * float(norms.max() + 1e-30)]
+    total = float((residual.double() ** 2).sum())
+    if not len(norms):
+        return total
+    normal = (slopes @ slopes.T).double() / torch.outer(norms, norms)
+    along = (slopes @ residual).double() / norms
+    normal += 1e-6 * torch.eye(len(norms), dtype=torch.float64)
+    return total - float(along @ torch.linalg.solve(normal, along))
+
+
+def try_effect(
+    folder: Path,
+    ids: tuple[str, ...],
+    held_ids: tuple[str, ...],
+    model: Model,
+    start: Present,
+    raising: bool,
+    iterations: int = 8,
+) -> Tried:
+    """Fit one effect, with present ones as they are, and judge it on held-out captures."""
+    captures = _captures(folder)
+    batches = load(captures, chosen(captures, ids))
+    name = start.effect.name
+    fitted = fit(model.having(start), [name], batches, iterations)
+    if raising:
+        fitted = raise_order(fitted, name, batches, least_for_order)
+    held_out = evaluate_captures(captures, chosen(captures, held_ids), fitted.model)
+    return Tried(name, fitted.model, fitted.errors.excess, held_out)
+
+
+def least_for_order(excess: float) -> float:
+    """Excess that a higher order must remove: a twentieth of what is left, and more than what noise can."""
+    return max(0.05 * excess, 1e-5)

@@ -1,0 +1,149 @@
+"""What an effect is: a name, the stage it belongs to, its physical parameters, and one function.
+
+The function takes the stage as it is without the effect and the parameters as tensors, and returns the stage with
+the effect. That is all that screening, fitting, the report, export and the headset need.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from firmware_iface.errors import InputError
+from trainer.bench_file import Bench
+
+STAGES = ("drive", "panel", "pupil", "sensor")
+TOLD_TO = ("display", "camera")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One physical parameter of an effect.
+
+    name : without a unit
+    unit : as printed; "1" for a pure number
+    scale : a change of this size is small but visible; fits step in units of it
+    absent : value at which the effect is not there; a number, or a function of the bench
+    low, high : physical range, inclusive
+    count : 0 for a single number; otherwise how many numbers, or a function of the effect's order
+    per_channel : one value (or row of values) a colour
+    even : the effect depends on the square of this parameter, so its derivative at absent is zero
+    starts : values to start a fit from, where the derivative at absent does not reach far; () for absent alone
+    """
+
+    name: str
+    unit: str
+    scale: float
+    absent: float | Callable[[Bench], float] = 0.0
+    low: float = -np.inf
+    high: float = np.inf
+    count: int | Callable[[int], int] = 0
+    per_channel: bool = False
+    even: bool = False
+    starts: tuple[float, ...] = ()
+    about: str = ""
+
+    def absent_value(self, bench: Bench) -> float:
+        """The value at which the effect is not there, on this bench."""
+        return float(self.absent(bench) if callable(self.absent) else self.absent)
+
+    def shape(self, order: int, channels: int) -> tuple[int, ...]:
+        """Shape of the parameter's values for an order and a number of colours."""
+        count = self.count(order) if callable(self.count) else self.count
+        return (*((channels,) if self.per_channel else ()), *((count,) if count else ()))
+
+    @property
+    def key(self) -> str:
+        """Name with its unit, as files and JSON have it."""
+        unit = UNIT_SUFFIX.get(self.unit, self.unit)
+        return f"{self.name}_{unit}" if unit else self.name
+
+
+UNIT_SUFFIX = {"1": "", "%": "percent", "pixels": "px", "share of band": "share", "waves": "waves"}
+
+
+@dataclass(frozen=True)
+class Effect:
+    """A named physical effect; `apply` is `(stage, **parameters) -> stage`.
+
+    orders : the orders a map or curve is raised through, lowest first; (0,) where there is nothing to raise
+    starts : optional `(evidence) -> list of {parameter: value}`: starting points read off the data
+    touches_iris : the effect may open the iris beyond what the bench says
+    """
+
+    name: str
+    stage: str
+    told_to: str
+    about: str
+    parameters: tuple[Parameter, ...]
+    apply: Callable[..., Any]
+    orders: tuple[int, ...] = (0,)
+    starts: Callable[..., list[dict[str, Any]]] | None = None
+    touches_iris: bool = False
+    source: str = "built in"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # An effect travels to other processes by name: the function of a decorated effect cannot be pickled.
+        return _named, (self.name, self.source)
+
+    def parameter(self, name: str) -> Parameter:
+        """The parameter of that name."""
+        return next(p for p in self.parameters if p.name == name)
+
+
+def _named(name: str, source: str) -> Effect:
+    from pathlib import Path
+
+    from trainer.effects.registry import BUILT_IN, catalogue, load_effects
+
+    for one in BUILT_IN:
+        if one.name == name:
+            return one
+    if source not in _loaded:
+        _loaded[source] = {e.name: e for e in load_effects(Path(source))}
+    return _loaded[source].get(name) or catalogue()[name]
+
+
+_loaded: dict[str, dict[str, Effect]] = {}
+
+
+def effect(
+    *,
+    stage: str,
+    told_to: str,
+    parameters: list[Parameter],
+    orders: tuple[int, ...] = (0,),
+    starts: Callable[..., list[dict[str, Any]]] | None = None,
+    touches_iris: bool = False,
+) -> Callable[[Callable[..., Any]], Effect]:
+    """Make an effect of a function: its name is the function's, its description the docstring's first line.
+
+    Raises InputError where stage, audience or parameters do not fit the function.
+    """
+
+    def make(function: Callable[..., Any]) -> Effect:
+        name = getattr(function, "__name__", "effect")
+        if stage not in STAGES:
+            raise InputError(f"effect '{name}': stage '{stage}' is not one of {', '.join(STAGES)}")
+        if told_to not in TOLD_TO:
+            raise InputError(f"effect '{name}': told_to '{told_to}' is not one of {', '.join(TOLD_TO)}")
+        if not parameters:
+            raise InputError(f"effect '{name}': give it at least one Parameter")
+        taken = list(inspect.signature(function).parameters)[1:]
+        named = [p.name for p in parameters]
+        if taken != named:
+            raise InputError(
+                f"effect '{name}': the function takes ({', '.join(taken)}) after the stage, its parameters are "
+                f"({', '.join(named)}); make them the same, in the same order"
+            )
+        about = (inspect.getdoc(function) or name).splitlines()[0]
+        source = inspect.getsourcefile(function) or "built in"
+        return Effect(
+            name, stage, told_to, about, tuple(parameters), function, orders, starts, touches_iris, source
+        )
+
+    return make

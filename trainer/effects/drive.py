@@ -1,0 +1,118 @@
+"""Effects of the drive: what the panel makes of a gray level, and of its neighbours'."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from trainer.bases import legendre_count, legendre_curve, legendre_maps
+from trainer.effects.definition import Parameter, effect
+from trainer.stages import Drive
+
+SUB_PIXELS = 3
+REACH = 2  # neighbours on either side that a pixel hears
+
+
+@effect(
+    stage="drive",
+    told_to="display",
+    orders=(1, 3, 5),
+    parameters=[
+        Parameter(
+            "gain",
+            "1",
+            scale=0.02,
+            absent=1.0,
+            low=0.2,
+            high=3.0,
+            per_channel=True,
+            starts=(0.8, 0.9, 1.0, 1.1, 1.2, 1.35),
+            about="phase at the last gray level over its nominal value",
+        ),
+        Parameter(
+            "curvature",
+            "rad",
+            scale=0.1,
+            low=-6,
+            high=6,
+            count=lambda order: order,
+            per_channel=True,
+            about="Legendre terms of the deviation from the straight line, zero at both ends",
+        ),
+    ],
+)
+def phase_response(drive: Drive, gain: Tensor, curvature: Tensor) -> Drive:
+    """Gray to phase is not the straight line that the bench file says."""
+    t = drive.level
+    bend = t * (1 - t) * 4 * (curvature @ legendre_curve(2 * t - 1, curvature.shape[0]))
+    return replace(drive, response=drive.response * gain + drive.sign * bend)
+
+
+@effect(
+    stage="drive",
+    told_to="display",
+    orders=(2, 4, 6),
+    parameters=[
+        Parameter(
+            "map",
+            "1",
+            scale=0.02,
+            low=-0.8,
+            high=0.8,
+            count=legendre_count,
+            about="Legendre terms of the relative change of the phase's gain over the panel",
+        )
+    ],
+)
+def phase_nonuniformity(drive: Drive, map: Tensor) -> Drive:
+    """The phase's gain varies over the panel, as the cell's thickness does."""
+    order = _order_of(map.shape[0])
+    return drive.scaled(1 + torch.tensordot(map, legendre_maps(drive.y, drive.x, order), dims=1))
+
+
+@effect(
+    stage="drive",
+    told_to="display",
+    parameters=[
+        Parameter("width_y", "pixels", scale=0.08, low=0, high=1.5, even=True, starts=(0.1, 0.3)),
+        Parameter("width_x", "pixels", scale=0.08, low=0, high=1.5, even=True, starts=(0.1, 0.3)),
+        Parameter("asymmetry_y", "1", scale=0.2, low=-1, high=1),
+        Parameter("asymmetry_x", "1", scale=0.2, low=-1, high=1),
+    ],
+)
+def crosstalk(
+    drive: Drive, width_y: Tensor, width_x: Tensor, asymmetry_y: Tensor, asymmetry_x: Tensor
+) -> Drive:
+    """Fringing fields: neighbouring pixels' voltages mix over a fraction of a pixel."""
+    return replace(drive, crosstalk=(_taps(width_y, asymmetry_y), _taps(width_x, asymmetry_x)))
+
+
+def _taps(width: Tensor, asymmetry: Tensor) -> Tensor:
+    """Share that each pixel has in the phase of each sub-pixel: [SUB_PIXELS, 2 REACH + 1].
+
+    The kernel is a two-sided exponential, as fringing fields decay; `width` (pixels) is its rms for equal sides,
+    `asymmetry` lengthens one side and shortens the other. The share of a pixel is the kernel's integral over it.
+    """
+    side = torch.clamp(width, min=1e-3) / math.sqrt(2)
+    right, left = side * (1 + 0.999 * asymmetry), side * (1 - 0.999 * asymmetry)
+
+    def below(x: Tensor) -> Tensor:
+        """Integral of the kernel from minus infinity to x."""
+        falling = torch.exp(-torch.clamp(x, min=0) / right)
+        rising = torch.exp(torch.clamp(x, max=0) / left)
+        share = left / (left + right)
+        return torch.where(x > 0, 1 - (1 - share) * falling, share * rising)
+
+    centre = (torch.arange(SUB_PIXELS, device=width.device) + 0.5) / SUB_PIXELS - 0.5
+    pixel = torch.arange(-REACH, REACH + 1, device=width.device)
+    distance = centre[:, None] - pixel[None, :]
+    taps = below(distance + 0.5) - below(distance - 0.5)
+    return taps / taps.sum(dim=1, keepdim=True)
+
+
+def _order_of(count: int) -> int:
+    """Order of a full set of Legendre products without the constant."""
+    return next(n for n in range(1, 40) if legendre_count(n) == count)

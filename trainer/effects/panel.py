@@ -1,0 +1,89 @@
+"""Effects of the panel: a fixed complex field, multiplied on or added to what it shows."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from trainer.bases import legendre_count, legendre_maps
+from trainer.effects.definition import Parameter, effect
+from trainer.stages import Panel
+from trainer.starts import wavefront_starts
+
+
+@effect(
+    stage="panel",
+    told_to="display",
+    parameters=[
+        Parameter(
+            "leak_real", "1", scale=0.02, low=-1, high=1, about="in phase with gray level 0, of the modulated amplitude"
+        ),
+        Parameter("leak_imaginary", "1", scale=0.02, low=-1, high=1, about="a quarter wave ahead of gray level 0"),
+        Parameter(
+            "fill_factor",
+            "1",
+            scale=0.03,
+            absent=lambda bench: bench.panel.fill_factor,
+            low=0.3,
+            high=1.0,
+            about="lit share of a pixel's area, which also sets the pixel's aperture",
+        ),
+    ],
+)
+def zero_order(panel: Panel, leak_real: Tensor, leak_imaginary: Tensor, fill_factor: Tensor) -> Panel:
+    """Light that the pattern does not modulate: dead space between pixels, first-surface reflection."""
+    side = torch.sqrt(fill_factor)
+    leak = panel.source * torch.complex(leak_real, leak_imaginary)
+    return replace(panel.leaking(leak), aperture=torch.stack((side, side)))
+
+
+@effect(
+    stage="panel",
+    told_to="display",
+    orders=(2, 4, 6),
+    parameters=[
+        Parameter(
+            "log_amplitude",
+            "1",
+            scale=0.03,
+            low=-4,
+            high=4,
+            count=legendre_count,
+            about="Legendre terms of the logarithm of the beam's amplitude",
+        )
+    ],
+)
+def illumination(panel: Panel, log_amplitude: Tensor) -> Panel:
+    """The beam that lights the panel is not uniform."""
+    return panel.multiplied(torch.exp(_smooth(panel, log_amplitude)))
+
+
+@effect(
+    stage="panel",
+    told_to="display",
+    orders=(2, 4, 6, 8),
+    starts=wavefront_starts,
+    parameters=[
+        Parameter(
+            "wavefront",
+            "rad",
+            scale=0.1,
+            low=-60,
+            high=60,
+            count=legendre_count,
+            about="Legendre terms at the first channel's wavelength; one path difference for all colours",
+        )
+    ],
+)
+def panel_wavefront(panel: Panel, wavefront: Tensor) -> Panel:
+    """The beam or the panel is not flat."""
+    phase = _smooth(panel, wavefront) * (panel.reference_wavelength / panel.wavelength)
+    return panel.multiplied(torch.polar(torch.ones_like(phase), phase))
+
+
+def _smooth(panel: Panel, terms: Tensor) -> Tensor:
+    order = round((math.sqrt(9 + 8 * terms.shape[0]) - 3) / 2)
+    return torch.tensordot(terms, legendre_maps(panel.y, panel.x, order), dims=1)

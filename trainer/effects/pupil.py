@@ -1,0 +1,136 @@
+"""Effects of the pupil: what the path to the image plane passes, delays or makes incoherent."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from trainer.bases import zernike_count, zernike_maps
+from trainer.effects.definition import Parameter, effect
+from trainer.stages import Pupil
+
+LINES = 5  # nodes of the Gauss-Hermite rule that stands for a laser line
+FWHM = 2 * math.sqrt(2 * math.log(2))
+
+
+@effect(
+    stage="pupil",
+    told_to="display",
+    parameters=[
+        Parameter(
+            "offset",
+            "mm",
+            scale=0.03,
+            low=-100,
+            high=100,
+            starts=tuple(float(s * d) for d in np.geomspace(0.1, 12, 26) for s in (-1, 1)),
+            about="how much farther from the panel the image plane is than asked for",
+        )
+    ],
+)
+def distance(pupil: Pupil, offset: Tensor) -> Pupil:
+    """The image plane is not where it is said to be."""
+    return replace(pupil, distance=pupil.distance + 1e-3 * offset)
+
+
+@effect(
+    stage="pupil",
+    told_to="display",
+    orders=(4, 6),
+    parameters=[
+        Parameter(
+            "zernike",
+            "waves",
+            scale=0.02,
+            low=-10,
+            high=10,
+            count=lambda order: zernike_count(order, without_defocus=True),
+            about="Noll-normalised terms from astigmatism on, at the first channel's wavelength",
+        )
+    ],
+)
+def pupil_aberration(pupil: Pupil, zernike: Tensor) -> Pupil:
+    """The relay aberrates (without piston, tilt or defocus, which other effects hold)."""
+    order = next(n for n in range(2, 40) if zernike_count(n, True) == zernike.shape[0])
+    maps = zernike_maps(pupil.v, pupil.u, order, without_defocus=True)
+    return pupil.delayed(torch.tensordot(zernike, maps, dims=1) * pupil.reference_wavelength)
+
+
+@effect(
+    stage="pupil",
+    told_to="display",
+    touches_iris=True,
+    parameters=[
+        Parameter(
+            "half_width",
+            "share of band",
+            scale=0.02,
+            absent=lambda bench: bench.iris.half_width,
+            low=0.05,
+            high=1.9,
+            starts=(0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
+        ),
+        Parameter("centre_y", "share of band", scale=0.02, low=-0.9, high=0.9),
+        Parameter("centre_x", "share of band", scale=0.02, low=-0.9, high=0.9),
+    ],
+)
+def iris(pupil: Pupil, half_width: Tensor, centre_y: Tensor, centre_x: Tensor) -> Pupil:
+    """The filter in the Fourier plane has another size or place than said."""
+    centre = (pupil.centre[0] + centre_y, pupil.centre[1] + centre_x)
+    return replace(pupil, half_width=half_width, centre=centre)
+
+
+@effect(
+    stage="pupil",
+    told_to="display",
+    parameters=[Parameter("line_width", "nm", scale=0.3, low=0, high=40, even=True, starts=(0.5, 2.0))],
+)
+def temporal_coherence(pupil: Pupil, line_width: Tensor) -> Pupil:
+    """The laser has a line width (full width at half maximum of a Gaussian line)."""
+    nodes, weights = np.polynomial.hermite_e.hermegauss(LINES)
+    nodes, weights = (
+        torch.as_tensor(a, dtype=line_width.dtype, device=line_width.device)
+        for a in (nodes, weights / weights.sum())
+    )
+    return replace(pupil, lines=(nodes * line_width * 1e-9 / FWHM, weights))
+
+
+@effect(
+    stage="pupil",
+    told_to="display",
+    parameters=[
+        Parameter(
+            "extent",
+            "mrad",
+            scale=0.3,
+            low=0,
+            high=50,
+            even=True,
+            starts=(0.5, 1.5),
+            about="rms angle along an axis, seen from the panel",
+        ),
+        Parameter(
+            "kurtosis", "1", scale=0.5, low=-1.5, high=1.5, about="shape of the source: 0 Gaussian, -1 uniform disc"
+        ),
+    ],
+)
+def spatial_coherence(pupil: Pupil, extent: Tensor, kurtosis: Tensor) -> Pupil:
+    """The source has an extent: each of its points tilts the light and displaces the picture by distance x angle."""
+    # Exact but for the iris's edge, and hundreds of times cheaper than a propagation a source point.
+    spread = 1e-3 * extent * torch.abs(pupil.distance)
+    return pupil.filtered(kernel_transfer(pupil.iy, pupil.ix, spread, kurtosis))
+
+
+def kernel_transfer(iy: Tensor, ix: Tensor, spread: Tensor, kurtosis: Tensor) -> Tensor:
+    """Transfer function of a round kernel with an rms `spread` along an axis and an excess kurtosis.
+
+    The first two cumulants of the kernel: exp(-w^2/2 + kurtosis w^4/24), w = 2 pi spread f; the quartic is held to
+    half of the quadratic, where the expansion ends.
+    """
+    w2 = (2 * math.pi * spread) ** 2 * (iy**2 + ix**2)
+    quartic = torch.clamp(kurtosis * w2 / 24, -0.25, 0.25)
+    return torch.exp(w2 * (quartic - 0.5))

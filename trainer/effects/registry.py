@@ -1,0 +1,99 @@
+"""The catalogue: built-in effects, effects from files that the user names, and effects of installed packages."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import importlib.util
+import sys
+import traceback
+from collections.abc import Iterable
+from importlib.metadata import entry_points
+from pathlib import Path
+
+from firmware_iface.errors import InputError
+from trainer.effects import drive, panel, pupil, sensor
+from trainer.effects.definition import Effect
+
+ENTRY_POINTS = "hololoop.effects"
+
+BUILT_IN: tuple[Effect, ...] = (
+    drive.phase_response,
+    drive.phase_nonuniformity,
+    drive.crosstalk,
+    panel.zero_order,
+    panel.illumination,
+    panel.panel_wavefront,
+    pupil.distance,
+    pupil.pupil_aberration,
+    pupil.iris,
+    pupil.temporal_coherence,
+    pupil.spatial_coherence,
+    sensor.sensor_blur,
+    sensor.misregistration,
+    sensor.vignetting,
+    sensor.stray_light,
+    sensor.sensor_response,
+    sensor.laser_drift,
+    sensor.ghost,
+)
+
+Catalogue = dict[str, Effect]
+
+
+def catalogue(files: Iterable[Path] = ()) -> Catalogue:
+    """Every known effect by name, in the order that light meets them; users' own after the built-in ones.
+
+    Raises InputError when a file cannot be loaded, holds no effect, or names one that is taken.
+    """
+    known: Catalogue = {e.name: e for e in BUILT_IN}
+    for point in entry_points(group=ENTRY_POINTS):
+        loaded = point.load()
+        _add(known, [loaded] if isinstance(loaded, Effect) else list(loaded), f"entry point '{point.name}'")
+    for path in files:
+        _add(known, load_effects(path), str(path))
+    return known
+
+
+def find_effect(known: Catalogue, name: str) -> Effect:
+    """The effect of that name. Raises InputError that suggests the nearest."""
+    if name in known:
+        return known[name]
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
+    hint = f"did you mean '{near[0]}'?" if near else "see 'hololoop-trainer effects' for the list"
+    raise InputError(f"unknown effect '{name}': {hint}")
+
+
+def load_effects(path: Path) -> list[Effect]:
+    """The effects that a Python file defines. Raises InputError, with the line, when it cannot be run."""
+    if not path.is_file():
+        raise InputError(f"effects file {path} is not there: give the path of a Python file")
+    name = "hololoop_effects_" + hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise InputError(f"effects file {path} is not a Python file: its name must end in .py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except InputError as error:
+        raise InputError(f"effects file {path}: {error}") from error
+    except Exception as error:
+        inside = [f for f in traceback.extract_tb(error.__traceback__) if f.filename == str(path)]
+        line = f", line {inside[-1].lineno}" if inside else ""
+        line = f", line {error.lineno}" if isinstance(error, SyntaxError) else line
+        raise InputError(f"effects file {path}{line}: {type(error).__name__}: {error}") from error
+    found = [value for value in vars(module).values() if isinstance(value, Effect)]
+    own = [e for e in found if e not in BUILT_IN]
+    if not own:
+        raise InputError(f"effects file {path} defines no effect: decorate a function with trainer.effects.effect")
+    return own
+
+
+def _add(known: Catalogue, effects: list[Effect], where: str) -> None:
+    for one in effects:
+        if not isinstance(one, Effect):
+            raise InputError(f"{where} gives {type(one).__name__}, not an effect: use trainer.effects.effect")
+        if one.name in known:
+            raise InputError(f"{where} defines '{one.name}', which is already the name of an effect: rename it")
+        known[one.name] = one

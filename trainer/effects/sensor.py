@@ -1,0 +1,165 @@
+"""Effects of the sensor: what happens to irradiance between the image plane and the counts."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from trainer.bases import legendre_count, legendre_curve, legendre_maps
+from trainer.effects.definition import Parameter, effect
+from trainer.effects.pupil import kernel_transfer
+from trainer.stages import Sensor
+from trainer.starts import ghost_starts, registration_starts
+
+
+@effect(
+    stage="sensor",
+    told_to="camera",
+    parameters=[
+        Parameter("width", "pixels", scale=0.15, low=0, high=20, even=True, starts=(0.3, 1.0), about="rms along an axis"),
+        Parameter("kurtosis", "1", scale=0.5, low=-1.5, high=1.5, about="shape: 0 Gaussian, -1 uniform disc"),
+    ],
+)
+def sensor_blur(sensor: Sensor, width: Tensor, kurtosis: Tensor) -> Sensor:
+    """The camera's lens and pixels blur the picture."""
+    return sensor.blurred(kernel_transfer(sensor.iy, sensor.ix, width, kurtosis))
+
+
+@effect(
+    stage="sensor",
+    told_to="camera",
+    orders=(1, 3),
+    starts=registration_starts,
+    parameters=[
+        Parameter("shift_y", "pixels", scale=0.05, low=-60, high=60),
+        Parameter("shift_x", "pixels", scale=0.05, low=-60, high=60),
+        Parameter("rotation", "mrad", scale=0.5, low=-300, high=300),
+        Parameter("magnification", "%", scale=0.05, low=-20, high=20, about="size of the picture in excess of nominal"),
+        Parameter(
+            "distortion",
+            "pixels",
+            scale=0.05,
+            low=-30,
+            high=30,
+            count=lambda order: 2 * (legendre_count(order, 1) - 1),
+            about="Legendre terms of the displacement that shift, rotation and size do not hold; rows, then columns",
+        ),
+    ],
+)
+def misregistration(
+    sensor: Sensor,
+    shift_y: Tensor,
+    shift_x: Tensor,
+    rotation: Tensor,
+    magnification: Tensor,
+    distortion: Tensor,
+) -> Sensor:
+    """Camera pixels are not where the registration says: shift, rotation, scale, distortion."""
+    half_height, half_width = (n / 2 for n in sensor.y.shape)
+    y, x = sensor.y * half_height, sensor.x * half_width
+    angle, size = 1e-3 * rotation, 1e-2 * magnification
+    dy, dx = shift_y + size * y + angle * x, shift_x + size * x - angle * y
+    order = next(n for n in range(1, 40) if 2 * (legendre_count(n) - 1) == distortion.shape[0])
+    # What an affine map does is held above, but for one share of it: stretch of rows against columns.
+    maps = legendre_maps(sensor.y, sensor.x, order)[1:]
+    rows, columns = distortion.reshape(2, -1)
+    return sensor.displaced(
+        dy + torch.tensordot(rows, maps, dims=1), dx + torch.tensordot(columns, maps, dims=1)
+    )
+
+
+@effect(
+    stage="sensor",
+    told_to="camera",
+    orders=(2, 4),
+    parameters=[
+        Parameter(
+            "log_gain", "1", scale=0.03, low=-4, high=4, count=legendre_count, about="Legendre terms over the picture"
+        )
+    ],
+)
+def vignetting(sensor: Sensor, log_gain: Tensor) -> Sensor:
+    """The camera's sensitivity falls off over the field."""
+    order = round((math.sqrt(9 + 8 * log_gain.shape[0]) - 3) / 2)
+    maps = legendre_maps(sensor.y, sensor.x, order)
+    return sensor.multiplied(torch.exp(torch.tensordot(log_gain, maps, dims=1)))
+
+
+@effect(
+    stage="sensor",
+    told_to="camera",
+    orders=(1, 2, 4),
+    parameters=[
+        Parameter(
+            "counts",
+            "counts",
+            scale=3.0,
+            low=-4000,
+            high=60000,
+            count=lambda order: legendre_count(order, 0),
+            about="Legendre terms over the picture, the mean first",
+        )
+    ],
+)
+def stray_light(sensor: Sensor, counts: Tensor) -> Sensor:
+    """Light is simply added, smooth over the picture."""
+    order = round((math.sqrt(1 + 8 * counts.shape[0]) - 3) / 2)
+    return sensor.brightened(torch.tensordot(counts, legendre_maps(sensor.y, sensor.x, order, 0), dims=1))
+
+
+@effect(
+    stage="sensor",
+    told_to="camera",
+    orders=(2, 4),
+    parameters=[
+        Parameter(
+            "bend",
+            "1",
+            scale=0.03,
+            low=-2,
+            high=2,
+            count=lambda order: order,
+            about="Legendre terms of the deviation from a straight line, zero at both ends, share of full scale",
+        )
+    ],
+)
+def sensor_response(sensor: Sensor, bend: Tensor) -> Sensor:
+    """Counts are not proportional to light."""
+
+    def curve(share: Tensor) -> Tensor:
+        # The polynomial is fitted from darkness to full scale; beyond it the curve goes on as a straight line.
+        inside = torch.clamp(share, -0.05, 1.0)
+        return share + inside * (1 - inside) * torch.tensordot(
+            bend, legendre_curve(2 * inside - 1, bend.shape[0]), dims=1
+        )
+
+    return sensor.responding(curve)
+
+
+@effect(
+    stage="sensor",
+    told_to="camera",
+    parameters=[Parameter("spread", "%", scale=1.0, low=0, high=100, about="rms of the gain from capture to capture")],
+)
+def laser_drift(sensor: Sensor, spread: Tensor) -> Sensor:
+    """The laser's power varies from capture to capture: each capture has its own gain, measured from it."""
+    return replace(sensor, free_capture_gain=sensor.free_capture_gain or bool(spread != 0))
+
+
+@effect(
+    stage="sensor",
+    told_to="display",
+    starts=ghost_starts,
+    parameters=[
+        Parameter("amplitude", "1", scale=0.01, low=0, high=1, about="irradiance of the copy over that of the picture"),
+        Parameter("shift_y", "pixels", scale=0.3, low=-200, high=200),
+        Parameter("shift_x", "pixels", scale=0.3, low=-200, high=200),
+    ],
+)
+def ghost(sensor: Sensor, amplitude: Tensor, shift_y: Tensor, shift_x: Tensor) -> Sensor:
+    """A second, weak, displaced image, as from a reflection in a window."""
+    angle = -2 * math.pi * (sensor.iy * shift_y + sensor.ix * shift_x)
+    return sensor.filtered(1 + amplitude * torch.complex(torch.cos(angle), torch.sin(angle)))

@@ -1,0 +1,311 @@
+"""Fits of effects to captures: damped Gauss-Newton on the very error that is reported.
+
+Columns of the Jacobian are secants one small physical step wide. They cost one prediction from the effect's own
+stage on, whatever the effect does inside, and an iris edge or a laser line, whose derivative is zero or jumps where
+the effect is absent, has a good one. What the fit minimises is the squared error in counts, unweighted: the reported
+excess. The gain of each colour is always fitted along.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from trainer.effects.definition import STAGES, Effect
+from trainer.evidence import Batch
+from trainer.excess import Errors, errors_of, join
+from trainer.model import Model, Present, Values, absent, raised
+from trainer.prediction import Scene, Stages, Trace, counts, light_on_camera, scene_for, stages_for, trace
+
+STEP = 0.1  # of a parameter's scale: large against single precision's rounding, small against curvature
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A fitted model with its error on the captures it saw, and the covariance of what was fitted."""
+
+    model: Model
+    errors: Errors
+    covariance: np.ndarray
+    keys: tuple[tuple[str, str, int], ...]  # (effect, parameter, index into its values)
+
+
+class Predictor:
+    """Predictions of one batch under changing models, each from the first stage that changed."""
+
+    def __init__(self, model: Model, batch: Batch) -> None:
+        self.scene: Scene = scene_for(model, batch.channel, batch.plane_mm, batch.signal.dtype)
+        self.batch = batch
+
+    def stages(self, model: Model) -> Stages:
+        """The scene's stages under a model."""
+        return stages_for(self.scene, model.present)
+
+    def trace(self, model: Model, start: str = "drive", before: Trace | None = None) -> Trace:
+        """Spectrum and irradiance from stage `start` on, a capture at a time to stay in the processor's cache."""
+        if before is not None and start == "sensor":
+            return before
+        stages = self.stages(model)
+        parts = []
+        for k in range(self.batch.gray.shape[0]):
+            one = None if before is None else Trace(before.spectrum[k : k + 1], before.image[k : k + 1])
+            parts.append(trace(self.scene, stages, self.batch.gray[k : k + 1], start, one))
+        return Trace(torch.cat([p.spectrum for p in parts]), torch.cat([p.image for p in parts]))
+
+    def light(self, model: Model, point: Trace) -> Tensor:
+        """Irradiance on the camera [B, h, w]."""
+        return light_on_camera(self.scene, self.stages(model), point.image)
+
+    def counts(self, model: Model, light: Tensor) -> Tensor:
+        """Counts above black [B, h, w]."""
+        gain = model.gain[self.batch.channel] * self.batch.exposure[:, None, None]
+        measured = (self.batch.signal, self.batch.weight)
+        return counts(self.scene, self.stages(model), light, gain, measured)
+
+    def predict(self, model: Model, start: str = "drive", before: Trace | None = None) -> Tensor:
+        """Counts above black [B, h, w], from stage `start` on."""
+        return self.counts(model, self.light(model, self.trace(model, start, before)))
+
+
+def with_gain(model: Model, predictors: Sequence[Predictor], points: Sequence[Trace] | None = None) -> Model:
+    """The model with each colour's gain by least squares, other parameters as they are."""
+    sums: dict[str, list[float]] = {}
+    for k, predictor in enumerate(predictors):
+        batch = predictor.batch
+        unit = replace(model, gain={batch.channel: 1.0})
+        stages = predictor.stages(unit)
+        linear = replace(stages.sensor, offset=None, response=None, free_capture_gain=False)
+        point = predictor.trace(unit) if points is None else points[k]
+        light = light_on_camera(predictor.scene, stages, point.image)
+        one = counts(predictor.scene, replace(stages, sensor=linear), light, batch.exposure[:, None, None], None)
+        seen = batch.signal if stages.sensor.offset is None else batch.signal - stages.sensor.offset
+        total = sums.setdefault(batch.channel, [0.0, 0.0])
+        total[0] += float((batch.weight * seen * one).sum(dtype=torch.float64))
+        total[1] += float((batch.weight * one**2).sum(dtype=torch.float64))
+    gain = {**model.gain, **{c: max(a, 1e-12) / max(b, 1e-30) for c, (a, b) in sums.items()}}
+    return replace(model, gain=gain)
+
+
+def evaluate(model: Model, batches: Sequence[Batch]) -> Errors:
+    """Errors of a model, with the gains it has, on batches."""
+    with torch.no_grad():
+        return join([errors_of(b, Predictor(model, b).predict(model)) for b in batches])
+
+
+def start_points(effect: Effect, model: Model) -> list[Present]:
+    """Where a fit of an effect starts: absent, and every combination of its parameters' own starting values."""
+    base = absent(effect, model.bench)
+    choices = [
+        [(p.name, s) for s in (p.starts or ((p.scale,) if p.even else (p.absent_value(model.bench),)))]
+        for p in effect.parameters
+    ]
+    return [
+        base.with_values({n: np.full_like(base.values[n], s) for n, s in combination})
+        for combination in itertools.product(*choices)
+    ]
+
+
+def best_start(model: Model, predictors: Sequence[Predictor], points: Sequence[Trace], starts: list[Present]) -> Present:
+    """The start whose prediction, with its own gain, has the smallest error."""
+    best, least = starts[0], np.inf
+    for start in starts:
+        trial = model.having(start)
+        stage = start.effect.stage
+        moved = [p.trace(trial, stage, t) for p, t in zip(predictors, points, strict=True)]
+        trial = with_gain(trial, predictors, moved)
+        error = sum(_cost(p, p.counts(trial, p.light(trial, t))) for p, t in zip(predictors, moved, strict=True))
+        if error < least:
+            best, least = start, error
+    return best
+
+
+def _cost(predictor: Predictor, prediction: Tensor) -> float:
+    batch = predictor.batch
+    return float((batch.weight * (batch.signal - prediction) ** 2).sum(dtype=torch.float64))
+
+
+def fit(
+    model: Model,
+    free: Sequence[str],
+    batches: Sequence[Batch],
+    iterations: int = 12,
+    tolerance: float = 1e-3,
+    progress: Callable[[float], None] | None = None,
+) -> Fitted:
+    """Fit the named effects of a model, and the gains, to batches.
+
+    Stops after `iterations`, or when a step lowers the excess by less than `tolerance` of it and less than 2e-6.
+    Errors are standard errors from the residuals themselves (a sandwich), so misfit widens them.
+    """
+    with torch.no_grad():
+        return _fit(model, tuple(free), batches, iterations, tolerance, progress)
+
+
+def _fit(
+    model: Model,
+    free: tuple[str, ...],
+    batches: Sequence[Batch],
+    iterations: int,
+    tolerance: float,
+    progress: Callable[[float], None] | None,
+) -> Fitted:
+    predictors = [Predictor(model, b) for b in batches]
+    keys = _keys(model, free)
+    first = min((_present(model, n).effect.stage for n in free), key=STAGES.index, default="sensor")
+    points = [p.trace(model) for p in predictors]
+    if not model.gain or any(b.channel not in model.gain for b in batches):
+        model = with_gain(model, predictors, points)
+    damping = 1e-3
+    errors, normal, gradient, scatter = _linearise(model, keys, predictors, points)
+    for iteration in range(iterations):
+        if progress:
+            progress(iteration / iterations)
+        before = errors.excess
+        accepted = False
+        for _ in range(6):
+            step = _solve(normal, gradient, damping)
+            trial = _moved(model, keys, step)
+            trial_points = [p.trace(trial, first, t) for p, t in zip(predictors, points, strict=True)]
+            trial_errors = join(
+                [errors_of(p.batch, p.counts(trial, p.light(trial, t))) for p, t in zip(predictors, trial_points, strict=True)]
+            )
+            if trial_errors.excess < before:
+                accepted = True
+                break
+            damping = max(damping, 1e-4) * 8
+        if not accepted:
+            break
+        model, points = trial, trial_points
+        damping = max(damping / 10, 1e-7)
+        gone = before - trial_errors.excess
+        errors = trial_errors
+        if gone < max(tolerance * abs(trial_errors.excess), 2e-6):
+            break
+        if iteration + 1 < iterations:
+            errors, normal, gradient, scatter = _linearise(model, keys, predictors, points)
+    inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
+    covariance = inverse @ scatter @ inverse
+    return Fitted(_with_errors(model, keys, covariance), errors, covariance, keys)
+
+
+def _present(model: Model, name: str) -> Present:
+    return next(p for p in model.present if p.effect.name == name)
+
+
+def _keys(model: Model, free: Sequence[str]) -> tuple[tuple[str, str, int], ...]:
+    keys = []
+    for name in free:
+        present = _present(model, name)
+        for p in present.effect.parameters:
+            keys += [(name, p.name, i) for i in range(present.values[p.name].size)]
+    return tuple(keys)
+
+
+def stepped(model: Model, key: tuple[str, str, int], change: float) -> Model:
+    """The model with one number of one effect changed, held within its physical range."""
+    name, parameter, index = key
+    present = _present(model, name)
+    p = present.effect.parameter(parameter)
+    values = present.values[parameter].copy()
+    flat = values.reshape(-1)
+    flat[index] = min(max(flat[index] + change, p.low), p.high)
+    return model.having(replace(present, values={**present.values, parameter: values}))
+
+
+def column_step(model: Model, key: tuple[str, str, int]) -> float:
+    """Width of the secant that stands for a derivative: towards the inside of the range."""
+    present = _present(model, key[0])
+    p = present.effect.parameter(key[1])
+    value = float(present.values[key[1]].reshape(-1)[key[2]])
+    step = p.scale * (1.0 if p.even and value < p.scale else STEP)
+    return -step if value + step > p.high else step
+
+
+def columns(
+    model: Model, keys: Sequence[tuple[str, str, int]], predictor: Predictor, point: Trace
+) -> tuple[Tensor, list[Tensor]]:
+    """Prediction [B, h, w] and its change a unit of each parameter, then of the logarithm of the gain."""
+    light = predictor.light(model, point)
+    base = predictor.counts(model, light)
+    result = []
+    for key in keys:
+        step = column_step(model, key)
+        stage = _present(model, key[0]).effect.stage
+        moved = predictor.predict(stepped(model, key, step), stage, point)
+        result.append((moved - base) / step)
+    louder = replace(model, gain={c: g * 1.01 for c, g in model.gain.items()})
+    result.append((predictor.counts(louder, light) - base) / 0.01)
+    return base, result
+
+
+def _linearise(
+    model: Model, keys: tuple[tuple[str, str, int], ...], predictors: Sequence[Predictor], points: Sequence[Trace]
+) -> tuple[Errors, np.ndarray, np.ndarray, np.ndarray]:
+    channels = list(dict.fromkeys(p.batch.channel for p in predictors))
+    size = len(keys) + len(channels)
+    normal, scatter = np.zeros((size, size)), np.zeros((size, size))
+    gradient = np.zeros(size)
+    errors = []
+    for predictor, point in zip(predictors, points, strict=True):
+        batch = predictor.batch
+        base, slopes = columns(model, keys, predictor, point)
+        errors.append(errors_of(batch, base))
+        which = [*range(len(keys)), len(keys) + channels.index(batch.channel)]
+        jacobian = (torch.stack(slopes) * batch.weight).reshape(len(slopes), -1)
+        residual = (batch.weight * (batch.signal - base)).reshape(-1)
+        place = np.ix_(which, which)
+        normal[place] += (jacobian @ jacobian.T).double().numpy()
+        gradient[which] += (jacobian @ residual).double().numpy()
+        weighted = jacobian * residual
+        scatter[place] += (weighted @ weighted.T).double().numpy()
+    return join(errors), normal, gradient, scatter
+
+
+def _solve(normal: np.ndarray, gradient: np.ndarray, damping: float) -> np.ndarray:
+    diagonal = np.sqrt(np.maximum(np.diag(normal), 1e-30))
+    scaled = normal / np.outer(diagonal, diagonal)
+    scaled[np.diag_indices_from(scaled)] += damping + 1e-9
+    return np.linalg.solve(scaled, gradient / diagonal) / diagonal
+
+
+def _moved(model: Model, keys: tuple[tuple[str, str, int], ...], step: np.ndarray) -> Model:
+    channels = list(model.gain)
+    for key, change in zip(keys, step, strict=False):
+        model = stepped(model, key, float(change))
+    logs = dict(zip(channels, step[len(keys) :], strict=False))
+    gain = {c: g * float(np.exp(np.clip(logs.get(c, 0.0), -1, 1))) for c, g in model.gain.items()}
+    return replace(model, gain=gain)
+
+
+def _with_errors(model: Model, keys: tuple[tuple[str, str, int], ...], covariance: np.ndarray) -> Model:
+    spread = np.sqrt(np.maximum(np.diag(covariance), 0))
+    for name in dict.fromkeys(k[0] for k in keys):
+        present = _present(model, name)
+        errors: Values = {n: np.zeros_like(v) for n, v in present.values.items()}
+        for i, (effect_name, parameter, index) in enumerate(keys):
+            if effect_name == name:
+                errors[parameter].reshape(-1)[index] = spread[i]
+        model = model.having(replace(present, errors=errors))
+    return model
+
+
+def raise_order(fitted: Fitted, name: str, batches: Sequence[Batch], gain_needed: Callable[[float], float]) -> Fitted:
+    """Raise the order of an effect's map or curve while the error keeps falling.
+
+    `gain_needed(excess)` is how much excess a higher order must remove to be kept.
+    """
+    while True:
+        present = _present(fitted.model, name)
+        higher = [o for o in present.effect.orders if o > present.order]
+        if not higher:
+            return fitted
+        trial = fitted.model.having(raised(present, fitted.model.bench, higher[0]))
+        better = fit(trial, [name], batches)
+        if fitted.errors.excess - better.errors.excess < gain_needed(fitted.errors.excess):
+            return fitted
+        fitted = better

@@ -1,0 +1,383 @@
+"""What the camera would have counted, for a model and a set of patterns: the trainer's use of the light path.
+
+A `Scene` holds what is fixed for one colour and one plane. A prediction runs through three points at which it can
+be picked up again when only a later stage has changed: the panel's spectrum, irradiance, counts.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from runtime.lightpath import (
+    Grid,
+    LightPath,
+    at_pixels,
+    band_frequencies,
+    grid_for,
+    image_frequencies,
+    mode_irradiance,
+    panel_phase,
+    panel_spectrum,
+)
+from runtime.fft import irfft2, rfft2
+from runtime.propagation import Aperture, band_limit, check_sampling, transfer_function
+from trainer.bench_file import Bench
+from trainer.effects.definition import STAGES, Effect
+from trainer.model import Model, Present
+from trainer.stages import Drive, Panel, Pupil, Sensor
+
+IRIS_ROOM = 1.25  # how far an effect may open or move the iris, in units of what the bench says
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One colour and one plane of a bench: sizes, and coordinates as tensors of one precision."""
+
+    bench: Bench
+    channel: str
+    plane_mm: float
+    method: str
+    grid: Grid
+    dtype: torch.dtype
+
+    @property
+    def wavelength(self) -> float:
+        """Metres."""
+        return self.bench.channel(self.channel).wavelength
+
+    def channel_row(self) -> int:
+        """Index of the colour in per-channel parameters."""
+        return [c.name for c in self.bench.channels].index(self.channel)
+
+
+def scene_for(model: Model, channel: str, plane_mm: float, dtype: torch.dtype = torch.float32) -> Scene:
+    """The scene of a model. Raises InputError where the propagation method's sampling does not hold."""
+    opened = IRIS_ROOM if any(p.effect.touches_iris for p in model.present) else 1.0
+    return _scene(model.bench, channel, plane_mm, model.method, opened, dtype)
+
+
+@lru_cache(maxsize=64)
+def _scene(
+    bench: Bench, channel: str, plane_mm: float, method: str, opened: float, dtype: torch.dtype
+) -> Scene:
+    wavelength = bench.channel(channel).wavelength
+    panel = bench.panel
+    half_width = min(bench.iris.half_width * opened, 1.95)
+    distance = plane_mm * 1e-3
+    grid = grid_for(panel.shape, panel.pitch, wavelength, distance, half_width)
+    check_sampling(
+        method,
+        Aperture(panel.shape, grid.padded, panel.pitch),
+        wavelength,
+        distance,
+        half_width / (2 * panel.pitch),
+    )
+    return Scene(bench, channel, plane_mm, method, grid, dtype)
+
+
+@dataclass(frozen=True)
+class Stages:
+    """The four stages of a scene with a model's effects applied."""
+
+    drive: Drive
+    panel: Panel
+    pupil: Pupil
+    sensor: Sensor
+
+
+@lru_cache(maxsize=32)
+def _bare(scene: Scene) -> Stages:
+    """The stages as the bench file has them."""
+    bench, grid, dtype = scene.bench, scene.grid, scene.dtype
+    height, width = bench.panel.shape
+    panel_y, panel_x = _coordinates(height, width, dtype)
+    camera_y, camera_x = _coordinates(*bench.camera.shape, dtype)
+    like = torch.zeros((), dtype=dtype)
+    reference = bench.channels[0].wavelength
+    level = torch.arange(256, dtype=dtype) / bench.panel.levels
+    drive = Drive(
+        scene.channel,
+        scene.wavelength,
+        reference,
+        bench.panel.phase_sign,
+        panel_y,
+        panel_x,
+        level,
+        bench.panel.phase_sign * 2 * math.pi * level,
+    )
+    side = torch.full((2,), math.sqrt(bench.panel.fill_factor), dtype=dtype)
+    source = torch.ones((height, width), dtype=dtype).to(torch.complex64 if dtype == torch.float32 else torch.complex128)
+    panel = Panel(
+        scene.channel, scene.wavelength, reference, bench.panel.pitch, panel_y, panel_x, source, None, side
+    )
+    fy, fx = band_frequencies(grid, like)
+    iy, ix = image_frequencies(grid, like)
+    edge = 1 / (2 * bench.panel.pitch)
+    zero = torch.zeros((), dtype=dtype)
+    pupil = Pupil(
+        scene.channel,
+        scene.wavelength,
+        reference,
+        bench.panel.pitch,
+        fy[:, None],
+        fx[None, :],
+        fy[:, None] / edge,
+        fx[None, :] / edge,
+        iy[:, None],
+        ix[None, :],
+        torch.tensor(scene.plane_mm * 1e-3, dtype=dtype),
+        torch.tensor(bench.iris.half_width, dtype=dtype),
+        (zero, zero),
+        bench.iris.shape,
+    )
+    sensor = Sensor(
+        scene.channel,
+        bench.camera.full_scale,
+        camera_y,
+        camera_x,
+        iy[:, None] * bench.panel.pitch,
+        ix[None, :] * bench.panel.pitch,
+    )
+    return Stages(drive, panel, pupil, sensor)
+
+
+def _coordinates(height: int, width: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    y = (torch.arange(height, dtype=dtype) - (height - 1) / 2) / (height / 2)
+    x = (torch.arange(width, dtype=dtype) - (width - 1) / 2) / (width / 2)
+    return torch.broadcast_tensors(y[:, None], x[None, :])  # type: ignore[return-value]
+
+
+def stages_for(scene: Scene, present: tuple[Present, ...], tensors: Any = None) -> Stages:
+    """The scene's stages with effects applied in the order of `present`.
+
+    `tensors` gives {effect name: {parameter: tensor}} where values are to be differentiated; others are taken from
+    `present`. Per-channel parameters are cut to the scene's own colour.
+    """
+    stages = _bare(scene)
+    row = scene.channel_row()
+    for one in present:
+        given = (tensors or {}).get(one.effect.name, {})
+        arguments = {}
+        for p in one.effect.parameters:
+            value = given.get(p.name)
+            if value is None:
+                value = torch.as_tensor(one.values[p.name], dtype=scene.dtype)
+            arguments[p.name] = value[row] if p.per_channel else value
+        stage = one.effect.stage
+        stages = replace(stages, **{stage: one.effect.apply(getattr(stages, stage), **arguments)})
+    return stages
+
+
+def light_path(scene: Scene, stages: Stages) -> LightPath:
+    """The arrays that stand for drive, panel and pupil, ready for `runtime.lightpath`."""
+    transfers, weights = pupil_modes(scene, stages.pupil)
+    return LightPath(
+        grid=scene.grid,
+        response=stages.drive.response,
+        source=stages.panel.source,
+        transfers=transfers,
+        weights=weights,
+        gain=stages.drive.gain,
+        crosstalk=stages.drive.crosstalk,
+        leak=stages.panel.leak,
+        aperture=(stages.panel.aperture[0], stages.panel.aperture[1]),
+        irradiance_filter=display_filter(stages),
+    )
+
+
+def display_filter(stages: Stages) -> Tensor | None:
+    """The irradiance filter that the eye sees too: source extent and ghosts."""
+    parts = [f for f in (stages.pupil.irradiance_filter, stages.sensor.irradiance_filter) if f is not None]
+    if not parts:
+        return None
+    return parts[0] if len(parts) == 1 else parts[0] * parts[1]
+
+
+def pupil_modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
+    """Transfer functions [M, n, m] and weights [M] of the pupil's modes."""
+    if pupil.lines is None:
+        offsets, weights = torch.zeros(1, dtype=scene.dtype), torch.ones(1, dtype=scene.dtype)
+    else:
+        offsets, weights = pupil.lines
+    opening = iris_opening(scene, pupil)
+    if pupil.transmission is not None:
+        opening = opening * pupil.transmission
+    grid = scene.grid
+    limits = tuple(
+        band_limit(scene.wavelength, scene.plane_mm * 1e-3, n * grid.pitch) for n in grid.padded
+    )
+    modes = []
+    for offset in offsets:
+        wavelength = scene.wavelength + offset
+        mode = opening * transfer_function(
+            pupil.fy, pupil.fx, wavelength, pupil.distance, (limits[0], limits[1]), scene.method
+        )
+        if pupil.path_difference is not None:
+            angle = 2 * math.pi / wavelength * pupil.path_difference
+            mode = mode * torch.polar(torch.ones_like(angle), angle)
+        modes.append(mode)
+    return torch.stack(modes), weights
+
+
+def iris_opening(scene: Scene, pupil: Pupil) -> Tensor:
+    """What the iris passes of each frequency, 0 .. 1.
+
+    A frequency on the edge passes whole; one a bin beyond it, nothing; between them a ramp, so that the size and
+    the place of the iris have gradients.
+    """
+    bins = [2 / n for n in scene.grid.padded]  # width of a frequency bin, share of the band
+    v, u = pupil.v - pupil.centre[0], pupil.u - pupil.centre[1]
+    if pupil.shape == "circle":
+        bin_width = math.sqrt(bins[0] * bins[1])
+        return torch.clamp((pupil.half_width - torch.sqrt(v**2 + u**2 + 1e-12)) / bin_width + 1, 0, 1)
+    # Rounding of v and u must not close an edge bin: 1e-4 of a bin is nothing.
+    rows = torch.clamp((pupil.half_width - torch.abs(v)) / bins[0] + 1.0001, 0, 1)
+    columns = torch.clamp((pupil.half_width - torch.abs(u)) / bins[1] + 1.0001, 0, 1)
+    return rows * columns
+
+
+@dataclass(frozen=True)
+class Trace:
+    """Points of a prediction at which it can be picked up: the panel's spectrum, and irradiance before filters."""
+
+    spectrum: Tensor
+    image: Tensor
+
+
+def trace(scene: Scene, stages: Stages, gray: Tensor, start: str = "drive", before: Trace | None = None) -> Trace:
+    """Spectrum and irradiance of patterns [B, H, W], recomputed from stage `start` on; earlier ones from `before`."""
+    if before is not None and start == "sensor":
+        return before
+    path = light_path(scene, stages)
+    if before is not None and start == "pupil":
+        spectrum = before.spectrum
+    else:
+        spectrum = panel_spectrum(path, panel_phase(path, gray))
+    return Trace(spectrum, mode_irradiance(path, spectrum))
+
+
+def light_on_camera(scene: Scene, stages: Stages, image: Tensor) -> Tensor:
+    """Irradiance that camera pixels integrate [B, h, w], before gain, offset and response."""
+    grid, camera = scene.grid, scene.bench.camera
+    sensor = stages.sensor
+    transfer = _pixel_area(scene, sensor)
+    for extra in (stages.pupil.irradiance_filter, sensor.irradiance_filter, sensor.blur):
+        if extra is not None:
+            transfer = transfer * extra
+    moved = sensor.displacement is not None or not camera.registered
+    if moved:
+        transfer = transfer / (_spline_transfer(sensor.iy / 2) * _spline_transfer(sensor.ix / 2))
+    filtered = irfft2(rfft2(image) * transfer, grid.image_shape)
+    if not moved:
+        return at_pixels(grid, filtered)
+    y, x = camera_positions(scene)
+    if sensor.displacement is not None:
+        y, x = y + sensor.displacement[0], x + sensor.displacement[1]
+    return _spline_samples(filtered, 2 * (y + grid.margin), 2 * (x + grid.margin))
+
+
+def counts(scene: Scene, stages: Stages, light: Tensor, gain: Tensor, measured: tuple[Tensor, Tensor] | None) -> Tensor:
+    """Counts above black [B, h, w] for light on the camera; `gain` [B, 1, 1] is counts a unit of light.
+
+    `measured` (signal, weight) is what each capture's own gain is taken from where laser power drifts.
+    """
+    sensor = stages.sensor
+    signal = light * gain
+    if sensor.gain is not None:
+        signal = signal * sensor.gain
+    if sensor.free_capture_gain and measured is not None:
+        seen, weight = measured
+        if sensor.offset is not None:
+            seen = seen - sensor.offset
+        own = (seen * signal * weight).sum((-2, -1)) / (signal**2 * weight).sum((-2, -1))
+        signal = signal * own[:, None, None]
+    if sensor.offset is not None:
+        signal = signal + sensor.offset
+    if sensor.response is not None:
+        signal = sensor.response(signal / sensor.full_scale) * sensor.full_scale
+    return signal
+
+
+@lru_cache(maxsize=32)
+def camera_positions(scene: Scene) -> tuple[Tensor, Tensor]:
+    """Where each camera pixel's centre looks, in panel pixels: (y, x), each [h, w]."""
+    height, width = scene.bench.camera.shape
+    y, x = np.meshgrid(np.arange(height, dtype=float), np.arange(width, dtype=float), indexing="ij")
+    matrix = scene.bench.camera.homography
+    if matrix is not None:
+        h = np.asarray(matrix, dtype=float).reshape(3, 3)
+        w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
+        y, x = (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w, (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w
+    return torch.as_tensor(y, dtype=scene.dtype), torch.as_tensor(x, dtype=scene.dtype)
+
+
+def _pixel_area(scene: Scene, sensor: Sensor) -> Tensor:
+    """Transfer function of the camera pixel's area."""
+    camera = scene.bench.camera
+    side = camera.pixel_um / scene.bench.panel.pitch_um
+    if camera.homography is None:
+        rows, columns = sensor.iy * side, sensor.ix * side
+    else:
+        # The pixel's two sides as the homography puts them on the panel, at the picture's centre.
+        y, x = camera_positions(scene)
+        i, j = camera.height // 2, camera.width // 2
+        rows = sensor.iy * (y[i + 1, j] - y[i, j]) + sensor.ix * (x[i + 1, j] - x[i, j])
+        columns = sensor.iy * (y[i, j + 1] - y[i, j]) + sensor.ix * (x[i, j + 1] - x[i, j])
+    return torch.sinc(rows) * torch.sinc(columns)
+
+
+def _spline_transfer(cycles_per_sample: Tensor) -> Tensor:
+    """Sum of cubic B-splines at whole samples: dividing by it makes spline samples pass through the data."""
+    return (2 + torch.cos(2 * math.pi * cycles_per_sample)) / 3
+
+
+def _spline_samples(coefficients: Tensor, y: Tensor, x: Tensor) -> Tensor:
+    """Cubic B-spline sum at positions y, x [h, w] (samples) of coefficients [B, m, n]: [B, h, w]."""
+    height, width = coefficients.shape[-2:]
+    flat = coefficients.reshape(coefficients.shape[0], -1)
+    rows, row_weights = _spline_taps(y, height)
+    columns, column_weights = _spline_taps(x, width)
+    total = torch.zeros(1, dtype=coefficients.dtype)
+    for i in range(4):
+        inner = torch.zeros(1, dtype=coefficients.dtype)
+        for j in range(4):
+            index = (rows[i] * width + columns[j]).reshape(-1)
+            inner = inner + flat[:, index].reshape(-1, *y.shape) * column_weights[j]
+        total = total + inner * row_weights[i]
+    return total
+
+
+def _spline_taps(position: Tensor, count: int) -> tuple[list[Tensor], list[Tensor]]:
+    position = torch.clamp(position, 1, count - 3)
+    whole = torch.floor(position.detach())
+    t = position - whole
+    first = whole.long()
+    weights = [
+        (1 - t) ** 3 / 6,
+        (3 * t**3 - 6 * t**2 + 4) / 6,
+        (-3 * t**3 + 3 * t**2 + 3 * t + 1) / 6,
+        t**3 / 6,
+    ]
+    return [first + k - 1 for k in range(4)], weights
+
+
+def ideal_irradiance(bench: Bench, gray: np.ndarray, channel: str, plane_mm: float) -> np.ndarray:
+    """What the bench file alone predicts for one pattern: float32 [h, w] in camera pixels, of arbitrary scale."""
+    model = Model(bench)
+    scene = scene_for(model, channel, plane_mm)
+    stages = stages_for(scene, ())
+    with torch.no_grad():
+        patterns = torch.as_tensor(gray.astype(np.int64))[None]
+        return light_on_camera(scene, stages, trace(scene, stages, patterns).image)[0].numpy()
+
+
+def first_stage(effects: list[Effect]) -> str:
+    """The earliest stage that any of the effects acts on."""
+    return min((e.stage for e in effects), key=STAGES.index, default="sensor")

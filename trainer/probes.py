@@ -1,0 +1,343 @@
+"""Free-form probes: the most general thing each stage could be doing, fitted alone.
+
+The stage whose probe removes most of the held-out excess is where the missing physics sits, also when no named
+effect fits; and a fitted probe is a picture, in which a fringe, a speck or a stripe is recognised at sight. Probes
+are fitted by L-BFGS with the light path's own gradient, from "absent", and stopped early: what one capture's noise
+asks of a map is not what the others ask, so the first iterations find what all captures share.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from runtime.lightpath import mode_irradiance, panel_phase, panel_spectrum
+from trainer.bases import legendre_count, legendre_curve, legendre_maps
+from trainer.candidates import _captures, chosen
+from trainer.evidence import Batch, load, load_batch
+from trainer.excess import Errors, Removed, errors_of, join, removed
+from trainer.fit import Predictor
+from trainer.model import Model
+from trainer.prediction import Stages, Trace, counts, light_on_camera, light_path, trace
+
+Picture = tuple[str, np.ndarray, str]
+Tensors = dict[str, Tensor]
+
+ITERATIONS = {"drive": 14, "panel": 24, "pupil": 24, "sensor": 24}
+CAPTURES = {"drive": 4, "panel": 8, "pupil": 6, "sensor": 8}
+NODES = 100_000  # most nodes of a free map; larger panels get a coarser map
+PUPIL_NODES = 97  # nodes of the pupil's map across its extent, an axis
+PUPIL_EXTENT = 1.3  # of the panel's band
+KNOTS = 33
+SMOOTH_ORDER = 6
+TAPS = 9  # of the sensor's free kernel, half a pixel apart
+
+
+@dataclass(frozen=True)
+class ProbeFit:
+    """A fitted probe: held-out errors with it, and what it looks like."""
+
+    stage: str
+    held_out: Errors
+    pictures: tuple[Picture, ...]
+
+
+@dataclass(frozen=True)
+class Probed:
+    """A probe judged against the model without it."""
+
+    stage: str
+    gone: Removed
+    excess_after: float
+    pictures: tuple[Picture, ...]
+
+    @classmethod
+    def judged(cls, found: ProbeFit, before: Errors) -> Probed:
+        """How much held-out excess the probe removes."""
+        return cls(found.stage, removed(before, found.held_out), found.held_out.excess, found.pictures)
+
+    def as_json(self) -> dict[str, Any]:
+        """The contract's keys, and an interval."""
+        low, high = self.gone.interval()
+        return {
+            "stage": self.stage,
+            "excess_removed": self.gone.value,
+            "excess_after": self.excess_after,
+            "ci95": [low, high],
+        }
+
+
+def probe(folder: Path, ids: tuple[str, ...], held_ids: tuple[str, ...], model: Model, stage: str) -> ProbeFit:
+    """Fit one stage's probe on some captures and judge it on others."""
+    captures = _captures(folder)
+    batches = load(captures, chosen(captures, ids)[: max(CAPTURES[stage], len(captures.channels))])
+    kind = PROBES[stage](model, batches[0])
+    workings = [_Working(model, b) for b in batches]
+    scale = sum(float(errors_of(b, torch.zeros_like(b.signal)).variance.sum()) for b in batches)
+    raw = {n: torch.zeros(shape, requires_grad=True) for n, (shape, _) in kind.shapes.items()}
+
+    def physical() -> Tensors:
+        return {n: t * kind.shapes[n][1] for n, t in raw.items()}
+
+    optimiser = torch.optim.LBFGS(
+        list(raw.values()),
+        max_iter=ITERATIONS[stage],
+        max_eval=2 * ITERATIONS[stage],
+        history_size=10,
+        line_search_fn="strong_wolfe",
+    )
+
+    def loss_and_gradient() -> float:
+        optimiser.zero_grad()
+        total = 0.0
+        for working in workings:
+            for k in range(len(working.batch.ids)):
+                loss = working.squared_error(kind, physical(), k) / scale
+                loss.backward()
+                total += float(loss)
+        return total
+
+    optimiser.step(loss_and_gradient)
+    with torch.no_grad():
+        found = physical()
+        parts = []
+        for row in chosen(captures, held_ids):
+            working = _Working(model, load_batch(captures, [row]))
+            parts.append(errors_of(working.batch, working.predict(kind, found, 0)))
+        return ProbeFit(stage, join(parts), tuple(kind.pictures(found)))
+
+
+class _Working:
+    """One batch under a model, ready to be predicted with a probe on top."""
+
+    def __init__(self, model: Model, batch: Batch) -> None:
+        self.predictor = Predictor(model, batch)
+        self.batch = batch
+        self.stages = self.predictor.stages(model)
+        self.gain = model.gain[batch.channel] * batch.exposure[:, None, None]
+        with torch.no_grad():
+            self.base = self.predictor.trace(model)
+
+    def predict(self, kind: _Kind, tensors: Tensors, k: int) -> Tensor:
+        """Counts [1, h, w] of capture k."""
+        scene, gray = self.predictor.scene, self.batch.gray[k : k + 1]
+        stages = kind.apply(self.stages, tensors)
+        before = Trace(self.base.spectrum[k : k + 1], self.base.image[k : k + 1])
+        if "spread" in tensors:
+            image = _spread_in_time(scene, stages, gray, tensors["spread"])
+        else:
+            image = trace(scene, stages, gray, kind.stage, before).image
+        light = light_on_camera(scene, stages, image)
+        measured = (self.batch.signal[k : k + 1], self.batch.weight[k : k + 1])
+        return counts(scene, stages, light, self.gain[k : k + 1], measured)
+
+    def squared_error(self, kind: _Kind, tensors: Tensors, k: int) -> Tensor:
+        """Weighted squared error of capture k."""
+        error = self.batch.signal[k : k + 1] - self.predict(kind, tensors, k)
+        return (self.batch.weight[k : k + 1] * error**2).sum()
+
+
+def _spread_in_time(scene: Any, stages: Stages, gray: Tensor, spread: Tensor) -> Tensor:
+    """Mean irradiance over a phase whose gain swings by +-spread while the camera looks."""
+    path = light_path(scene, stages)
+    phase = panel_phase(path, gray)
+    both = [mode_irradiance(path, panel_spectrum(path, phase * (1 + s * spread))) for s in (-1, 1)]
+    return 0.5 * (both[0] + both[1])
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """A stage's probe. shapes: {name: (shape, physical units a unit of the optimiser's variable)}."""
+
+    stage: str
+    shapes: dict[str, tuple[tuple[int, ...], float]]
+    apply: Callable[[Stages, Tensors], Stages]
+    pictures: Callable[[Tensors], list[Picture]]
+
+
+def _drive(model: Model, batch: Batch) -> _Kind:
+    y, x = _field(*model.bench.panel.shape)
+    channels = [c.name for c in model.bench.channels]
+    taps = torch.tensor([[0.0, 0, 1, 0, 0], [0, 0, 1, 0, 0]])
+
+    def apply(stages: Stages, t: Tensors) -> Stages:
+        drive = stages.drive
+        knots = t["table"][channels.index(drive.channel)]
+        bend = _interpolated(knots, drive.level * (drive.level.shape[0] / 256))
+        moved = replace(drive, response=drive.response + bend)
+        moved = moved.scaled(1 + torch.tensordot(t["gain"], legendre_maps(y, x, SMOOTH_ORDER), dims=1))
+        if drive.crosstalk is None:
+            moved = replace(moved, crosstalk=(taps + t["rows"], taps + t["columns"]))
+        return replace(stages, drive=moved)
+
+    def pictures(t: Tensors) -> list[Picture]:
+        gain = torch.tensordot(t["gain"], legendre_maps(y, x, SMOOTH_ORDER), dims=1)
+        return [
+            *((f"response, deviation ({c})", _array(t["table"][k]), "rad") for k, c in enumerate(channels)),
+            ("gain of the phase over the panel", _array(gain), "relative"),
+            ("share of neighbours, rows then columns", _array(torch.cat((t["rows"], t["columns"]))), "1"),
+        ]
+
+    shapes = {
+        "table": ((len(channels), KNOTS), math.sqrt(KNOTS) / 4),
+        "gain": ((legendre_count(SMOOTH_ORDER),), 0.5),
+        "rows": ((2, 5), 0.5),
+        "columns": ((2, 5), 0.5),
+        "spread": ((), 0.3),
+    }
+    return _Kind("drive", shapes, apply, pictures)
+
+
+def _panel(model: Model, batch: Batch) -> _Kind:
+    height, width = model.bench.panel.shape
+    nodes = _nodes(height, width)
+
+    def apply(stages: Stages, t: Tensors) -> Stages:
+        panel = stages.panel
+        log, phase, real, imaginary = (_resized(t[n], (height, width)) for n in names)
+        phase = phase * (panel.reference_wavelength / panel.wavelength)
+        size = torch.exp(torch.clamp(log, -4, 2))
+        factor = torch.complex(size * torch.cos(phase), size * torch.sin(phase))
+        moved = panel.multiplied(factor).leaking(torch.complex(real, imaginary))
+        return replace(stages, panel=moved)
+
+    def pictures(t: Tensors) -> list[Picture]:
+        added = torch.hypot(t["real"], t["imaginary"])
+        return [
+            ("amplitude multiplied", _array(torch.exp(t["log"])), "relative"),
+            ("phase multiplied", _array(t["phase"]), "rad"),
+            ("amplitude added", _array(added), "of the modulated"),
+        ]
+
+    names = ("log", "phase", "real", "imaginary")
+    unit = math.sqrt(nodes[0] * nodes[1])
+    return _Kind("panel", {n: (nodes, unit) for n in names}, apply, pictures)
+
+
+def _pupil(model: Model, batch: Batch) -> _Kind:
+    def apply(stages: Stages, t: Tensors) -> Stages:
+        pupil = stages.pupil
+        log = _sampled(t["log"], pupil.v / PUPIL_EXTENT, pupil.u / PUPIL_EXTENT)
+        phase = _sampled(t["phase"], pupil.v / PUPIL_EXTENT, pupil.u / PUPIL_EXTENT)
+        phase = phase * (pupil.reference_wavelength / pupil.wavelength)
+        size = torch.exp(torch.clamp(log, -4, 2))
+        factor = torch.complex(size * torch.cos(phase), size * torch.sin(phase))
+        before = pupil.transmission
+        moved = replace(pupil, transmission=factor if before is None else before * factor)
+        reach = (2 * math.pi * 1e-3 * torch.abs(pupil.distance)) ** 2
+        rows, columns = t["extent"]
+        blur = torch.exp(-0.5 * reach * (rows * pupil.iy**2 + columns * pupil.ix**2))
+        return replace(stages, pupil=moved.filtered(blur))
+
+    def pictures(t: Tensors) -> list[Picture]:
+        return [
+            ("amplitude passed, over spatial frequency", _array(torch.exp(t["log"])), "relative"),
+            ("phase, over spatial frequency", _array(t["phase"]), "rad"),
+        ]
+
+    nodes = (PUPIL_NODES, PUPIL_NODES)
+    shapes = {"log": (nodes, PUPIL_NODES), "phase": (nodes, PUPIL_NODES), "extent": ((2,), 0.5)}
+    return _Kind("pupil", shapes, apply, pictures)  # type: ignore[arg-type]
+
+
+def _sensor(model: Model, batch: Batch) -> _Kind:
+    height, width = model.bench.camera.shape
+    nodes = _nodes(height, width)
+    full_scale = model.bench.camera.full_scale
+    y, x = _field(height, width)
+    smooth = legendre_maps(y, x, 3, 0)
+    reach = (torch.arange(TAPS) - TAPS // 2) / 2
+
+    def apply(stages: Stages, t: Tensors) -> Stages:
+        sensor = stages.sensor
+        gain = torch.exp(torch.clamp(_resized(t["gain"], (height, width)), -3, 3))
+        moved = replace(sensor, free_capture_gain=True).multiplied(gain)
+        moved = moved.brightened(full_scale * _resized(t["offset"], (height, width)))
+        moved = moved.displaced(*(torch.tensordot(t["shift"][k], smooth, dims=1) for k in (0, 1)))
+        kernel = t["kernel"]
+        rows = 2 * math.pi * sensor.iy * reach
+        columns = 2 * math.pi * sensor.ix.T * reach
+        real = torch.cos(rows) @ kernel @ torch.cos(columns).T - torch.sin(rows) @ kernel @ torch.sin(columns).T
+        odd = -(torch.sin(rows) @ kernel @ torch.cos(columns).T + torch.cos(rows) @ kernel @ torch.sin(columns).T)
+        moved = moved.blurred(torch.complex(1 + real, odd))
+
+        def curve(share: Tensor) -> Tensor:
+            inside = torch.clamp(share, -0.05, 1)
+            return share + inside * (1 - inside) * torch.tensordot(
+                t["bend"], legendre_curve(2 * inside - 1, t["bend"].shape[0]), dims=1
+            )
+
+        return replace(stages, sensor=moved.responding(curve))
+
+    def pictures(t: Tensors) -> list[Picture]:
+        shift = torch.tensordot(t["shift"], smooth, dims=1)
+        share = torch.linspace(0, 1, 101)
+        bend = share * (1 - share) * (t["bend"] @ legendre_curve(2 * share - 1, t["bend"].shape[0]))
+        return [
+            ("gain over the picture", _array(torch.exp(t["gain"])), "relative"),
+            ("light added", _array(full_scale * t["offset"]), "counts"),
+            ("displacement, rows", _array(shift[0]), "pixels"),
+            ("displacement, columns", _array(shift[1]), "pixels"),
+            ("kernel, half-pixel steps", _array(t["kernel"]), "1"),
+            ("response, deviation", _array(bend), "of full scale"),
+        ]
+
+    unit = math.sqrt(nodes[0] * nodes[1])
+    shapes = {
+        "gain": (nodes, unit),
+        "offset": (nodes, 0.1 * unit),
+        "shift": ((2, legendre_count(3, 0)), 2.0),
+        "kernel": ((TAPS, TAPS), 0.5),
+        "bend": ((6,), 1.0),
+    }
+    return _Kind("sensor", shapes, apply, pictures)
+
+
+PROBES: dict[str, Callable[[Model, Batch], _Kind]] = {
+    "drive": _drive,
+    "panel": _panel,
+    "pupil": _pupil,
+    "sensor": _sensor,
+}
+
+
+def _array(values: Tensor) -> np.ndarray:
+    return values.detach().float().numpy()
+
+
+def _field(height: int, width: int) -> tuple[Tensor, Tensor]:
+    y, x = ((torch.arange(n) - (n - 1) / 2) / (n / 2) for n in (height, width))
+    return torch.broadcast_tensors(y[:, None], x[None, :])  # type: ignore[return-value]
+
+
+def _nodes(height: int, width: int) -> tuple[int, int]:
+    shrink = max(1.0, math.sqrt(height * width / NODES))
+    return round(height / shrink), round(width / shrink)
+
+
+def _resized(nodes: Tensor, shape: tuple[int, int]) -> Tensor:
+    if tuple(nodes.shape) == shape:
+        return nodes
+    whole = torch.nn.functional.interpolate(nodes[None, None], shape, mode="bilinear", align_corners=True)
+    return whole[0, 0]
+
+
+def _sampled(nodes: Tensor, y: Tensor, x: Tensor) -> Tensor:
+    """A map given by nodes over -1 .. 1, at y [n, 1] and x [1, m]: bilinear, as two small matrix products."""
+    return _tents(y[:, 0], nodes.shape[0]) @ nodes @ _tents(x[0, :], nodes.shape[1]).T
+
+
+def _tents(position: Tensor, count: int) -> Tensor:
+    place = torch.clamp((position + 1) / 2 * (count - 1), 0, count - 1)
+    return torch.clamp(1 - torch.abs(place[:, None] - torch.arange(count)), min=0)
+
+
+def _interpolated(knots: Tensor, share: Tensor) -> Tensor:
+    return _tents(2 * share - 1, knots.shape[0]) @ knots

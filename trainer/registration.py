@@ -1,0 +1,229 @@
+"""Where the panel's pixels are in the camera's picture: a homography, given or found from a dot pattern.
+
+Points are (x, y) in pixels, x along columns; a pixel's centre has whole coordinates. A homography is 3 x 3,
+row-major, and takes the centre of a camera pixel (x, y, 1) to panel pixels (x, y, 1) up to scale.
+
+The dot pattern is a regular grid of dots with one broad dot in the corner nearest to the panel's pixel (0, 0),
+and a second, less broad one next to it along x. Together they tell every mirroring and quarter turn apart.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.spatial import cKDTree
+
+from firmware_iface.errors import InputError
+
+SPREAD = 0.11               # standard deviation of a plain dot, share of the spacing
+BROAD = (2.0, 1.5)          # of the marker's two dots, against a plain dot
+LIGHT = (1.8, 1.3)          # the least light of the marker's two dots, against their neighbours
+TOLERANCE = 0.25            # share of the spacing within which a found dot is an expected one
+FEWEST = 0.6                # share of the expected dots that must be found
+
+
+@dataclass(frozen=True)
+class Dots:
+    """The dots of a pattern. xy : float [n, 2], panel pixels, row by row; the marker's two dots come first."""
+
+    xy: np.ndarray
+    spacing: float
+    columns: int
+    rows: int
+
+
+def dots_of(shape: tuple[int, int], spacing: float) -> Dots:
+    """The dots that `dot_pattern` shows on a panel of that shape (height, width); spacing in panel pixels.
+
+    Raises InputError if fewer than 4 x 4 dots fit, or a dot would be too small to be shown.
+    """
+    rows, columns = (int((n - 1.2 * spacing) // spacing) + 1 if spacing > 0 else 0 for n in shape)
+    if not spacing >= 8 or rows < 4 or columns < 4:
+        raise InputError(f"dots {spacing:g} pixels apart do not make a grid of 4 x 4 on a panel of {shape[0]} x "
+                         f"{shape[1]} pixels: choose a spacing from 8 to {min(shape) / 4.4:.0f}")
+    left, top = (shape[1] - 1 - (columns - 1) * spacing) / 2, (shape[0] - 1 - (rows - 1) * spacing) / 2
+    grid = [(left + i * spacing, top + j * spacing) for j in range(rows) for i in range(columns)]
+    return Dots(np.asarray(grid), float(spacing), columns, rows)
+
+
+def dot_pattern(shape: tuple[int, int], spacing: float) -> np.ndarray:
+    """Irradiance to aim for, float32 [H, W], 0 to 1: Gaussian dots on black with an asymmetric marker.
+
+    Raises InputError as `dots_of` does.
+    """
+    dots = dots_of(shape, spacing)
+    y, x = np.arange(shape[0])[:, None], np.arange(shape[1])[None]
+    target = np.zeros(shape, np.float32)
+    for number, (px, py) in enumerate(dots.xy):
+        sigma = SPREAD * spacing * (BROAD[number] if number < 2 else 1.0)
+        across = np.exp(-((x - px) / sigma) ** 2 / 2)
+        target = np.maximum(target, np.exp(-((y - py) / sigma) ** 2 / 2) * across).astype(np.float32)
+    return target
+
+
+def find_homography(image: np.ndarray, dots: Dots) -> np.ndarray:
+    """The homography, float64 [3, 3], from a camera picture [h, w] of a dot pattern.
+
+    image : counts or any scale, uneven background allowed; mirrored and turned pictures are found as well
+    Raises InputError if too few dots are seen, or they are not the expected grid.
+    """
+    points, light = _spots(image)
+    if len(points) < FEWEST * len(dots.xy):
+        raise InputError(f"only {len(points)} of {len(dots.xy)} dots are seen in the dot picture: focus the "
+                         "camera, see that the whole pattern is in view, and expose so that the dots are bright "
+                         "but not saturated")
+    best: tuple[float, np.ndarray] | None = None
+    for first, second in _markers(points, light):
+        for guess in _guesses(points, first, second, dots):
+            fitted = _refined(points, guess, dots)
+            if fitted is not None and (best is None or fitted[0] > best[0]):
+                best = fitted
+        if best is not None and best[0] > len(dots.xy) * 0.9:
+            break
+    if best is None or best[0] < FEWEST * len(dots.xy):
+        raise InputError(f"{len(points)} dots are seen but they do not fit the expected {dots.columns} x "
+                         f"{dots.rows} grid with its marker: show this dot pattern with its corner of two broad "
+                         "dots in view, or use a wider spacing if the dots are less than 8 camera pixels apart")
+    return best[1] / best[1][2, 2]
+
+
+def panel_points(homography: np.ndarray, camera_xy: np.ndarray) -> np.ndarray:
+    """Panel points, float [n, 2], for camera points (x, y), [n, 2], pixels."""
+    points = np.concatenate([camera_xy, np.ones((len(camera_xy), 1))], 1) @ np.asarray(homography).T
+    return points[:, :2] / points[:, 2:]
+
+
+def resample(image: np.ndarray, homography: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """A camera picture [h, w] on the panel's pixels, float32 [H, W]; 0 where the camera did not look.
+
+    Interpolates with a Lanczos kernel: for looking at, and for making registered sets of finely sampled pictures.
+    """
+    there = np.ascontiguousarray(image, np.float32)
+    return cv2.warpPerspective(there, np.asarray(homography, np.float64), (shape[1], shape[0]),
+                               flags=cv2.INTER_LANCZOS4)
+
+
+def _spots(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (x, y), float [n, 2], of a picture's bright dots, and their light against neighbours', [n]."""
+    image = np.asarray(image)
+    if image.ndim != 2 or min(image.shape) < 16:
+        raise InputError(f"the dot picture has shape {image.shape}: give a gray picture, 16 x 16 pixels or more")
+    raw = np.nan_to_num(image.astype(np.float32), posinf=0, neginf=0)
+    picture: np.ndarray = cv2.GaussianBlur(raw, (0, 0), 0.7)
+    wide = max(picture.shape) / 6
+    background = cv2.GaussianBlur(picture, (0, 0), wide)
+    light = picture - np.minimum(background, np.median(picture))
+    noise = 1.4826 * float(np.median(np.abs(light - np.median(light))))
+    bright = float(np.quantile(light, 0.995))
+    level = float(np.median(light)) + max(6 * noise, 0.25 * (bright - float(np.median(light))))
+    count, _, stats, _ = cv2.connectedComponentsWithStats((light > level).astype(np.uint8), connectivity=8)
+    points = []
+    for label in range(1, count):
+        x, y, w, h, area = (int(v) for v in stats[label])
+        if area < 4 or x == 0 or y == 0 or x + w >= picture.shape[1] or y + h >= picture.shape[0]:
+            continue
+        if max(w, h) > 3 * min(w, h):
+            continue
+        points.append(_centroid(light, x + w / 2 - 0.5, y + h / 2 - 0.5, max(w, h)))
+    if len(points) < 9:
+        return np.zeros((0, 2)), np.zeros(0)
+    xy = np.asarray(points)
+    distance, near = cKDTree(xy).query(xy, k=9)
+    flux = _flux(light, xy, 0.48 * float(np.median(distance[:, 1])))
+    return xy, flux / np.maximum(np.median(flux[near[:, 1:]], axis=1), 1e-9)
+
+
+def _flux(light: np.ndarray, xy: np.ndarray, radius: float) -> np.ndarray:
+    """The light within radius pixels of each point, [n], above what is on the rim."""
+    reach = math.ceil(radius) + 1
+    flux = np.zeros(len(xy))
+    for number, (x, y) in enumerate(xy):
+        left, top = max(round(x) - reach, 0), max(round(y) - reach, 0)
+        part = light[top:round(y) + reach + 1, left:round(x) + reach + 1]
+        away = np.hypot(np.arange(part.shape[1]) + left - x, np.arange(part.shape[0])[:, None] + top - y)
+        inside = np.clip(radius + 0.5 - away, 0, 1)
+        rim = part[np.abs(away - radius) < 0.8]
+        flux[number] = float(((part - (np.median(rim) if rim.size else 0)) * inside).sum())
+    return flux
+
+
+def _centroid(light: np.ndarray, x: float, y: float, size: float) -> tuple[float, float]:
+    """The centre of a dot near (x, y), by its moments under a Gaussian window that follows it."""
+    sigma = max(size / 2.5, 1.0)
+    reach = math.ceil(2.5 * sigma)
+    for _ in range(12):
+        left, top = max(round(x) - reach, 0), max(round(y) - reach, 0)
+        part = light[top:round(y) + reach + 1, left:round(x) + reach + 1]
+        part = np.maximum(part - np.quantile(part, 0.1), 0)
+        u, v = np.arange(part.shape[1]) + left - x, np.arange(part.shape[0])[:, None] + top - y
+        weight = part * np.exp(-(u ** 2 + v ** 2) / (2 * sigma ** 2))
+        total = float(weight.sum()) + 1e-12
+        dx, dy = float((weight * u).sum()) / total, float((weight * v).sum()) / total
+        spread = float((weight * (u ** 2 + v ** 2)).sum()) / total / 2
+        width = math.sqrt(1 / max(1 / max(spread, 1e-3) - 1 / sigma ** 2, 1 / (9 * sigma ** 2)))
+        # the window pulls the moments towards its own centre: the step is lengthened by what it takes away
+        stretch = 1 + (width / sigma) ** 2
+        step = min(1.0, reach / (2 * stretch * math.hypot(dx, dy) + 1e-9))
+        x, y = x + stretch * dx * step, y + stretch * dy * step
+        if not (0 <= x < light.shape[1] and 0 <= y < light.shape[0]):
+            break
+        if math.hypot(dx, dy) < 1e-3:
+            break
+    return float(x), float(y)
+
+
+def _markers(points: np.ndarray, light: np.ndarray) -> list[tuple[int, int]]:
+    """Pairs of neighbouring dots that may be the marker (its broad dot, its second), the likeliest first."""
+    order = [int(i) for i in np.argsort(-light)[:6] if light[i] > LIGHT[1]]
+    tree = cKDTree(points)
+    step = float(np.median(tree.query(points, k=2)[0][:, 1]))
+    pairs = [(float(light[a] + light[b]), a, b) for a, b in itertools.permutations(order, 2)
+             if light[a] > max(light[b], LIGHT[0]) and np.hypot(*(points[a] - points[b])) < 1.6 * step]
+    return [(a, b) for _, a, b in sorted(pairs, reverse=True)[:4]]
+
+
+def _guesses(points: np.ndarray, first: int, second: int, dots: Dots) -> list[np.ndarray]:
+    """Affine guesses of the homography, [3, 3], for a marker: plain and mirrored."""
+    along = points[second] - points[first]
+    guesses = []
+    for side in (1.0, -1.0):
+        # the dot of the next row is where a right angle puts it, or the nearest that is seen
+        wanted = points[first] + side * np.array([-along[1], along[0]])
+        near = points[int(np.argmin(np.hypot(*(points - wanted).T)))]
+        if np.hypot(*(near - wanted)) > 0.45 * np.hypot(*along):
+            continue
+        camera = np.stack([points[first], points[second], near]).astype(np.float32)
+        panel = dots.xy[[0, 1, dots.columns]].astype(np.float32)
+        guesses.append(np.vstack([cv2.getAffineTransform(camera, panel), [0, 0, 1]]))
+    return guesses
+
+
+def _refined(points: np.ndarray, guess: np.ndarray, dots: Dots) -> tuple[float, np.ndarray] | None:
+    """How many dots a guess explains once grown over the grid, and the homography; None if it does not grow."""
+    tree = cKDTree(dots.xy)
+    homography = guess
+    origin = dots.xy[0]
+    for reach in (2.5, 4, 7, 12, 24, 1e9, 1e9, 1e9):
+        where = panel_points(homography, points)
+        distance, index = tree.query(where)
+        near = (distance < TOLERANCE * dots.spacing) & (np.hypot(*(where - origin).T) < reach * dots.spacing)
+        keep = np.flatnonzero(near)
+        _, only = np.unique(index[keep], return_index=True)
+        keep = keep[only]
+        if len(keep) < 4:
+            return None
+        camera, panel = points[keep], dots.xy[index[keep]]
+        if len(keep) < 9:  # too few for a perspective: an affine map, which does not bend
+            affine, _ = cv2.estimateAffine2D(camera, panel, ransacReprojThreshold=0.2 * dots.spacing)
+            found = None if affine is None else np.vstack([affine, [0, 0, 1]])
+        else:
+            found, _ = cv2.findHomography(camera, panel, cv2.RANSAC, max(0.05 * dots.spacing, 1.0))
+        if found is None or not np.isfinite(found).all():
+            return None
+        homography = found
+    error = np.hypot(*(panel_points(homography, camera) - panel).T)
+    return float((error < 0.1 * dots.spacing).sum()), homography
