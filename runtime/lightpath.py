@@ -1,20 +1,22 @@
 """The light path: from phase on the panel to irradiance in the image plane, and its adjoint.
 
-One copy, written against the array API: the headset runs it on NumPy arrays, the trainer differentiates it. All
-that a bench does to the light is in the arrays of a `LightPath`, for one colour and one plane:
+One copy, written against the array API: the headset runs it on NumPy arrays, the trainer differentiates it.
+All that a bench does to the light is in the arrays of a `LightPath`, for one colour and one plane:
 
     phi = gain * response[gray]                     drive (and, finer than a pixel, `crosstalk`)
     u   = source * exp(j phi) + leak                panel, seen through the pixel's aperture
     z_m = IFFT(FFT(u) * transfer_m)                 pupil, one transfer function a mode
     I   = filter * sum_m weight_m |z_m|^2           irradiance, on a grid twice as fine as the panel's
 
-The grid is twice as fine because irradiance has twice the bandwidth of the field. It is zero-padded, so light that
-leaves one side does not come back on the other. Arrays are [row, column]; leading axes are batches.
+The grid is twice as fine because irradiance has twice the bandwidth of the field. It is zero-padded, so
+light that leaves one side does not come back on the other. Arrays are [row, column]; leading axes are
+batches.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +24,7 @@ import scipy.fft
 from array_api_compat import array_namespace
 
 from runtime.fft import fft, ifft, irfft2, rfft2
+from runtime.windows import put, ring, take
 
 Array = Any
 
@@ -32,9 +35,9 @@ FINE = 2  # samples of irradiance a panel pixel, an axis
 class Grid:
     """Sizes of the sampled light path.
 
-    shape: panel (rows, columns). padded: the same with room for light to spread. margin: panel pixels kept around
-    the image so that what follows (blur, shift) sees beyond its border. band: the highest frequency index kept,
-    (rows, columns); index k is k / (padded * pitch) cycles/m. pitch: metres.
+    shape: panel (rows, columns). padded: the same with room for light to spread. margin: panel pixels kept
+    around the image so that what follows (blur, shift) sees beyond its border. band: the highest frequency
+    index kept, (rows, columns); index k is k / (padded * pitch) cycles/m. pitch: metres.
     """
 
     shape: tuple[int, int]
@@ -63,12 +66,12 @@ def grid_for(
 ) -> Grid:
     """The smallest grid that keeps the light path linear.
 
-    A ray at the edge of the iris (`half_width` as a share of the panel's band 1 / (2 pitch)) walks
-    lambda z half_width / (2 pitch) sideways; a third more holds the tails of the aperture's own diffraction (on a
-    240 x 320 panel at 30 mm this brings the ideal model's excess from 6e-5 to 2e-5).
+    A ray at the edge of the iris (`half_width` as a share of the panel's band 1 / (2 pitch)) walks lambda z
+    half_width / (2 pitch) sideways; six tenths more hold the tails of the aperture's own diffraction (on a
+    240 x 320 panel at 30 mm this brings the ideal model's excess from 4e-5 to 1.4e-5).
     """
     walk = wavelength * abs(distance) * half_width / (2 * pitch**2)
-    room = max(math.ceil(1.33 * walk), 2 * margin)
+    room = max(math.ceil(1.6 * walk), 2 * margin)
     rows, columns = (_even_fast_size(n + room) for n in shape)
     # One bin more than the iris, so that an edge bin always passes whole.
     band = tuple(min(math.ceil(half_width * n / 2), n - 1) for n in (rows, columns))
@@ -86,12 +89,13 @@ def _even_fast_size(n: int) -> int:
 class LightPath:
     """Everything a bench does to light of one colour on its way to one plane.
 
-    response [levels]: phase (rad) of each gray level. gain [H, W] or None: factor on that phase over the panel.
-    crosstalk: None, or (ky, kx), each [sub-pixels, taps]: phase of a sub-pixel as a weighted sum over the pixel
-    and its neighbours. source [H, W] complex: the illuminating field. leak [H, W] complex or None: light the
-    pattern does not modulate. aperture: side of a pixel's active area as a share of the pitch (rows, columns).
-    transfers [M, 2 band + 1, 2 band + 1] complex and weights [M]: the pupil's modes. irradiance_filter: None, or a
-    transfer function of irradiance over `rfft2` frequencies of the fine grid, for what the eye sees too.
+    response [levels]: phase (rad) of each gray level. gain [H, W] or None: factor on that phase over the
+    panel. crosstalk: None, or (ky, kx), each [sub-pixels, taps]: phase of a sub-pixel as a weighted sum
+    over the pixel and its neighbours. source [H, W] complex: the illuminating field. leak [H, W] complex or
+    None: light the pattern does not modulate. aperture: side of a pixel's active area as a share of the
+    pitch (rows, columns). transfers [M, 2 band + 1, 2 band + 1] complex and weights [M]: the pupil's modes.
+    irradiance_filter: None, or a transfer function of irradiance over `rfft2` frequencies of the fine grid,
+    for what the eye sees too.
     """
 
     grid: Grid
@@ -133,8 +137,8 @@ def image_field(path: LightPath, spectrum: Array, mode: int) -> Array:
     grid = path.grid
     rows, columns = _image_window(grid)
     z = ifft(spectrum * path.transfers[mode, ...], axis=-1, n=FINE * grid.padded[1])
-    z = ifft(_take(z, columns, -1), axis=-2, n=FINE * grid.padded[0])
-    return FINE**2 * _take(z, rows, -2)
+    z = ifft(take(z, columns, -1), axis=-2, n=FINE * grid.padded[0])
+    return FINE**2 * take(z, rows, -2)
 
 
 def irradiance(path: LightPath, phase: Array) -> Array:
@@ -144,9 +148,12 @@ def irradiance(path: LightPath, phase: Array) -> Array:
 
 def mode_irradiance(path: LightPath, spectrum: Array) -> Array:
     """Sum over pupil modes of weighted |z|^2, before the irradiance filter."""
+    return _summed(path, (image_field(path, spectrum, mode) for mode in range(path.transfers.shape[0])))
+
+
+def _summed(path: LightPath, fields: Iterable[Array]) -> Array:
     total = 0
-    for mode in range(path.transfers.shape[0]):
-        z = image_field(path, spectrum, mode)
+    for mode, z in enumerate(fields):
         xp = array_namespace(z)
         total = total + path.weights[mode] * (xp.real(z) ** 2 + xp.imag(z) ** 2)
     return total
@@ -162,19 +169,43 @@ def filter_irradiance(path: LightPath, image: Array) -> Array:
 def phase_gradient(path: LightPath, phase: Array, irradiance_gradient: Array) -> Array:
     """Adjoint of `irradiance` at `phase`: gradient of a loss with respect to phase, [..., H, W].
 
-    `irradiance_gradient` is the loss's gradient with respect to the fine irradiance. Seed eq. 20-23, with each
-    linear operator replaced by its adjoint: 2 z dI, back through the conjugate transfer, Re(-j e^{-j phi} ...).
+    `irradiance_gradient` is the loss's gradient with respect to the fine irradiance.
     """
-    xp = array_namespace(phase)
+    return irradiance_and_pullback(path, phase)[1](irradiance_gradient)
+
+
+def irradiance_and_pullback(path: LightPath, phase: Array) -> tuple[Array, Callable[[Array], Array]]:
+    """`irradiance`, and the map from a loss's gradient over it to the gradient over phase.
+
+    Seed eq. 20-23, with each linear operator replaced by its adjoint: 2 z dI, back through the conjugate
+    transfer, Re(-j e^{-j phi} ...). The fields of the forward pass are kept, so the way back costs no
+    second one.
+    """
     spectrum = panel_spectrum(path, phase)
-    if path.irradiance_filter is not None:
-        kept = rfft2(irradiance_gradient) * xp.conj(path.irradiance_filter)
-        irradiance_gradient = irfft2(kept, path.grid.image_shape)
-    back = 0
-    for mode in range(path.transfers.shape[0]):
-        z = image_field(path, spectrum, mode)
-        back = back + _image_field_adjoint(path, 2 * path.weights[mode] * irradiance_gradient * z, mode)
-    return _panel_spectrum_adjoint(path, phase, back)
+    fields = [image_field(path, spectrum, mode) for mode in range(path.transfers.shape[0])]
+
+    def pullback(gradient: Array) -> Array:
+        xp = array_namespace(gradient)
+        if path.irradiance_filter is not None:
+            gradient = irfft2(rfft2(gradient) * xp.conj(path.irradiance_filter), path.grid.image_shape)
+        back = 0
+        for mode, z in enumerate(fields):
+            back = back + _image_field_adjoint(path, 2 * path.weights[mode] * gradient * z, mode)
+        return _panel_spectrum_adjoint(path, phase, back)
+
+    return filter_irradiance(path, _summed(path, fields)), pullback
+
+
+def back_propagated(path: LightPath, z: Array, mode: int = 0) -> Array:
+    """Field at the panel that a field [..., *grid.image_shape] in the image plane comes from: [..., H, W]
+    complex.
+
+    Adjoint of the way from the panel to one pupil mode's image, which is its inverse where the pupil passes
+    all.
+    """
+    xp = array_namespace(z)
+    spectrum = _aperture(path, xp.real(z), (1, 1)) * _image_field_adjoint(path, z, mode)
+    return _band_spectrum_adjoint(path.grid, spectrum)
 
 
 def mix_neighbours(phase: Array, taps: Array, axis: int) -> Array:
@@ -190,7 +221,7 @@ def mix_neighbours(phase: Array, taps: Array, axis: int) -> Array:
 
 
 def pixel_irradiance(path: LightPath, image: Array) -> Array:
-    """What a pixel of the panel's pitch, centred on each panel pixel, integrates of fine irradiance: [..., H, W]."""
+    """What pixels of the panel's pitch, centred on the panel's, integrate of fine irradiance: [..., H, W]."""
     grid = path.grid
     fy, fx = image_frequencies(grid, image)
     box = _sinc(fy * grid.pitch)[:, None] * _sinc(fx * grid.pitch)[None, :]
@@ -218,7 +249,7 @@ def at_pixels(grid: Grid, image: Array) -> Array:
 
 
 def band_frequencies(grid: Grid, like: Array) -> tuple[Array, Array]:
-    """Frequencies (cycles/m) of the band along y and x, in the namespace and precision of the real array `like`."""
+    """Frequencies (cycles/m) of the band along y and x, in namespace and precision of the real `like`."""
     xp = array_namespace(like)
     fy, fx = (
         xp.asarray(grid.frequency_index(axis), dtype=like.dtype) / (grid.padded[axis] * grid.pitch)
@@ -246,14 +277,14 @@ def _panel_field(path: LightPath, phase: Array) -> Array:
 
 def _band_spectrum(grid: Grid, field: Array) -> Array:
     rows, columns = _band_window(grid)
-    spectrum = _take(fft(field, axis=-1, n=grid.padded[1]), columns, -1)
-    return _take(fft(spectrum, axis=-2, n=grid.padded[0]), rows, -2)
+    spectrum = take(fft(field, axis=-1, n=grid.padded[1]), columns, -1)
+    return take(fft(spectrum, axis=-2, n=grid.padded[0]), rows, -2)
 
 
 def _band_spectrum_adjoint(grid: Grid, spectrum: Array) -> Array:
     rows, columns = _band_window(grid)
-    field = ifft(_put(spectrum, rows, -2, grid.padded[0]), axis=-2)[..., : grid.shape[0], :]
-    field = ifft(_put(field, columns, -1, grid.padded[1]), axis=-1)[..., :, : grid.shape[1]]
+    field = ifft(put(spectrum, rows, -2, grid.padded[0]), axis=-2)[..., : grid.shape[0], :]
+    field = ifft(put(field, columns, -1, grid.padded[1]), axis=-1)[..., :, : grid.shape[1]]
     return field * (grid.padded[0] * grid.padded[1])
 
 
@@ -262,8 +293,8 @@ def _image_field_adjoint(path: LightPath, z: Array, mode: int) -> Array:
     grid = path.grid
     rows, columns = _image_window(grid)
     height, width = (FINE * n for n in grid.padded)
-    spectrum = fft(_put(z, rows, -2, height), axis=-2)[..., : 2 * grid.band[0] + 1, :]
-    spectrum = fft(_put(spectrum, columns, -1, width), axis=-1)[..., :, : 2 * grid.band[1] + 1]
+    spectrum = fft(put(z, rows, -2, height), axis=-2)[..., : 2 * grid.band[0] + 1, :]
+    spectrum = fft(put(spectrum, columns, -1, width), axis=-1)[..., :, : 2 * grid.band[1] + 1]
     return xp.conj(path.transfers[mode, ...]) * spectrum * (FINE**2 / (height * width))
 
 
@@ -336,7 +367,7 @@ def _sinc(x: Array) -> Array:
 
 
 def _band_window(grid: Grid) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    return _ring(-grid.band[0], 2 * grid.band[0] + 1, grid.padded[0]), _ring(
+    return ring(-grid.band[0], 2 * grid.band[0] + 1, grid.padded[0]), ring(
         -grid.band[1], 2 * grid.band[1] + 1, grid.padded[1]
     )
 
@@ -344,44 +375,7 @@ def _band_window(grid: Grid) -> tuple[list[tuple[int, int]], list[tuple[int, int
 def _image_window(grid: Grid) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
     first = -FINE * grid.margin
     height, width = grid.image_shape
-    return _ring(first, height, FINE * grid.padded[0]), _ring(first, width, FINE * grid.padded[1])
-
-
-def _ring(first: int, count: int, period: int) -> list[tuple[int, int]]:
-    """`count` samples of a periodic axis from `first` on, as (start, stop) runs within one period."""
-    runs = []
-    while count:
-        start = first % period
-        length = min(count, period - start)
-        runs.append((start, start + length))
-        first, count = first + length, count - length
-    return runs
-
-
-def _take(x: Array, runs: list[tuple[int, int]], axis: int) -> Array:
-    xp = array_namespace(x)
-    parts = [_along(x, start, stop, axis) for start, stop in runs]
-    return parts[0] if len(parts) == 1 else xp.concat(parts, axis=axis)
-
-
-def _put(x: Array, runs: list[tuple[int, int]], axis: int, period: int) -> Array:
-    """Adjoint of `_take`: samples back at their places on an axis of `period` samples, zero elsewhere."""
-    xp = array_namespace(x)
-    shape = list(x.shape)
-    shape[axis] = period
-    whole = xp.zeros(tuple(shape), dtype=x.dtype)
-    done = 0
-    for start, stop in runs:
-        part = _along(whole, start, stop, axis)
-        part += _along(x, done, done + stop - start, axis)
-        done += stop - start
-    return whole
-
-
-def _along(x: Array, start: int, stop: int, axis: int) -> Array:
-    inside: list[Any] = [slice(None)] * x.ndim
-    inside[axis] = slice(start, stop)
-    return x[tuple(inside)]
+    return ring(first, height, FINE * grid.padded[0]), ring(first, width, FINE * grid.padded[1])
 
 
 def _indices(like: Array, index: list[int]) -> Array:

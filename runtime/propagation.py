@@ -1,9 +1,9 @@
 """Free-space propagation between the panel and an image plane: transfer functions, and where they hold.
 
-Three forms of the diffraction integral (seed sections 1.1-1.2): the band-limited angular spectrum (exact; seed
-eq. 5, Matsushima and Shimobaba 2009), Fresnel (paraxial) and Fraunhofer (far field). Written against the array
-API: NumPy in the headset, any differentiable namespace in the trainer. Lengths are in metres, frequencies in
-cycles per metre; frequency grids are the DFT's own.
+Three forms of the diffraction integral (seed sections 1.1-1.2): the band-limited angular spectrum (exact;
+seed eq. 5, Matsushima and Shimobaba 2009), Fresnel (paraxial) and Fraunhofer (far field). Written against
+the array API: NumPy in the headset, any differentiable namespace in the trainer. Lengths are in metres,
+frequencies in cycles per metre; frequency grids are the DFT's own.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ METHODS = ("angular_spectrum", "fresnel", "fraunhofer")
 
 @dataclass(frozen=True)
 class Aperture:
-    """What a propagation starts from: rows x columns of samples `pitch` metres apart, zero-padded to `padded`."""
+    """What a propagation starts from: rows x columns of samples `pitch` metres apart, padded to `padded`."""
 
     shape: tuple[int, int]
     padded: tuple[int, int]
@@ -41,10 +41,10 @@ def transfer_function(
     """Complex transfer function of free space over a grid of spatial frequencies: [n, m].
 
     fy [n, 1] and fx [1, m] are in cycles/m; `wavelength` and `distance` (m) are scalars or scalar arrays;
-    beyond `limits` (cycles/m, along y and x; see `band_limit`) the sampled function is aliased and set to zero.
-    Seed eq. 5 for "angular_spectrum"; its paraxial expansion (seed eq. 8) for "fresnel". Both without the plane
-    wave's own 2 pi z / lambda, which is thousands of turns and changes no irradiance. Evanescent frequencies
-    are zero. Raises InputError for another method.
+    beyond `limits` (cycles/m, along y and x; see `band_limit`) the sampled function is aliased and set to
+    zero. Seed eq. 5 for "angular_spectrum"; its paraxial expansion (seed eq. 8) for "fresnel". Both without
+    the plane wave's own 2 pi z / lambda, which is thousands of turns and changes no irradiance. Evanescent
+    frequencies are zero. Raises InputError for another method.
     """
     xp = array_namespace(fy, fx)
     sine2 = (wavelength * fy) ** 2 + (wavelength * fx) ** 2
@@ -73,7 +73,7 @@ def band_limit(wavelength: float, distance: float, side: float) -> float:
 
 
 def far_field(u: Array, pitch: float, y: Array, x: Array, wavelength: Array, distance: Array) -> Array:
-    """Fraunhofer field of `u` [..., H, W] at the image-plane positions y [n] and x [m] (metres from the axis).
+    """Fraunhofer field of `u` [..., H, W] at image-plane positions y [n] and x [m] (metres from the axis).
 
     A matrix Fourier transform, so the image grid is free: [..., n, m]. Up to the quadratic phase in the image
     plane, which changes no irradiance (Goodman, Introduction to Fourier Optics, eq. 4-25).
@@ -93,7 +93,7 @@ def far_field(u: Array, pitch: float, y: Array, x: Array, wavelength: Array, dis
 def check_sampling(
     method: str, aperture: Aperture, wavelength: float, distance: float, half_band: float
 ) -> None:
-    """Raise InputError, saying which limit, by how much, and what would hold, where `method` cannot be sampled.
+    """Raise InputError (which limit, by how much, what would hold) where `method` cannot be sampled.
 
     `half_band` (cycles/m) is the highest frequency that the iris lets through.
     """
@@ -132,5 +132,6 @@ def check_sampling(
         farthest = min(aperture.padded) * aperture.pitch / (wavelength * half_band)
         raise InputError(
             f"at {z * 1e3:.4g} mm the sampled transfer function carries {limit * 1e-3:.4g} cycles/mm of the "
-            f"{half_band * 1e-3:.4g} that the iris passes: use at most {farthest * 1e3:.3g} mm, or a larger panel"
+            f"{half_band * 1e-3:.4g} that the iris passes: use at most {farthest * 1e3:.3g} mm, "
+            "or a larger panel"
         )

@@ -33,6 +33,7 @@ __all__ = [
 ]
 
 REQUIRED = ("capture", "channel", "phase", "image")
+PNG_END = b"\0\0\0\0IEND\xae\x42\x60\x82"
 KNOWN = (*REQUIRED, "plane_mm", "pattern", "exposure_ms", "time_s")
 
 
@@ -186,6 +187,8 @@ def read_picture(path: Path, shape: tuple[int, int], bits: int, what: str) -> np
             Image.DecompressionBombError, OverflowError) as error:
         raise PictureError("unreadable", f"{what} is not a whole PNG at {path} ({_short(error)}): "
                            "write the file again") from None
+    if PNG_END not in data:  # which Pillow does not miss
+        raise PictureError("unreadable", f"{what} is cut off at its end at {path}: write the file again")
     depth = {"L": 8, "I;16": 16, "I;16B": 16, "I": 16}.get(mode)
     if depth is None or (bits and depth != bits):
         kind = f"{depth}-bit gray" if depth else f"of mode {mode}"

@@ -139,7 +139,8 @@ def _bits(counts: np.ndarray, camera: Camera, name: str) -> tuple[int, list[Prob
     if top > camera.saturation:
         return 0, [Problem(
             "error", "bit_depth", name, f"the image of capture {name} has counts up to {top}, but "
-            f"camera.bit_depth = {camera.bit_depth} ends at {camera.saturation}: correct bit_depth, or save raw counts")]
+            f"camera.bit_depth = {camera.bit_depth} ends at {camera.saturation}: correct bit_depth, or save "
+            "raw counts")]
     if empty and values >= 16:
         return 0, [Problem(
             "warning", "bit_depth", name, f"every count in the image of capture {name} is a multiple of "
@@ -173,7 +174,8 @@ def _patterns(bench: Bench, seen: _Seen) -> list[Problem]:
         if number < FEWEST_PATTERNS:
             problems.append(Problem(
                 "warning", "too_few", "", f"channel {channel.name!r} has {number} different patterns: take "
-                f"at least {FEWEST_PATTERNS}, so that some can be held back, and better 10 with one of them repeated"))
+                f"at least {FEWEST_PATTERNS}, so that some can be held back, and better 10 with one of them "
+                "repeated"))
     return problems
 
 
@@ -235,8 +237,8 @@ def _black(camera: Camera, dark: np.ndarray, measured: Sequence[Repeats]) -> Pro
     lowest = int(np.searchsorted(below, 1e-12))
     if not measured and stated < noise and lowest > stated + max(10 * noise, 0.002 * camera.full_scale):
         return Problem("warning", "black_level", "", f"camera.black_level = {stated:g} is in doubt: no "
-                       f"pixel of any capture is darker than {lowest} counts, which is a black level or stray light; "
-                       f"{advice}")
+                       f"pixel of any capture is darker than {lowest} counts, which is a black level or "
+                       f"stray light; {advice}")
     return None
 
 
@@ -259,5 +261,5 @@ def _convention(bench: Bench, seen: _Seen, predict: Predict | None) -> list[Prob
         gray, counts = _load(capture, bench, seen)
         samples.append(Sample(capture.capture, gray, counts.astype(np.float32) - bench.camera.black_level,
                               counts < bench.camera.saturation, capture.channel, capture.plane_mm))
-    found = compare_conventions(bench, samples, predict)
+    found = compare_conventions(bench, samples, predict, quick=True)
     return [Problem("error", "convention", "", found.change)] if found.decisive else []

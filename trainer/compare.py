@@ -15,7 +15,8 @@ import torch
 
 from firmware_iface.errors import InputError
 from trainer.captures import Capture, CaptureSet
-from trainer.evidence import load, load_batch, sample, split
+from trainer.diagnose import parts_of
+from trainer.evidence import load, load_batch, split
 from trainer.excess import Errors, errors_of, join
 from trainer.fit import Predictor, fit, with_gain
 from trainer.localise import BrightnessSums, FieldSums, FrequencySums, Seen
@@ -24,7 +25,6 @@ from trainer.photon_transfer import compare_repeats
 
 PICTURES = 3  # held-out captures whose pictures are kept for the report
 PAIRS = 12  # pairs of repeats that the noise is checked on
-GAIN_CAPTURES = 4  # a colour, for the gain of a model whose counts are not proportional to light
 
 Progress = Callable[[float], None]
 
@@ -53,7 +53,7 @@ class Comparison:
 
     model : as it was compared, with its gains; captures : the held-out ones, in the order of `errors`
     gains : least-squares factor from prediction to measurement, a capture (None where nothing was predicted)
-    psnr_db : 10 log10(peak^2 / mse) over all held-out pixels; the peak is the camera's full scale above black,
+    psnr_db : 10 log10(peak^2 / mse) over all held-out pixels; the peak is the camera's full scale less black,
         the mse holds the camera's noise, and there is no scale factor a picture
     field, frequency, brightness : as in `as_json`; tile_px : side of a tile of `field`, pixels
     noise_from_repeats : measured noise variance over the expected one, from captures of the same pattern;
@@ -145,13 +145,14 @@ def part_of(errors: Errors, which: Sequence[int]) -> Errors:
 def compare(captures: CaptureSet, model: Model, progress: Progress | None = None) -> Comparison:
     """How far a model is from the held-out captures of a set.
 
-    Effects are taken as they are. A channel without a gain gets one from the captures that are for fitting.
+    Effects are taken as they are. A channel without a gain gets one from the captures that `diagnose` fits,
+    so that the numbers of both agree.
     progress : called with the share that is done, 0 .. 1
     Raises InputError where a picture cannot be read or every held-out picture is saturated.
     """
     parts = split(captures)
     wanted = {c.channel for c in parts.held_out} - set(model.gain)
-    for_gain = [c for c in parts.fitted if c.channel in wanted]
+    for_gain = [c for c in parts_of(captures).fitted if c.channel in wanted]
     steps = len(for_gain) + len(parts.held_out)
 
     def done(count: int) -> None:
@@ -183,9 +184,7 @@ def with_gains(
     found = with_gain(replace(model, gain={}), _Predictors(captures, model, rows, done))
     if any(p.effect.name == "sensor_response" or p.effect.source != "built in" for p in model.present):
         # Counts may not be proportional to light: least squares is then only where the fit starts.
-        pixels = captures.bench.camera.width * captures.bench.camera.height
-        few = sample(rows, pixels, GAIN_CAPTURES * len(channels))
-        found = fit(found, [], load(captures, few)).model
+        found = fit(found, [], load(captures, rows)).model
     return replace(model, gain={**model.gain, **{c: found.gain[c] for c in channels}})
 
 

@@ -125,10 +125,12 @@ def find_convention(captures: CaptureSet, count: int = 3, predict: Predict | Non
 
 
 def compare_conventions(bench: Bench, samples: Sequence[Sample],
-                        predict: Predict | None = None) -> Convention:
+                        predict: Predict | None = None, quick: bool = False) -> Convention:
     """Scores every combination that the image's shape allows; see the module's text for the test.
 
     predict : (bench, gray, channel, plane_mm) -> irradiance [h, w], any scale; the ideal model by default
+    quick : stop when a sample fits so well as stated that no other combination can be decisively better
+    Raises InputError if there is no sample.
     """
     if predict is None:
         from trainer.prediction import ideal_irradiance
@@ -152,6 +154,13 @@ def compare_conventions(bench: Bench, samples: Sequence[Sample],
                 values, shift = _tile_correlations(_flattened(seen, good), good, flat)
                 tiles.setdefault((turn, sign), []).append(values)
                 shifts.setdefault((turn, sign), []).append(shift)
+            if quick and R_RATIO * float(np.mean(tiles["as_stated", stated_sign][0])) > 1:
+                return _conclude(tiles, shifts, stated_sign)
+    return _conclude(tiles, shifts, stated_sign)
+
+
+def _conclude(tiles: dict[tuple[str, int], list[np.ndarray]],
+              shifts: dict[tuple[str, int], list[tuple[int, int]]], stated_sign: int) -> Convention:
     joined = {key: np.concatenate(values) for key, values in tiles.items()}
     reference = joined["as_stated", stated_sign]
     scores = [Score(turn, sign, float(np.mean(values)), tuple(shifts[turn, sign]),

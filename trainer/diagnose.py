@@ -27,7 +27,7 @@ Progress = Callable[[float, str], None]
 
 FIRST_TRIED = 5  # candidates fitted after the screen; all of them when none of these explains anything
 FIT_CAPTURES = 4
-PROBE_CAPTURES = 6
+PROBE_CAPTURES = 9
 HELD_PIXELS = 24 * 480 * 640  # held-out pixels a candidate is judged on
 
 
@@ -194,11 +194,11 @@ def diagnose(
     screened = screen_all(parts, model, candidates, pool, say)
     order = sorted(screened, key=lambda s: -s.removed)
     first = [s for s in order[:FIRST_TRIED] if s.removed > 0.05 * max(order[0].removed, 1e-12)] or order[:1]
-    tried = try_all(parts, model, first[:2] if complete else first, pool, say, 0.3, 0.6)
+    tried = try_all(parts, model, before, first[:2] if complete else first, pool, say, 0.3, 0.6)
     ranking = rank(before, tried, known, thresholds, ideal_excess, len(candidates))
     if not complete and not any(r.worth for r in ranking):
         rest = [s for s in order if s.effect not in {t.effect for t in tried}]
-        tried += try_all(parts, model, rest, pool, say, 0.5, 0.7)
+        tried += try_all(parts, model, before, rest, pool, say, 0.5, 0.7)
         ranking = rank(before, tried, known, thresholds, ideal_excess, len(candidates))
     found = not complete and bool(ranking) and ranking[0].worth
     verdict = "complete" if complete else "missing" if found else "outside_catalogue"
@@ -238,7 +238,14 @@ def screen_all(parts: Parts, model: Model, effects: Sequence[Effect], pool: Pool
 
 
 def try_all(
-    parts: Parts, model: Model, screened: Sequence[Screened], pool: Pool, say: Progress, start: float, end: float
+    parts: Parts,
+    model: Model,
+    before: Errors,
+    screened: Sequence[Screened],
+    pool: Pool,
+    say: Progress,
+    start: float,
+    end: float,
 ) -> list[Tried]:
     """Fit candidates at their lowest order, then raise the order of those that do about as well as the best."""
     ids = tuple(c.capture for c in parts.fitted)
@@ -251,8 +258,7 @@ def try_all(
     tried = pool.map(try_effect, tasks, told)
     if not tried:
         return []
-    least = min(t.held_out.excess for t in tried)
-    most = max(s.before for s in screened)
+    least, most = min(t.held_out.excess for t in tried), before.excess
     again = [
         k
         for k, t in enumerate(tried)
@@ -279,11 +285,12 @@ def rank(
     before: Errors, tried: Sequence[Tried], known: Catalogue, thresholds: Thresholds, ideal_excess: float, candidates: int
 ) -> list[Ranked]:
     """Candidates by excess removed, each with those that the captures cannot tell it from."""
+    complete = thresholds.complete(before.excess, ideal_excess)
     ordered = sorted(tried, key=lambda t: t.held_out.excess)
     ranked = []
     for one in ordered:
         gone = removed(before, one.held_out)
-        worth = thresholds.worth_adding(gone, ideal_excess, candidates)
+        worth = not complete and thresholds.worth_adding(gone, ideal_excess, candidates)
         twins = tuple(
             other.effect
             for other in ordered

@@ -87,7 +87,8 @@ class FrequencySums:
         self._norm = float((self._window**2).sum())
         fy, fx = np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])[None, :]
         radius = np.hypot(fy, fx)
-        self._ring = np.minimum(radius / RINGS, math.sqrt(0.5) / RINGS - 1e-9).astype(np.int64)
+        # The corners of the spectrum hold few frequencies: they go with the last whole ring.
+        self._ring = np.minimum(radius / RINGS, math.floor(math.sqrt(0.5) / RINGS) - 1).astype(np.int64)
         # A half spectrum holds each frequency once but for the first column and, of an even width, the last.
         self._twice = np.full(radius.shape, 2.0)
         self._twice[:, 0] = 1.0
@@ -113,7 +114,7 @@ class FrequencySums:
         return np.asarray(np.bincount(self._ring.ravel(), power.ravel()), dtype=np.float64)
 
     def rows(self) -> list[dict[str, float]]:
-        """One row a ring: its mean cycles_per_pixel, and error (noise included), noise and signal, counts^2."""
+        """One row a ring: its mean cycles_per_pixel, and error (with the noise), noise, signal, counts^2."""
         captures = max(self._captures, 1)
         return [
             {

@@ -1,7 +1,8 @@
 """Model files: TOML that a person reads and edits, with long arrays beside it as safetensors.
 
-Reading is strict and says which key is wrong and what is allowed there. Writing is whole or not at all: long arrays
-go to a file of their own name first, and the TOML, which names it with its SHA-256, takes its place last.
+Reading is strict and says which key is wrong and what is allowed there. Writing is whole or not at all: long
+arrays go to a file of their own name first, and the TOML, which names it with its SHA-256, takes its place
+last.
 """
 
 from __future__ import annotations
@@ -39,8 +40,8 @@ def write_model(path: Path | str, model: Model, about: Mapping[str, Any] | None 
     """Write a model, whole or not at all, over one that is there.
 
     about : free text, numbers and lists on where the model comes from, kept in the table [about]
-    Entries of `about` and of the history that are None are left out; a step of the history without `added` is one
-    that added nothing. Raises InputError if the file cannot be written, or a value is outside its physical range.
+    Entries of `about` and of the history that are None are left out. Raises InputError if the file cannot be
+    written, or a value is outside its physical range.
     """
     path = Path(path)
     arrays: dict[str, np.ndarray] = {}
@@ -71,7 +72,8 @@ def read_model(path: Path | str, known: Catalogue, bench: Bench | None = None) -
 
     known : effects by name
     bench : the capture set's; the model's must have the same panel, channels, iris and camera
-    Raises InputError, naming the key and what is allowed, if the file cannot be read or anything in it does not fit.
+    Raises InputError, naming the key and what is allowed, if the file cannot be read or anything in it does
+    not fit.
     """
     path = Path(path)
     tables = _tables(path)
@@ -88,7 +90,9 @@ def _tables(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
     except OSError as error:
-        raise InputError(f"model {path} cannot be read ({error.strerror}): give the path of a model's TOML") from None
+        raise InputError(
+            f"model {path} cannot be read ({error.strerror}): give the path of a model's TOML"
+        ) from None
     except (ValueError, RecursionError) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
         raise InputError(f"{path} is not TOML ({reason}): correct that line") from None
@@ -111,7 +115,7 @@ def _model(tables: Mapping[str, Any], known: Catalogue, path: Path) -> Model:
     history = []
     for number, row in enumerate(_rows(tables, "history"), 1):
         _plain(row, f"history {number}")
-        history.append({"added": None, **row})
+        history.append(dict(row))
     return Model(bench, tuple(present), _gain(tables.get("gain", {}), bench), _method(tables), tuple(history))
 
 
@@ -167,37 +171,51 @@ def _effect(row: Mapping[str, Any], number: int, known: Catalogue, bench: Bench,
         table = _table(given.get(p.name), where)
         _only(table, ("value", "error", "unit"), f"{where}.")
         if table.get("unit") != p.unit:
-            raise InputError(f"{where}.unit is {_shown(table.get('unit'))}: write '{p.unit}', and the value in it")
+            raise InputError(
+                f"{where}.unit is {_shown(table.get('unit'))}: write '{p.unit}', and the value in it"
+            )
         values[p.name] = _numbers(table.get("value"), f"{where}.value", p, order, bench, arrays)
         if "error" in table:
             errors[p.name] = _numbers(table["error"], f"{where}.error", p, order, bench, arrays)
     return Present(effect, order, values, errors or None)
 
 
-def _numbers(given: Any, where: str, parameter: Parameter, order: int, bench: Bench, arrays: Arrays) -> np.ndarray:
+def _numbers(
+    given: Any, where: str, parameter: Parameter, order: int, bench: Bench, arrays: Arrays
+) -> np.ndarray:
     """The numbers of a value or an error, of the shape that the order asks for."""
     shape = parameter.shape(order, len(bench.channels))
     is_value = where.endswith(".value")
     if isinstance(given, Mapping) and list(given) == ["array"] and isinstance(given["array"], str):
         array = arrays.get(given["array"])
         if array is None:
-            raise InputError(f"{where} names the array {_shown(given['array'])}: {nearest(given['array'], arrays)}")
+            raise InputError(
+                f"{where} names the array {_shown(given['array'])}: {nearest(given['array'], arrays)}"
+            )
         if array.shape != shape:
-            raise InputError(f"{where} has shape {array.shape} in the arrays' file: order {order} has {shape}")
+            raise InputError(
+                f"{where} has shape {array.shape} in the arrays' file: order {order} has {shape}"
+            )
         array = array.astype(np.float64)
     elif parameter.per_channel:
         names = [c.name for c in bench.channels]
         if not isinstance(given, Mapping):
-            raise InputError(f"{where} is {_shown(given)}: write one a channel, as {where.split('.')[-1]}.{names[0]} = ...")
+            raise InputError(
+                f"{where} is {_shown(given)}: write one a channel, as {where.split('.')[-1]}.{names[0]} = ..."
+            )
         _only(given, names, f"{where}.")
-        array = np.array([_row(given.get(n), f"{where}.{n}", shape[1:], order, parameter, is_value) for n in names])
+        array = np.array(
+            [_row(given.get(n), f"{where}.{n}", shape[1:], order, parameter, is_value) for n in names]
+        )
     else:
         array = np.array(_row(given, where, shape, order, parameter, is_value))
     _in_range(array, where, parameter, is_value)
     return array.reshape(shape)
 
 
-def _row(given: Any, where: str, shape: tuple[int, ...], order: int, parameter: Parameter, is_value: bool) -> Any:
+def _row(
+    given: Any, where: str, shape: tuple[int, ...], order: int, parameter: Parameter, is_value: bool
+) -> Any:
     kind = f"{allowed(parameter)}" if is_value else "a number from 0 on"
     if not shape:
         return _number(given, where, kind)
@@ -222,19 +240,27 @@ def _arrays(path: Path, given: Any) -> Arrays:
     _only(table, ("file", "sha256"), "arrays.")
     name, digest = table.get("file"), table.get("sha256")
     if not isinstance(name, str) or not re.fullmatch(r"[^/\\\0]+\.safetensors", name):
-        raise InputError(f"arrays.file is {_shown(name)}: write the name of a .safetensors file beside the model")
+        raise InputError(
+            f"arrays.file is {_shown(name)}: write the name of a .safetensors file beside the model"
+        )
     if not isinstance(digest, str):
         raise InputError(f"arrays.sha256 is {_shown(digest)}: write the file's SHA-256 as text")
     try:
         data = path.with_name(name).read_bytes()
     except OSError as error:
-        raise InputError(f"arrays.file {name} cannot be read ({error.strerror}): put it beside the model") from None
+        raise InputError(
+            f"arrays.file {name} cannot be read ({error.strerror}): put it beside the model"
+        ) from None
     if hashlib.sha256(data).hexdigest() != digest.lower():
-        raise InputError(f"arrays.file {name} is not the one that was written: its SHA-256 differs, put that one back")
+        raise InputError(
+            f"arrays.file {name} is not the one that was written: its SHA-256 differs, put that one back"
+        )
     try:
         return safetensors.numpy.load(data)
     except (SafetensorError, ValueError, KeyError, TypeError, OverflowError) as error:
-        raise InputError(f"arrays.file {name} is not a safetensors file of numbers ({_shown(error)})") from None
+        raise InputError(
+            f"arrays.file {name} is not a safetensors file of numbers ({_shown(error)})"
+        ) from None
 
 
 def _compare(path: Path, model: Bench, captures: Bench) -> None:
@@ -249,8 +275,8 @@ def _compare(path: Path, model: Bench, captures: Bench) -> None:
             key = next(k for k in {**a, **b} if a.get(k) != b.get(k))
             what, first, second = f"{table}.{key} is", _shown(a.get(key)), _shown(b.get(key))
         raise InputError(
-            f"{path} is a model of another bench: {what} {first} there and {second} in the capture set's bench.toml; "
-            "use a model of this bench, or correct the one that is wrong"
+            f"{path} is a model of another bench: {what} {first} there and {second} in the capture set's "
+            "bench.toml; use a model of this bench, or correct the one that is wrong"
         )
 
 
@@ -269,7 +295,9 @@ def _array_file(path: Path) -> str:
 
 
 def _name_for(path: Path, data: bytes, digest: str) -> str:
-    """`<stem>.safetensors`, or one with part of the hash where that name is another's: nothing is written over."""
+    """`<stem>.safetensors`, or one with part of the hash where that name is another's: nothing is written
+    over.
+    """
     plain = path.with_name(f"{path.stem}.safetensors")
     try:
         free = not plain.exists() or plain.read_bytes() == data

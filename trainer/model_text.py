@@ -1,7 +1,7 @@
 """A model as the text of its TOML file: written for a person to read and edit.
 
-Numbers are written with all their digits, so reading gives the same model back. Arrays that are too long for a text
-are left to the caller, under the name ``effect.parameter.value``.
+Numbers are written with all their digits, so reading gives the same model back. Arrays that are too long for
+a text are left to the caller, under the name ``effect.parameter.value``.
 """
 
 from __future__ import annotations
@@ -36,10 +36,15 @@ def model_text(model: Model, about: Mapping[str, Any] | None, store: Store) -> s
     parts = [_head(), *_about(about), _bench(model.bench)]
     parts.append(f"[propagation]\nmethod = {literal(model.method)}")
     if model.gain:
-        parts.append("\n".join([
-            "# Camera counts a unit of irradiance and millisecond, by channel. Every fit sets them anew.", "[gain]",
-            *(f"{key(c)} = {literal(float(g))}" for c, g in model.gain.items()),
-        ]))
+        parts.append(
+            "\n".join(
+                [
+                    "# Camera counts a unit of irradiance and millisecond, by channel; every fit sets them.",
+                    "[gain]",
+                    *(f"{key(c)} = {literal(float(g))}" for c, g in model.gain.items()),
+                ]
+            )
+        )
     parts += [_effect(p, model.bench, store) for p in model.present]
     parts += [table_text("[[history]]", record) for record in model.history]
     return "\n\n".join(parts) + "\n"
@@ -78,7 +83,9 @@ def literal(value: Any) -> str:
         return "[" + ", ".join(literal(v) for v in value if v is not None) + "]"
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{key(k)} = {literal(v)}" for k, v in value.items() if v is not None) + " }"
-    raise InputError(f"a {type(value).__name__} cannot be written to a model file: use text, numbers and lists of them")
+    raise InputError(
+        f"a {type(value).__name__} cannot be written to a model file: use text, numbers and lists of them"
+    )
 
 
 def key(name: str) -> str:
@@ -109,14 +116,16 @@ def _escape(character: str) -> str:
 
 
 def _head() -> str:
-    return "\n".join([
-        *comment(
-            "A model of a bench: what bench.toml says, then the effects that were found, in the order in which "
-            "they were added. Values may be edited; 'error' is one standard error and is for reading only. Take an "
-            "[[effect]] out to be without it."
-        ),
-        "schema = 1",
-    ])
+    return "\n".join(
+        [
+            *comment(
+                "A model of a bench: what bench.toml says, then the effects that were found, in the order "
+                "in which they were added. Values may be edited; 'error' is one standard error and is for "
+                "reading only. Take an [[effect]] out to be without it."
+            ),
+            "schema = 1",
+        ]
+    )
 
 
 def _about(about: Mapping[str, Any] | None) -> list[str]:
@@ -125,8 +134,10 @@ def _about(about: Mapping[str, Any] | None) -> list[str]:
 
 def _bench(bench: Bench) -> str:
     tables = bench_tables(bench)
-    parts = ["# The bench as bench.toml has it. A model serves capture sets of this bench.\n"
-             f"[bench]\nname = {literal(tables['name'])}"]
+    parts = [
+        "# The bench as bench.toml has it. A model serves capture sets of this bench.\n"
+        f"[bench]\nname = {literal(tables['name'])}"
+    ]
     for name in ("panel", "channel", "propagation", "iris", "camera"):
         rows = tables[name]
         header = f"[[bench.{name}]]" if isinstance(rows, list) else f"[bench.{name}]"
@@ -191,6 +202,10 @@ def _check(effect: Effect, parameter: Parameter, value: np.ndarray, order: int, 
     where = f"{effect.name}.{parameter.name}"
     shape = parameter.shape(order, len(bench.channels))
     if np.shape(value) != shape:
-        raise InputError(f"{where} has shape {np.shape(value)}, but order {order} has {shape}: the model is not written")
-    if not (np.all(np.isfinite(value)) and np.all(value >= parameter.low) and np.all(value <= parameter.high)):
+        raise InputError(
+            f"{where} has shape {np.shape(value)}, but order {order} has {shape}: the model is not written"
+        )
+    if not (
+        np.all(np.isfinite(value)) and np.all(value >= parameter.low) and np.all(value <= parameter.high)
+    ):
         raise InputError(f"{where} is outside {allowed(parameter)}: the model is not written")

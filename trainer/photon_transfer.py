@@ -15,6 +15,7 @@ import numpy as np
 from trainer.captures import Camera
 
 BINS = 32
+SLOPE_DOUBT = 0.008     # relative standard error that a stated full well has at best
 
 
 @dataclass(frozen=True)
@@ -73,12 +74,12 @@ def black_estimate(repeats: list[Repeats], camera: Camera) -> BlackEstimate | No
     variance = np.concatenate([r.variance for r in repeats]) if repeats else np.zeros(0)
     if len(mean) < 8 or np.ptp(mean) < 0.02 * camera.full_scale or not (variance > 0).all():
         return None
-    error = np.concatenate([r.error for r in repeats]) / variance + 1e-3
+    relative = np.concatenate([r.error for r in repeats]) / variance + 1e-3
     low, step = float(mean.min()), float(np.ptp(mean))
     place = (mean - low) / step
     floor = float(_expected(np.zeros(1), camera)[0])
-    line = _fit(np.stack([np.ones_like(place), place], 1), variance, error)
-    bent = _fit(np.stack([np.ones_like(place), place, place ** 2], 1), variance, error)
+    line = _fit(np.stack([np.ones_like(place), place], 1), variance, relative)
+    bent = _fit(np.stack([np.ones_like(place), place, place ** 2], 1), variance, relative)
     if line is None or bent is None:
         return None
     fit, covariance = bent if abs(bent[0][2]) > 4 * math.sqrt(bent[1][2, 2]) else line
@@ -86,7 +87,17 @@ def black_estimate(repeats: list[Repeats], camera: Camera) -> BlackEstimate | No
         return None
     reach = (fit[0] - floor) / fit[1]  # how far below the darkest bin, in units of the range
     gradient = np.array([-1 / fit[1], reach / fit[1], 0])[:len(fit)]
-    return BlackEstimate(low - step * float(reach), step * math.sqrt(float(gradient @ covariance @ gradient)))
+    free = BlackEstimate(low - step * float(reach), step * math.sqrt(float(gradient @ covariance @ gradient)))
+    slope, spread = float(fit[1]) / step, math.sqrt(covariance[1, 1]) / step
+    if abs(slope - camera.counts_per_electron) > 3 * spread:
+        return free
+    # the stated full well fits the slope: a line of that slope reaches down to black with less error
+    weight = 1 / (relative * np.maximum(line[0][0] + line[0][1] * place, 1e-2 * float(variance.mean()))) ** 2
+    above = (variance - floor) / camera.counts_per_electron
+    level = float(np.average(mean - above, weights=weight))
+    error = math.hypot(1 / (math.sqrt(float(weight.sum())) * camera.counts_per_electron),
+                       SLOPE_DOUBT * float(np.average(above, weights=weight)))
+    return BlackEstimate(level, error) if error < free.error else free
 
 
 def _fit(terms: np.ndarray, variance: np.ndarray,

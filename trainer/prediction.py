@@ -229,17 +229,20 @@ def pupil_modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
 def iris_opening(scene: Scene, pupil: Pupil) -> Tensor:
     """What the iris passes of each frequency, 0 .. 1.
 
-    A frequency on the edge passes whole; one a bin beyond it, nothing; between them a ramp, so that the size and
-    the place of the iris have gradients.
+    A frequency sample passes by the share of its width that lies inside, so the iris's size and place have gradients
+    and the result does not depend on the padding. The edge lies half a frequency sample of the doubled panel,
+    1 / (4 N pitch), beyond the nominal one: a frequency on the edge passes.
     """
-    bins = [2 / n for n in scene.grid.padded]  # width of a frequency bin, share of the band
+    panel = scene.bench.panel.shape
+    beyond = [1 / (2 * n) for n in panel]  # share of the band
+    bins = [2 / n for n in scene.grid.padded]  # width of a frequency sample, share of the band
     v, u = pupil.v - pupil.centre[0], pupil.u - pupil.centre[1]
     if pupil.shape == "circle":
-        bin_width = math.sqrt(bins[0] * bins[1])
-        return torch.clamp((pupil.half_width - torch.sqrt(v**2 + u**2 + 1e-12)) / bin_width + 1, 0, 1)
-    # Rounding of v and u must not close an edge bin: 1e-4 of a bin is nothing.
-    rows = torch.clamp((pupil.half_width - torch.abs(v)) / bins[0] + 1.0001, 0, 1)
-    columns = torch.clamp((pupil.half_width - torch.abs(u)) / bins[1] + 1.0001, 0, 1)
+        width = math.sqrt(bins[0] * bins[1])
+        edge = pupil.half_width + math.sqrt(beyond[0] * beyond[1])
+        return torch.clamp((edge - torch.sqrt(v**2 + u**2 + 1e-12)) / width + 0.5, 0, 1)
+    rows = torch.clamp((pupil.half_width + beyond[0] - torch.abs(v)) / bins[0] + 0.5, 0, 1)
+    columns = torch.clamp((pupil.half_width + beyond[1] - torch.abs(u)) / bins[1] + 0.5, 0, 1)
     return rows * columns
 
 

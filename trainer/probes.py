@@ -30,9 +30,11 @@ from trainer.prediction import Stages, Trace, counts, light_on_camera, light_pat
 Picture = tuple[str, np.ndarray, str]
 Tensors = dict[str, Tensor]
 
-ITERATIONS = {"drive": 14, "panel": 24, "pupil": 24, "sensor": 24}
-CAPTURES = {"drive": 4, "panel": 8, "pupil": 6, "sensor": 8}
-NODES = 100_000  # most nodes of a free map; larger panels get a coarser map
+ROUND = 2  # iterations between two looks at the capture that says when to stop
+ROUNDS = {"drive": 7, "panel": 12, "pupil": 10, "sensor": 12}
+CAPTURES = {"drive": 4, "panel": 8, "pupil": 6, "sensor": 8}  # most that the gradient sees
+PATIENCE = 3  # rounds without progress on that capture
+NODES = {"panel": 80_000, "sensor": 9_000}  # most nodes of a free map; larger pictures get coarser maps
 PUPIL_NODES = 97  # nodes of the pupil's map across its extent, an axis
 PUPIL_EXTENT = 1.3  # of the panel's band
 KNOTS = 33
@@ -77,9 +79,13 @@ class Probed:
 def probe(folder: Path, ids: tuple[str, ...], held_ids: tuple[str, ...], model: Model, stage: str) -> ProbeFit:
     """Fit one stage's probe on some captures and judge it on others."""
     captures = _captures(folder)
-    batches = load(captures, chosen(captures, ids)[: max(CAPTURES[stage], len(captures.channels))])
+    rows = chosen(captures, ids)
+    last = {(c.channel, c.plane_mm): c for c in rows}.values()
+    first = [c for c in rows if c not in last] or rows
+    batches = load(captures, first[: CAPTURES[stage]])
     kind = PROBES[stage](model, batches[0])
-    workings = [_Working(model, b) for b in batches]
+    seen = [_Working(model, b) for b in batches]
+    unseen = [_Working(model, b) for b in load(captures, last)]
     scale = sum(float(errors_of(b, torch.zeros_like(b.signal)).variance.sum()) for b in batches)
     raw = {n: torch.zeros(shape, requires_grad=True) for n, (shape, _) in kind.shapes.items()}
 
@@ -88,25 +94,40 @@ def probe(folder: Path, ids: tuple[str, ...], held_ids: tuple[str, ...], model: 
 
     optimiser = torch.optim.LBFGS(
         list(raw.values()),
-        max_iter=ITERATIONS[stage],
-        max_eval=2 * ITERATIONS[stage],
+        max_iter=ROUND,
+        max_eval=2 * ROUND,
         history_size=10,
+        tolerance_change=0,
         line_search_fn="strong_wolfe",
     )
 
     def loss_and_gradient() -> float:
         optimiser.zero_grad()
         total = 0.0
-        for working in workings:
+        for working in seen:
             for k in range(len(working.batch.ids)):
                 loss = working.squared_error(kind, physical(), k) / scale
                 loss.backward()
-                total += float(loss)
+                total += float(loss.detach())
         return total
 
-    optimiser.step(loss_and_gradient)
+    def unseen_error() -> float:
+        with torch.no_grad():
+            found = physical()
+            return sum(float(w.squared_error(kind, found, k)) for w in unseen for k in range(len(w.batch.ids)))
+
+    # One capture a colour and plane is kept from the gradient and says when to stop.
+    best, least = {n: t.detach().clone() for n, t in raw.items()}, unseen_error()
+    waited = 0
+    for _ in range(ROUNDS[stage]):
+        optimiser.step(loss_and_gradient)
+        error = unseen_error()
+        if error < least:
+            best, least, waited = {n: t.detach().clone() for n, t in raw.items()}, error, 0
+        elif (waited := waited + 1) == PATIENCE:
+            break
     with torch.no_grad():
-        found = physical()
+        found = {n: t * kind.shapes[n][1] for n, t in best.items()}
         parts = []
         for row in chosen(captures, held_ids):
             working = _Working(model, load_batch(captures, [row]))
@@ -197,7 +218,7 @@ def _drive(model: Model, batch: Batch) -> _Kind:
 
 def _panel(model: Model, batch: Batch) -> _Kind:
     height, width = model.bench.panel.shape
-    nodes = _nodes(height, width)
+    nodes = _nodes(height, width, "panel")
 
     def apply(stages: Stages, t: Tensors) -> Stages:
         panel = stages.panel
@@ -249,7 +270,7 @@ def _pupil(model: Model, batch: Batch) -> _Kind:
 
 def _sensor(model: Model, batch: Batch) -> _Kind:
     height, width = model.bench.camera.shape
-    nodes = _nodes(height, width)
+    nodes = _nodes(height, width, "sensor")
     full_scale = model.bench.camera.full_scale
     y, x = _field(height, width)
     smooth = legendre_maps(y, x, 3, 0)
@@ -317,8 +338,8 @@ def _field(height: int, width: int) -> tuple[Tensor, Tensor]:
     return torch.broadcast_tensors(y[:, None], x[None, :])  # type: ignore[return-value]
 
 
-def _nodes(height: int, width: int) -> tuple[int, int]:
-    shrink = max(1.0, math.sqrt(height * width / NODES))
+def _nodes(height: int, width: int, stage: str) -> tuple[int, int]:
+    shrink = max(1.0, math.sqrt(height * width / NODES[stage]))
     return round(height / shrink), round(width / shrink)
 
 

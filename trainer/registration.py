@@ -3,8 +3,8 @@
 Points are (x, y) in pixels, x along columns; a pixel's centre has whole coordinates. A homography is 3 x 3,
 row-major, and takes the centre of a camera pixel (x, y, 1) to panel pixels (x, y, 1) up to scale.
 
-The dot pattern is a regular grid of dots with one broad dot in the corner nearest to the panel's pixel (0, 0),
-and a second, less broad one next to it along x. Together they tell every mirroring and quarter turn apart.
+The dot pattern is a regular grid of dots with one broad dot in the corner nearest to panel pixel (0, 0), and
+a second, less broad one next to it along x. Together they tell every mirroring and quarter turn apart.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from firmware_iface.errors import InputError
 
 SPREAD = 0.11               # standard deviation of a plain dot, share of the spacing
-BROAD = (2.0, 1.5)          # of the marker's two dots, against a plain dot
+BROAD = (1.7, 1.35)        # of the marker's two dots, against a plain dot
 LIGHT = (1.8, 1.3)          # the least light of the marker's two dots, against their neighbours
 TOLERANCE = 0.25            # share of the spacing within which a found dot is an expected one
 FEWEST = 0.6                # share of the expected dots that must be found
@@ -28,7 +28,7 @@ FEWEST = 0.6                # share of the expected dots that must be found
 
 @dataclass(frozen=True)
 class Dots:
-    """The dots of a pattern. xy : float [n, 2], panel pixels, row by row; the marker's two dots come first."""
+    """The dots of a pattern. xy : float [n, 2], panel pixels, row by row; the marker's two come first."""
 
     xy: np.ndarray
     spacing: float
@@ -43,8 +43,8 @@ def dots_of(shape: tuple[int, int], spacing: float) -> Dots:
     """
     rows, columns = (int((n - 1.2 * spacing) // spacing) + 1 if spacing > 0 else 0 for n in shape)
     if not spacing >= 8 or rows < 4 or columns < 4:
-        raise InputError(f"dots {spacing:g} pixels apart do not make a grid of 4 x 4 on a panel of {shape[0]} x "
-                         f"{shape[1]} pixels: choose a spacing from 8 to {min(shape) / 4.4:.0f}")
+        raise InputError(f"dots {spacing:g} pixels apart do not make a grid of 4 x 4 on a panel of "
+                         f"{shape[0]} x {shape[1]} pixels: choose a spacing from 8 to {min(shape) / 4.4:.0f}")
     left, top = (shape[1] - 1 - (columns - 1) * spacing) / 2, (shape[0] - 1 - (rows - 1) * spacing) / 2
     grid = [(left + i * spacing, top + j * spacing) for j in range(rows) for i in range(columns)]
     return Dots(np.asarray(grid), float(spacing), columns, rows)
@@ -74,8 +74,8 @@ def find_homography(image: np.ndarray, dots: Dots) -> np.ndarray:
     points, light = _spots(image)
     if len(points) < FEWEST * len(dots.xy):
         raise InputError(f"only {len(points)} of {len(dots.xy)} dots are seen in the dot picture: focus the "
-                         "camera, see that the whole pattern is in view, and expose so that the dots are bright "
-                         "but not saturated")
+                         "camera, see that the whole pattern is in view, and expose so that the dots are "
+                         "bright but not saturated")
     best: tuple[float, np.ndarray] | None = None
     for first, second in _markers(points, light):
         for guess in _guesses(points, first, second, dots):
@@ -86,8 +86,9 @@ def find_homography(image: np.ndarray, dots: Dots) -> np.ndarray:
             break
     if best is None or best[0] < FEWEST * len(dots.xy):
         raise InputError(f"{len(points)} dots are seen but they do not fit the expected {dots.columns} x "
-                         f"{dots.rows} grid with its marker: show this dot pattern with its corner of two broad "
-                         "dots in view, or use a wider spacing if the dots are less than 8 camera pixels apart")
+                         f"{dots.rows} grid with its marker: show this dot pattern with its corner of two "
+                         "broad dots in view, or space the dots wider if they are less than 8 camera pixels "
+                         "apart")
     return best[1] / best[1][2, 2]
 
 
@@ -100,7 +101,7 @@ def panel_points(homography: np.ndarray, camera_xy: np.ndarray) -> np.ndarray:
 def resample(image: np.ndarray, homography: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """A camera picture [h, w] on the panel's pixels, float32 [H, W]; 0 where the camera did not look.
 
-    Interpolates with a Lanczos kernel: for looking at, and for making registered sets of finely sampled pictures.
+    Interpolates with a Lanczos kernel: to look at, and to make registered sets of finely sampled pictures.
     """
     there = np.ascontiguousarray(image, np.float32)
     return cv2.warpPerspective(there, np.asarray(homography, np.float64), (shape[1], shape[0]),
@@ -111,11 +112,11 @@ def _spots(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Centres (x, y), float [n, 2], of a picture's bright dots, and their light against neighbours', [n]."""
     image = np.asarray(image)
     if image.ndim != 2 or min(image.shape) < 16:
-        raise InputError(f"the dot picture has shape {image.shape}: give a gray picture, 16 x 16 pixels or more")
+        raise InputError(f"the dot picture has shape {image.shape}: give a gray one, 16 x 16 pixels or more")
     raw = np.nan_to_num(image.astype(np.float32), posinf=0, neginf=0)
     picture: np.ndarray = cv2.GaussianBlur(raw, (0, 0), 0.7)
-    wide = max(picture.shape) / 6
-    background = cv2.GaussianBlur(picture, (0, 0), wide)
+    coarse = cv2.GaussianBlur(cv2.resize(picture, (24, 24), interpolation=cv2.INTER_AREA), (0, 0), 4)
+    background = cv2.resize(coarse, picture.shape[::-1], interpolation=cv2.INTER_LINEAR)
     light = picture - np.minimum(background, np.median(picture))
     noise = 1.4826 * float(np.median(np.abs(light - np.median(light))))
     bright = float(np.quantile(light, 0.995))
@@ -154,7 +155,7 @@ def _flux(light: np.ndarray, xy: np.ndarray, radius: float) -> np.ndarray:
 def _centroid(light: np.ndarray, x: float, y: float, size: float) -> tuple[float, float]:
     """The centre of a dot near (x, y), by its moments under a Gaussian window that follows it."""
     sigma = max(size / 2.5, 1.0)
-    reach = math.ceil(2.5 * sigma)
+    reach = math.ceil(3.5 * sigma)
     for _ in range(12):
         left, top = max(round(x) - reach, 0), max(round(y) - reach, 0)
         part = light[top:round(y) + reach + 1, left:round(x) + reach + 1]
@@ -203,7 +204,7 @@ def _guesses(points: np.ndarray, first: int, second: int, dots: Dots) -> list[np
 
 
 def _refined(points: np.ndarray, guess: np.ndarray, dots: Dots) -> tuple[float, np.ndarray] | None:
-    """How many dots a guess explains once grown over the grid, and the homography; None if it does not grow."""
+    """How many dots a guess explains once grown over the grid, and the homography; None if it does not."""
     tree = cKDTree(dots.xy)
     homography = guess
     origin = dots.xy[0]
@@ -214,6 +215,9 @@ def _refined(points: np.ndarray, guess: np.ndarray, dots: Dots) -> tuple[float, 
         keep = np.flatnonzero(near)
         _, only = np.unique(index[keep], return_index=True)
         keep = keep[only]
+        if reach > 1e6 and len(keep) > 16:
+            # the marker's dots lean on each other: they lead, but do not measure
+            keep = keep[index[keep] > 1]
         if len(keep) < 4:
             return None
         camera, panel = points[keep], dots.xy[index[keep]]

@@ -9,14 +9,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from trainer.evidence import Batch
-from trainer.prediction import Scene
+if TYPE_CHECKING:  # effects name these starts, and the light path's trainer side names effects
+    from trainer.evidence import Batch
+    from trainer.prediction import Scene
 
 Starts = list[dict[str, Any]]
 TILE = 64

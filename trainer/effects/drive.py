@@ -19,7 +19,7 @@ REACH = 2  # neighbours on either side that a pixel hears
 @effect(
     stage="drive",
     told_to="display",
-    orders=(1, 3, 5),
+    orders=(2, 4, 6),
     parameters=[
         Parameter(
             "gain",

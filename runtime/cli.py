@@ -1,0 +1,299 @@
+"""`hololoop-runtime`: the headset's commands.
+
+Exit codes: 0 done; 2 the input cannot be used (one line on stderr says what to change); 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from argparse import ArgumentParser, ArgumentTypeError, Namespace, RawDescriptionHelpFormatter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NoReturn
+
+from firmware_iface.errors import InputError, nearest
+
+PROGRAM = "hololoop-runtime"
+DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
+
+ABOUT = """Compute the patterns that look right through a calibrated bench.
+
+The usual way:
+  hololoop-runtime solve bundle/ picture.png --out pattern.png
+
+A bundle comes from the workstation: hololoop-trainer export --model model.toml --out bundle/"""
+
+SOLVE = """Compute the panel pattern for each picture, through the light path of a bundle.
+
+TARGET is a PNG (taken as sRGB), an EXR or an NPY file (taken as linear light) of the panel's size, or of any
+size with --fit. The pattern is an 8-bit gray PNG, to be sent to the panel as it is. With several channels in
+the bundle, each gets a pattern of its own: NAME-red.png, NAME-green.png, NAME-blue.png; a gray picture is the
+same in all of them. With --channel, only that one is computed, under the name given.
+
+examples:
+  hololoop-runtime solve bundle/ picture.png --out pattern.png
+  hololoop-runtime solve bundle/ a.png b.png --out patterns/ --iterations 40
+  hololoop-runtime solve bundle/ photo.png --fit --channel green --plane 30 --out pattern.png
+
+amplitude PSNR is of what the calibrated model says that the pattern shows; more iterations never make it
+worse, and 20 are usually within a few dB of what can be reached."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One pattern to compute: which picture, which colour of it, and the file that it goes to."""
+
+    target: Path
+    channel: str
+    out: Path
+
+
+class _Parser(ArgumentParser):
+    """A parser whose errors are InputErrors of one sentence."""
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(f"{' '.join(message.split())}; see: {self.prog} --help")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code."""
+    try:
+        return _main(sys.argv[1:] if argv is None else list(argv))
+    except InputError as error:
+        return _stopped(str(error), BAD_INPUT)
+    except KeyboardInterrupt:
+        return _stopped("interrupted; what was finished is there, and nothing is half written", INTERRUPTED)
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        return _stopped(f"{where}{error.strerror or error}", BAD_INPUT)
+    except MemoryError:
+        return _stopped("there is not enough memory for this bundle: use a machine with more", BAD_INPUT)
+
+
+def _stopped(message: str, code: int) -> int:
+    print(f"{PROGRAM}: {' '.join(message.split())}", file=sys.stderr)
+    return code
+
+
+def _main(argv: list[str]) -> int:
+    parser = _parser()
+    if argv and not argv[0].startswith("-") and argv[0] not in COMMANDS:
+        raise InputError(f"there is no command '{argv[0][:60]}': {nearest(argv[0], COMMANDS)}")
+    try:
+        args = parser.parse_args(argv)
+    except SystemExit as stop:  # --help has printed
+        return int(stop.code or 0)
+    if args.version:
+        from importlib.metadata import version
+
+        print(version("hololoop"))
+        return DONE
+    if args.command is None:
+        parser.print_help()
+        return BAD_INPUT if argv else DONE
+    run, show = COMMANDS[args.command]
+    result = run(args)
+    if args.json:
+        print(json.dumps(result, allow_nan=False))
+    else:
+        show(result)
+    return DONE
+
+
+def _parser() -> ArgumentParser:
+    parser = _Parser(prog=PROGRAM, description=ABOUT, formatter_class=RawDescriptionHelpFormatter)
+    parser.add_argument("--version", action="store_true", help="print the version and stop")
+    parts = parser.add_subparsers(metavar="COMMAND", dest="command", title="commands", parser_class=_Parser)
+    solve = parts.add_parser(
+        "solve",
+        help="compute the pattern for each picture",
+        description=SOLVE,
+        formatter_class=RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    solve.add_argument("bundle", metavar="BUNDLE", type=Path, help="folder that hololoop-trainer exported")
+    solve.add_argument("targets", metavar="TARGET", type=Path, nargs="+", help="pictures to show")
+    solve.add_argument(
+        "--out",
+        metavar="PHASE.png|DIR",
+        type=Path,
+        required=True,
+        help="a .png for one picture, or a folder (made if it is not there)",
+    )
+    solve.add_argument(
+        "--iterations",
+        metavar="N",
+        type=_whole(0, 100000),
+        default=20,
+        help="steps a pattern (default 20; 0: double phase alone)",
+    )
+    solve.add_argument("--channel", metavar="C", help="compute this channel only (default: all)")
+    solve.add_argument(
+        "--plane",
+        metavar="MM",
+        type=_millimetres,
+        help="image plane, mm from the panel (default: the bench's)",
+    )
+    solve.add_argument("--fit", action="store_true", help="crop and resize pictures of another size")
+    solve.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
+    return parser
+
+
+def _whole(low: int, high: int) -> Callable[[str], int]:
+    def read(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = low - 1
+        if not low <= value <= high:
+            raise ArgumentTypeError(f"{text!r} is not a whole number from {low} to {high}")
+        return value
+
+    return read
+
+
+def _millimetres(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ArgumentTypeError(f"{text!r} is not a distance in mm")
+    return value
+
+
+def run_solve(args: Namespace) -> dict[str, Any]:
+    """Compute and write the patterns, picture by picture; returns what `--json` prints."""
+    import time
+
+    from runtime.bundle import read_bundle
+    from runtime.calibrated import bundle_channels, load_light_path, plane_of
+    from runtime.solver import solve
+
+    bundle = read_bundle(args.bundle)
+    colour = len(bundle_channels(bundle)) > 1
+    channels = bundle_channels(bundle) if args.channel is None else [args.channel]
+    paths = {c: load_light_path(bundle, c, args.plane) for c in channels}
+    planned = jobs(args.targets, channels, args.out)
+    shape = next(iter(paths.values())).grid.shape
+    patterns = []
+    with _progress(sum(args.iterations + 1 for _ in planned)) as tick:
+        pictures: dict[Path, Any] = {}
+        for job in planned:
+            if job.target not in pictures:
+                pictures = {job.target: _planes(job.target, shape, channels, args.fit, colour)}
+            started = time.perf_counter()
+            solution = solve(
+                paths[job.channel],
+                pictures[job.target][job.channel],
+                args.iterations,
+                progress=partial(tick, job.out.name),
+            )
+            write_gray(job.out, solution.gray)
+            patterns.append(
+                {
+                    "target": str(job.target),
+                    "channel": job.channel,
+                    "plane_mm": plane_of(bundle, job.channel, args.plane),
+                    "phase": str(job.out),
+                    "psnr_db": round(solution.quality.psnr_db, 4),
+                    "nrmse": round(solution.quality.nrmse, 6),
+                    "scale": solution.quality.scale,
+                    "iterations": args.iterations,
+                    "seconds": round(time.perf_counter() - started, 4),
+                }
+            )
+    return {"bundle": str(args.bundle), "patterns": patterns}
+
+
+def show_solve(result: dict[str, Any]) -> None:
+    """One line a pattern."""
+    for p in result["patterns"]:
+        print(
+            f"{p['phase']}: {p['channel']}, {p['plane_mm']:g} mm, amplitude PSNR {p['psnr_db']:.1f} dB "
+            f"after {p['iterations']} iterations, {p['seconds']:.1f} s"
+        )
+
+
+COMMANDS = {"solve": (run_solve, show_solve)}
+
+
+def jobs(targets: Sequence[Path], channels: Sequence[str], out: Path) -> list[Job]:
+    """Which file each colour of each picture goes to; makes the folder. Raises InputError where two meet."""
+    single = out.suffix.lower() == ".png" and not out.is_dir()
+    if single and len(targets) > 1:
+        raise InputError(f"--out {out} is one file and there are {len(targets)} pictures: give a folder")
+    if not single and out.suffix and not out.is_dir():
+        raise InputError(f"--out {out}: patterns are PNG; give a name that ends in .png, or a folder")
+    planned = []
+    for target in targets:
+        base = out if single else out / f"{target.stem}.png"
+        for channel in channels:
+            name = base if len(channels) == 1 else base.with_name(f"{base.stem}-{channel}{base.suffix}")
+            planned.append(Job(target, channel, name))
+    taken: dict[Path, Path] = {}
+    for job in planned:
+        if job.out in taken:
+            raise InputError(
+                f"{taken[job.out]} and {job.target} would both be written to {job.out}: rename one"
+            )
+        if job.out.resolve() == job.target.resolve():
+            raise InputError(f"{job.target} would be overwritten by its own pattern: give another --out")
+        taken[job.out] = job.target
+    if not single:
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"--out {out} cannot be made ({error.strerror}): give another folder") from None
+    elif not out.absolute().parent.is_dir():
+        raise InputError(f"--out {out}: there is no folder {out.absolute().parent}; make it first")
+    return planned
+
+
+def _planes(
+    path: Path, shape: tuple[int, int], channels: Sequence[str], fit: bool, colour: bool
+) -> dict[str, Any]:
+    """A picture's irradiance for each channel, [H, W].
+
+    colour: the bundle has several channels, and each shows its own part; else luminance is shown.
+    """
+    from runtime.targets import CHANNELS, read_target
+
+    if colour and all(c in CHANNELS for c in channels):
+        return dict(zip(channels, read_target(path, shape, channels, fit=fit), strict=True))
+    gray = read_target(path, shape, fit=fit)
+    return dict.fromkeys(channels, gray)
+
+
+def write_gray(path: Path, gray: Any) -> None:
+    """Gray levels, uint8 [H, W], as an 8-bit PNG that appears whole or not at all."""
+    from PIL import Image
+
+    from runtime.files import whole_file
+
+    with whole_file(path) as file:
+        Image.fromarray(gray).save(file, format="PNG")
+
+
+@contextmanager
+def _progress(steps: int) -> Iterator[Callable[[str, int, float], None]]:
+    """A callback (pattern, steps done, dB) for each step; a moving bar on stderr if that is a terminal."""
+    if not sys.stderr.isatty():
+        yield lambda name, done, psnr: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (BarColumn(30), TimeRemainingColumn(), TextColumn("{task.description}", markup=False))
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("solving", total=steps)
+        yield lambda name, done, psnr: bar.update(task, advance=1, description=f"{name}  {psnr:.1f} dB")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

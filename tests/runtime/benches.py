@@ -1,0 +1,135 @@
+"""Light paths for tests, drawn at random or written out, that need neither a bench file nor the trainer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from runtime.lightpath import LightPath, band_frequencies, grid_for
+from runtime.propagation import band_limit, transfer_function
+
+PITCH, WAVELENGTH = 8e-6, 520e-9
+
+
+def ideal_path(
+    shape: tuple[int, int] = (48, 64),
+    distance: float = 0.012,
+    half_width: float = 1.0,
+    dtype: type = np.float64,
+) -> LightPath:
+    """A perfect panel of 256 levels under a uniform beam, with a square iris, by the angular spectrum."""
+    grid = grid_for(shape, PITCH, WAVELENGTH, distance, half_width)
+    fy, fx = band_frequencies(grid, np.zeros((), np.float64))
+    limits = tuple(band_limit(WAVELENGTH, distance, n * PITCH) for n in grid.padded)
+    edge = half_width / (2 * PITCH) * (1 + 1e-9)
+    passed = (np.abs(fy)[:, None] <= edge) & (np.abs(fx)[None, :] <= edge)
+    transfer = transfer_function(
+        fy[:, None], fx[None, :], WAVELENGTH, distance, (limits[0], limits[1]), "angular_spectrum"
+    )
+    path = LightPath(
+        grid=grid,
+        response=2 * np.pi * np.arange(256) / 256,
+        source=np.ones(shape, np.complex128),
+        transfers=(passed * transfer)[None],
+        weights=np.ones(1),
+    )
+    return converted(path, dtype)
+
+
+def random_path(
+    shape: tuple[int, int] = (24, 30), half_width: float = 0.8, dtype: type = np.float64, **without: None
+) -> LightPath:
+    """Everything at once: gain, crosstalk, leak, three modes, an irradiance filter; `without` says what not."""
+    rng = np.random.default_rng(3)
+    path = ideal_path(shape, 0.005, half_width)
+    grid = path.grid
+
+    def noise(*size: int) -> np.ndarray:
+        return rng.normal(size=size) + 1j * rng.normal(size=size)
+
+    full = replace(
+        path,
+        gain=1 + 0.1 * rng.normal(size=shape),
+        source=path.source + 0.3 * noise(*shape),
+        leak=0.2 * noise(*shape),
+        transfers=path.transfers * (1 + 0.3 * noise(3, *path.transfers.shape[1:])),
+        weights=np.array([0.5, 0.3, 0.2]),
+        crosstalk=(_taps(rng, 3, 5), _taps(rng, 2, 3)),
+        aperture=(0.9, 0.8),
+        irradiance_filter=np.fft.rfft2(rng.normal(size=grid.image_shape) / grid.image_shape[0]),
+    )
+    return converted(replace(full, **without), dtype)
+
+
+def _taps(rng: np.random.Generator, sub: int, taps: int) -> np.ndarray:
+    weights = rng.random((sub, taps))
+    return weights / weights.sum(1, keepdims=True)
+
+
+def converted(path: LightPath, dtype: type) -> LightPath:
+    """The same path in another precision."""
+    pair = {np.float64: np.complex128, np.float32: np.complex64}[dtype]
+
+    def one(value: Any) -> Any:
+        if value is None:
+            return None
+        if isinstance(value, tuple):
+            return tuple(one(part) for part in value)
+        return np.asarray(value).astype(pair if np.iscomplexobj(value) else dtype)
+
+    names = (
+        "response", "source", "transfers", "weights", "gain", "crosstalk", "leak", "aperture", "irradiance_filter",
+    )  # fmt: skip
+    return replace(path, **{name: one(getattr(path, name)) for name in names})
+
+
+def torch_path(path: LightPath) -> LightPath:
+    """The same path on torch tensors."""
+    import torch
+
+    def one(value: Any) -> Any:
+        if value is None:
+            return None
+        return tuple(one(part) for part in value) if isinstance(value, tuple) else torch.as_tensor(value)
+
+    names = (
+        "response", "source", "transfers", "weights", "gain", "crosstalk", "leak", "aperture", "irradiance_filter",
+    )  # fmt: skip
+    return replace(path, **{name: one(getattr(path, name)) for name in names})
+
+
+def padded_irradiance(phase: np.ndarray, distance: float, oversampling: int = 4, pad: int = 3) -> np.ndarray:
+    """What panel-sized pixels integrate, [H, W], of square pixels of this phase: an independent simulation.
+
+    Plain double-precision FFTs of the panel drawn on sub-pixels, each a square, `pad` times larger all round; the
+    exact transfer function of free space; only the panel's own band passes.
+    """
+    height, width = phase.shape
+    q = oversampling
+    field = np.zeros((pad * height * q, pad * width * q), complex)
+    field[: height * q, : width * q] = np.kron(np.exp(1j * phase), np.ones((q, q)))
+    fy = np.fft.fftfreq(field.shape[0], PITCH / q)[:, None]
+    fx = np.fft.fftfreq(field.shape[1], PITCH / q)[None, :]
+    square = np.sinc(fy * PITCH / q) * np.sinc(fx * PITCH / q)
+    edge = 1 / (2 * PITCH) * (1 + 1e-9)
+    passed = (np.abs(fy) <= edge) & (np.abs(fx) <= edge)
+    root = np.sqrt(np.maximum(1 / WAVELENGTH**2 - fy**2 - fx**2, 0))
+    image = np.fft.ifft2(np.fft.fft2(field) * square * passed * np.exp(2j * np.pi * distance * root))
+    light = np.fft.ifft2(np.fft.fft2(np.abs(image) ** 2) * square).real[: height * q, : width * q]
+    return light.reshape(height, q, width, q).mean((1, 3))
+
+
+def scene(shape: tuple[int, int], seed: int = 0) -> np.ndarray:
+    """A picture with edges, a gradient, texture and darkness: irradiance [H, W], 0 .. 1."""
+    rng = np.random.default_rng(seed)
+    y, x = np.meshgrid(np.linspace(-1, 1, shape[0]), np.linspace(-1, 1, shape[1]), indexing="ij")
+    picture = 0.35 + 0.25 * x
+    picture[(y + 0.2) ** 2 + (x - 0.3) ** 2 < 0.12] = 0.9
+    picture[np.abs(y - 0.45) < 0.12] = 0.04
+    picture += 0.1 * np.sin(14 * x + 9 * y) * (x < -0.2)
+    for _ in range(6):
+        i, j = rng.integers(2, shape[0] - 6), rng.integers(2, shape[1] - 6)
+        picture[i : i + 4, j : j + 4] = rng.random()
+    return np.clip(picture, 0.02, 1).astype(np.float32)

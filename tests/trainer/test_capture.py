@@ -1,0 +1,126 @@
+"""Patterns that differ, exposures that do not saturate, and a capture set that reads and passes its check."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_iface.errors import InputError
+from firmware_iface.virtual import VirtualHeadset, load_bench
+from trainer.bench_file import Bench, read_bench
+from trainer.capture import Taken, capture_from, capture_set
+from trainer.captures import read_captures
+from trainer.check import check_captures
+from trainer.effects.testing import small_bench
+from trainer.patterns import choose_patterns, default_count
+
+ROWS, COLUMNS, DISTANCE = 72, 96, 6.0
+
+
+def small(name: str, seed: int = 0) -> tuple[VirtualHeadset, Bench]:
+    headset = VirtualHeadset(load_bench(f"virtual:{name}").resized(ROWS, COLUMNS, DISTANCE), seed)
+    tables = headset.description.nominal()
+    tables["panel"]["levels"] = int(tables["panel"]["levels"])
+    return headset, read_bench(tables)
+
+
+def take(folder: Path, name: str, **options: object) -> Taken:
+    headset, bench = small(name)
+    return capture_set(headset, bench, folder, **options)  # type: ignore[arg-type]
+
+
+def test_the_patterns_are_many_kinds_and_use_every_gray_level() -> None:
+    patterns = choose_patterns(small_bench(), "green", 6.0, 12)
+    kinds = [p.kind for p in patterns]
+    assert len(set(kinds)) == 8
+    assert len({p.gray.tobytes() for p in patterns}) == 12
+    assert all(p.gray.dtype == np.uint8 and p.gray.shape == (72, 96) for p in patterns)
+    used = np.bincount(np.concatenate([p.gray.ravel() for p in patterns[:7]]), minlength=256)
+    assert used.min() > 20
+    held_out, fitted = set(kinds[1::3]), {k for i, k in enumerate(kinds) if i % 3 != 1}
+    assert held_out <= fitted
+
+
+def test_the_same_seed_gives_the_same_patterns_and_another_does_not() -> None:
+    first, again, other = (choose_patterns(small_bench(), "green", 6.0, 4, seed) for seed in (1, 1, 2))
+    assert all((a.gray == b.gray).all() for a, b in zip(first, again, strict=True))
+    assert not (first[1].gray == other[1].gray).all()
+
+
+def test_a_picture_is_seen_in_the_image_plane() -> None:
+    headset, bench = small("ideal")
+    from trainer.patterns import _picture
+
+    for index, number in ((0, 0), (2, 1)):
+        pattern = choose_patterns(bench, "green", DISTANCE, 3)[index]
+        seen = headset.true_irradiance(pattern.gray, "green")
+        assert np.corrcoef(seen.ravel(), _picture(bench.panel.shape, number).ravel())[0, 1] > 0.6
+
+
+def test_a_set_is_sound_with_a_repeat_for_the_noise(tmp_path: Path) -> None:
+    steps: list[float] = []
+    taken = take(tmp_path / "set", "ideal", progress=lambda done, what: steps.append(done))
+    captures = read_captures(tmp_path / "set")
+    assert len(captures) == taken.captures == default_count(1) + 1 == 13
+    assert captures.captures[0].pattern == captures.captures[1].pattern
+    assert taken.saturated < 0.003
+    assert len({c.exposure_ms for c in captures.captures}) == 1
+    brightest = max(float(np.quantile(captures.counts(c), 0.99)) for c in captures.captures)
+    assert brightest > 0.4 * captures.bench.camera.saturation
+    assert [c.time_s for c in captures.captures] == sorted(c.time_s for c in captures.captures)
+    assert not [p for p in check_captures(tmp_path / "set") if p.severity == "error"]
+    assert steps == sorted(steps)
+    assert (steps[0], steps[-1]) == (0.0, 1.0)
+
+
+def test_each_colour_and_plane_has_its_patterns_and_its_exposure(tmp_path: Path) -> None:
+    taken = take(tmp_path / "set", "colour", patterns=2, planes_mm=[5.0, 7.0], channels=["blue", "red"])
+    captures = read_captures(tmp_path / "set")
+    assert captures.channels == ("red", "blue")
+    assert captures.planes == (5.0, 7.0)
+    assert len(captures) == 2 * 2 * 3
+    assert set(taken.exposure_ms) == {"red", "blue"}
+    assert len({c.pattern for c in captures.captures}) == 8
+
+
+def test_a_bright_bench_gets_a_short_exposure(tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    description = load_bench("virtual:ideal").resized(ROWS, COLUMNS, DISTANCE)
+    description = replace(description, simulation=replace(description.simulation, signal_share=5.0))
+    _, bench = small("ideal")
+    taken = capture_set(VirtualHeadset(description), bench, tmp_path / "set", 3)
+    assert taken.exposure_ms["green"] < 1.0
+    assert 0 < taken.saturated < 0.003
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"spec": "virtual:demoo"}, "did you mean 'demo'"),
+        ({"spec": "somewhere"}, "virtual:NAME"),
+        ({"channels": ["gren"]}, "did you mean 'green'"),
+        ({"planes_mm": [9999.0]}, "-2000 to 2000"),
+        ({"patterns": 0}, "at least one"),
+    ],
+)
+def test_what_cannot_be_captured_gets_a_sentence(tmp_path: Path, options: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        capture_from(**{"spec": "virtual:ideal", "folder": tmp_path / "set", "patterns": 1, **options})
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(InputError, match="not empty"):
+        capture_from("virtual:ideal", tmp_path, 1)
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_a_dark_bench_is_said_to_be_dark(tmp_path: Path) -> None:
+    headset, bench = small("ideal")
+    headset.lasers.set_power = lambda channel, fraction: None  # type: ignore[method-assign]
+    with pytest.raises(InputError, match="sees nothing"):
+        capture_set(headset, bench, tmp_path / "set", 1)

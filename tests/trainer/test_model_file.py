@@ -1,0 +1,413 @@
+"""Model files: an exact round trip, strict reading, and nothing but InputError for whatever is in a file."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from firmware_iface.errors import InputError
+from trainer.bench_file import Bench, Camera, Channel, Iris, Panel
+from trainer.effects.definition import Effect, Parameter
+from trainer.effects.registry import catalogue
+from trainer.model import Model, Present, absent
+from trainer.model_file import read_model, write_model
+
+
+def curve(drive: Any, gain: Any, curvature: Any) -> Any:
+    """Stands for an effect; nothing here applies it."""
+    return drive
+
+
+# Two effects whose parameters the texts below rely on, among all that there are.
+KNOWN = {
+    **catalogue(),
+    "phase_response": Effect(
+        "phase_response",
+        "drive",
+        "display",
+        "A curve a colour.",
+        (
+            Parameter("gain", "1", 0.02, 1.0, 0.2, 3.0, per_channel=True),
+            Parameter("curvature", "rad", 0.1, low=-6, high=6, count=lambda order: order, per_channel=True),
+        ),
+        curve,
+        (1, 3, 5),
+    ),
+    "distance": Effect(
+        "distance",
+        "pupil",
+        "display",
+        "The image plane is elsewhere.",
+        (Parameter("offset", "mm", 0.03, low=-100, high=100, about="how far it is"),),
+        curve,
+    ),
+}
+
+
+def bench(*names: str) -> Bench:
+    camera = Camera(64, 48, 8.0, True, 12, 64.0, 10500.0, 5.0)
+    channels = tuple(Channel(n, 520.0 + 50 * k) for k, n in enumerate(names or ("green",)))
+    return Bench("practice", Panel(64, 48, 8.0), channels, 30.0, Iris(), camera)
+
+
+def filled(effect: Effect, on: Bench, rng: np.random.Generator, order: int | None = None) -> Present:
+    """The effect with values all over its range, and with errors."""
+    base = absent(effect, on, order)
+    values, errors = {}, {}
+    for p in effect.parameters:
+        low, high = (max(p.low, -50.0), min(p.high, 50.0))
+        values[p.name] = rng.uniform(low, high, base.values[p.name].shape)
+        errors[p.name] = np.abs(rng.standard_normal(values[p.name].shape)) * 1e-7
+    return Present(effect, base.order, values, errors)
+
+
+def whole_model(on: Bench, seed: int = 0) -> Model:
+    rng = np.random.default_rng(seed)
+    present = tuple(filled(e, on, rng, e.orders[-1]) for e in KNOWN.values())
+    history = (
+        {"added": "", "nrmse": 0.2, "excess": 0.04, "date": "2025-01-31"},
+        {
+            "added": "zero_order",
+            "nrmse": 1 / 3,
+            "list": [1, 2.5, 'x\ny"\\'],
+            "kept": True,
+            "nested": {"a b": 1e-30},
+        },
+    )
+    return Model(on, present, {c.name: 1 / (k + 3) for k, c in enumerate(on.channels)}, "fresnel", history)
+
+
+def assert_same(a: Model, b: Model) -> None:
+    assert (a.bench, a.gain, a.method, a.history, a.names) == (b.bench, b.gain, b.method, b.history, b.names)
+    for one, other in zip(a.present, b.present, strict=True):
+        assert one.order == other.order
+        for first, second in ((one.values, other.values), (one.errors, other.errors)):
+            assert (first is None) == (second is None)
+            for name, array in (first or {}).items():
+                assert second is not None
+                assert second[name].shape == array.shape
+                assert second[name].dtype == np.float64
+                np.testing.assert_array_equal(second[name], array)
+
+
+@pytest.mark.parametrize("names", [("green",), ("red", "green", "blue"), ("my red", 'a"b', "array")])
+def test_a_model_of_every_effect_comes_back_exactly(tmp_path: Path, names: tuple[str, ...]) -> None:
+    model = whole_model(bench(*names))
+    path = tmp_path / "model.toml"
+    write_model(path, model, {"written_by": "a test", "captures": 12})
+    assert_same(model, read_model(path, KNOWN, model.bench))
+    assert [p.name for p in tmp_path.iterdir()] == ["model.toml"]
+    assert tomllib.loads(path.read_text(encoding="utf-8"))["about"] == {
+        "written_by": "a test",
+        "captures": 12,
+    }
+    assert max(map(len, path.read_text(encoding="utf-8").splitlines())) <= 120
+
+
+def test_an_empty_model_comes_back(tmp_path: Path) -> None:
+    model = Model(bench("red", "green"))
+    write_model(tmp_path / "m.toml", model)
+    assert_same(model, read_model(tmp_path / "m.toml", KNOWN))
+
+
+def test_the_file_tells_a_person_what_may_be_edited(tmp_path: Path) -> None:
+    write_model(tmp_path / "m.toml", whole_model(bench()))
+    text = (tmp_path / "m.toml").read_text(encoding="utf-8")
+    for words in (
+        "# how far it is; -100 to 100 mm; absent at 0",
+        "# The image plane is elsewhere. [pupil]",
+        "order = 5  # one of 1, 3, 5",
+        "# Camera counts a unit of irradiance",
+    ):
+        assert words in text
+
+
+def test_values_that_could_not_be_read_are_not_written(tmp_path: Path) -> None:
+    on = bench()
+    for bad in (np.array(1e9), np.array(np.nan), np.zeros(3)):
+        present = absent(KNOWN["distance"], on).with_values({"offset": bad})
+        with pytest.raises(InputError, match="distance.offset .* not written"):
+            write_model(tmp_path / "m.toml", Model(on, (present,)))
+    assert not list(tmp_path.iterdir())
+
+
+def long_effect(count: int = 100, per_channel: bool = False) -> Effect:
+    parameter = Parameter("table", "rad", 0.1, low=-5, high=5, count=count, per_channel=per_channel)
+    return Effect("long_table", "drive", "display", "A long table.", (parameter,), lambda drive, table: drive)
+
+
+@pytest.mark.parametrize("per_channel", [False, True])
+def test_long_arrays_lie_beside_the_file_under_a_hash(tmp_path: Path, per_channel: bool) -> None:
+    on, effect = bench("red", "green"), long_effect(per_channel=per_channel)
+    known = {**KNOWN, effect.name: effect}
+    rng = np.random.default_rng(3)
+    first = Model(on, (filled(effect, on, rng),))
+    path = tmp_path / "model.toml"
+    write_model(path, first)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["model.safetensors", "model.toml"]
+    assert_same(first, read_model(path, known))
+    assert "--effects" in path.read_text(encoding="utf-8")
+
+    second = Model(on, (filled(effect, on, rng),))
+    write_model(
+        path, second
+    )  # under another name first, so that the first model is whole until the last moment
+    assert_same(second, read_model(path, known))
+    assert len(list(tmp_path.iterdir())) == 2
+    (array_file,) = tmp_path.glob("*.safetensors")
+    data = bytearray(array_file.read_bytes())
+    data[-1] ^= 1
+    array_file.write_bytes(data)
+    with pytest.raises(InputError, match="SHA-256"):
+        read_model(path, known)
+    array_file.unlink()
+    with pytest.raises(InputError, match="cannot be read"):
+        read_model(path, known)
+    write_model(path, Model(on))
+    assert [p.name for p in tmp_path.iterdir()] == ["model.toml"]
+
+
+def test_a_failed_write_leaves_the_old_model_readable(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    on, effect = bench(), long_effect()
+    known = {**KNOWN, effect.name: effect}
+    old = Model(on, (filled(effect, on, np.random.default_rng(1)),))
+    path = tmp_path / "m.toml"
+    write_model(path, old)
+    import trainer.model_file as module
+
+    real, calls = module.whole_file, []
+
+    def failing(*arguments: Any) -> Any:
+        calls.append(arguments)
+        if len(calls) == 2:
+            raise InputError("the disk is full")
+        return real(*arguments)
+
+    monkeypatch.setattr(module, "whole_file", failing)
+    with pytest.raises(InputError, match="full"):
+        write_model(path, Model(on, (filled(effect, on, np.random.default_rng(2)),)))
+    assert_same(old, read_model(path, known))
+
+
+GOOD = """schema = 1
+[bench]
+name = "b"
+[bench.panel]
+width = 64
+height = 48
+pitch_um = 8
+[[bench.channel]]
+name = "red"
+wavelength_nm = 638
+[[bench.channel]]
+name = "green"
+wavelength_nm = 520
+[bench.propagation]
+distance_mm = 30
+[bench.camera]
+width = 64
+height = 48
+pixel_um = 8
+registered = true
+bit_depth = 12
+black_level = 64
+full_well_e = 10500
+read_noise_e = 5
+[propagation]
+method = "angular_spectrum"
+[gain]
+red = 12.5
+[[effect]]
+name = "phase_response"
+order = 1
+[effect.parameters.gain]
+value = { red = 1.1, green = 1.2 }
+error = { red = 0.1, green = nan }
+unit = "1"
+[effect.parameters.curvature]
+value.red = [0.1]
+value.green = [0]
+unit = "rad"
+[[effect]]
+name = "distance"
+order = 0
+[effect.parameters.offset]
+value = 2
+unit = "mm"
+[[history]]
+added = "distance"
+"""
+
+
+def read_text(tmp_path: Path, text: str, **options: Any) -> Model:
+    path = tmp_path / "m.toml"
+    path.write_text(text, encoding="utf-8")
+    return read_model(path, KNOWN, **options)
+
+
+def test_what_a_person_writes_is_read(tmp_path: Path) -> None:
+    model = read_text(tmp_path, GOOD)
+    assert model.names == ("phase_response", "distance")
+    assert float(model.present[1].values["offset"]) == 2.0
+    assert model.present[0].values["gain"].tolist() == [1.1, 1.2]
+    assert model.present[1].errors is None
+
+
+@pytest.mark.parametrize(
+    ("change", "by", "message"),
+    [
+        ("schema = 1", "schema = 2", "schema is 2.*schema = 1"),
+        ("[gain]", "[gains]", "gains is not known: did you mean 'gain'"),
+        ("red = 12.5", "red = -1", "gain.red is -1.*above 0"),
+        ("red = 12.5", "blue = 1", "gain.blue is not known"),
+        ("red = 12.5", "red = true", "gain.red is True"),
+        ('"angular_spectrum"', '"angular"', "propagation.method is 'angular'.*angular_spectrum, fresnel"),
+        ("pitch_um = 8", "pitch_um = -8", r"bench: panel.pitch_um is -8"),
+        ("pitch_um = 8", "", r"panel.pitch_um is missing in \[bench\]"),
+        (
+            'name = "distance"',
+            'name = "distanc"',
+            "unknown effect 'distanc': did you mean 'distance'.*--effects",
+        ),
+        ('name = "distance"', 'name = "phase_response"', "order is 0: write one of 1, 3, 5"),
+        ("order = 1", "order = 2", "order is 2: write one of 1, 3, 5"),
+        ("order = 1", "order = 3", r"curvature.value.red is 1 numbers: order 3 has a list of 3"),
+        ("value = 2", 'value = "2"', "distance.offset.value is '2': write -100 to 100 mm"),
+        ("value = 2", "value = 2000", "distance.offset.value is 2000: write -100 to 100 mm"),
+        ("value = 2", "value = nan", "distance.offset.value is nan"),
+        ("value = 2", "valeu = 2", "distance.offset.valeu is not known: did you mean 'value'"),
+        ("value = 2", "value = [2]", r"distance.offset.value is \[2\]"),
+        ("value = 2", 'value = { array = "x" }', "names the array 'x'"),
+        ('"mm"', '"m"', "distance.offset.unit is 'm': write 'mm'"),
+        ("offset]", "ofset]", "parameters.ofset is not known: did you mean 'offset'"),
+        ("value = { red = 1.1, green = 1.2 }", "value = 1.1", "gain.value is 1.1: write one a channel"),
+        ("value = { red = 1.1, green = 1.2 }", "value = { red = 1.1 }", "gain.value.green is missing"),
+        ("value = { red = 1.1, green = 1.2 }", "value = { red = 1.1, gren = 1 }", "gren is not known"),
+        (
+            "value = { red = 1.1, green = 1.2 }",
+            "value = { red = 9, green = 1 }",
+            "gain.value is 9: write 0.2 to 3",
+        ),
+        ("error = { red = 0.1,", "error = { red = -0.1,", "gain.error is -0.1"),
+        ("[[history]]", "[history]", "history is .*two brackets"),
+        ('added = "distance"', "added = 2020-01-01", "history 1.added is"),
+        ('[[effect]]\nname = "distance"', "[[effect]]\nname = 3", "effect 2 has name 3"),
+    ],
+)
+def test_a_wrong_key_is_named_with_what_is_allowed(
+    tmp_path: Path, change: str, by: str, message: str
+) -> None:
+    assert change in GOOD
+    with pytest.raises(InputError, match=re.compile(message, re.DOTALL)) as caught:
+        read_text(tmp_path, GOOD.replace(change, by, 1))
+    assert "\n" not in str(caught.value)
+    assert "m.toml" in str(caught.value)
+
+
+def test_an_effect_twice_is_one_too_many(tmp_path: Path) -> None:
+    part = GOOD[GOOD.index('[[effect]]\nname = "distance"') : GOOD.index("[[history]]")]
+    with pytest.raises(InputError, match="second 'distance'"):
+        read_text(tmp_path, GOOD.replace("[[history]]", part + "[[history]]"))
+
+
+def test_a_model_of_another_bench_says_what_differs(tmp_path: Path) -> None:
+    model = read_text(tmp_path, GOOD)
+    own = model.bench
+    assert read_text(tmp_path, GOOD, bench=replace(own, name="other", distance_mm=31.0)).names
+    cases = [
+        (replace(own, panel=replace(own.panel, pitch_um=6.4)), "panel.pitch_um is 8.0 there and 6.4"),
+        (
+            replace(own, camera=replace(own.camera, black_level=60.0)),
+            "camera.black_level is 64.0 there and 60.0",
+        ),
+        (replace(own, iris=Iris("circle")), "iris.shape is 'square' there and 'circle'"),
+        (
+            replace(own, channels=own.channels[:1]),
+            "channels are red 638 nm [+] green 520 nm there and red 638 nm in",
+        ),
+    ]
+    for other, message in cases:
+        with pytest.raises(InputError, match=message):
+            read_text(tmp_path, GOOD, bench=other)
+
+
+def test_a_missing_file_and_no_toml_are_input_errors(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be read"):
+        read_model(tmp_path / "none.toml", KNOWN)
+    with pytest.raises(InputError, match="cannot be read"):
+        read_model(tmp_path, KNOWN)
+    (tmp_path / "m.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match="not TOML"):
+        read_model(tmp_path / "m.toml", KNOWN)
+
+
+SCRAP = st.one_of(
+    st.integers(-(10**40), 10**40),
+    st.floats(),
+    st.booleans(),
+    st.text(max_size=6),
+    st.just([]),
+    st.just([1, [2]]),
+    st.just({}),
+    st.just({"array": "x"}),
+    st.just({"red": 1.0, "green": 1e400}),
+    st.just([1.0] * 3),
+    st.just("2020-01-01T00:00:00Z"),
+)
+
+
+def toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return '"' + "".join(c if c.isascii() and c.isalnum() else "_" for c in value) + '"'
+    if isinstance(value, list):
+        return "[" + ", ".join(toml(v) for v in value) + "]"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{k} = {toml(v)}" for k, v in value.items()) + "}"
+    return repr(value)
+
+
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_no_edit_gives_anything_but_a_model_or_an_input_error(tmp_path: Path, data: st.DataObject) -> None:
+    lines = GOOD.splitlines()
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = data.draw(st.integers(0, len(lines) - 1))
+        what = data.draw(st.sampled_from(("value", "drop", "twice", "cut", "swap")))
+        if what == "value" and "=" in lines[at]:
+            lines[at] = lines[at].split("=")[0] + "= " + toml(data.draw(SCRAP))
+        elif what == "drop":
+            lines[at] = ""
+        elif what == "twice":
+            lines.insert(at, lines[at])
+        elif what == "cut":
+            lines[at] = lines[at][: data.draw(st.integers(0, len(lines[at])))]
+        else:
+            other = data.draw(st.integers(0, len(lines) - 1))
+            lines[at], lines[other] = lines[other], lines[at]
+    try:
+        model = read_text(tmp_path, "\n".join(lines))
+    except InputError as error:
+        assert "\n" not in str(error)
+        return
+    write_model(tmp_path / "again.toml", model)
+    assert read_model(tmp_path / "again.toml", KNOWN).names == model.names
+
+
+@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.binary(max_size=200))
+def test_no_bytes_give_anything_but_an_input_error(tmp_path: Path, data: bytes) -> None:
+    (tmp_path / "m.toml").write_bytes(data)
+    with pytest.raises(InputError):
+        read_model(tmp_path / "m.toml", KNOWN)

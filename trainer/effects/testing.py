@@ -1,0 +1,97 @@
+"""Help for the test of an effect: a small bench without noise of its own kind, and captures that hold the
+effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from trainer.bench_file import Bench, Camera, Channel, Iris, Panel
+from trainer.capture_writer import CaptureWriter
+from trainer.captures import CaptureSet, read_captures
+from trainer.effects.definition import Effect
+from trainer.model import Model, Present, absent
+from trainer.patterns import choose_patterns
+from trainer.prediction import counts, light_on_camera, scene_for, stages_for, trace
+
+BRIGHTNESS = 0.13  # mean signal, share of full scale
+
+Given = Mapping[str, float | np.ndarray]
+
+
+def small_bench(rows: int = 72, columns: int = 96) -> Bench:
+    """A green bench with a small panel, 6 mm from the camera."""
+    camera = Camera(columns, rows, 8.0, True, 12, 64.0, 10500.0, 5.0)
+    return Bench("small", Panel(columns, rows, 8.0), (Channel("green", 520.0),), 6.0, Iris(), camera)
+
+
+def placed(effect: Effect, bench: Bench, values: Given) -> Present:
+    """The effect with these values; parameters that are not named stay absent."""
+    base = absent(effect, bench)
+    given = {
+        n: np.array(np.broadcast_to(values[n], v.shape), float) for n, v in base.values.items() if n in values
+    }
+    return base.with_values({**base.values, **given})
+
+
+def change_when_absent(effect: Effect) -> float:
+    """Largest change of a prediction by the effect at its absent values, over the brightest pixel."""
+    bench = small_bench()
+    model = Model(bench).having(absent(effect, bench))
+    with_it = _predict(model, model.present)
+    without = _predict(model, ())
+    return float((with_it - without).abs().max() / without.max())
+
+
+def slopes(effect: Effect, values: Given) -> dict[str, float]:
+    """Size of a prediction's derivative by each parameter at these values, by automatic differentiation."""
+    bench = small_bench()
+    model = Model(bench).having(placed(effect, bench, values))
+    tensors = {
+        n: torch.tensor(v, dtype=torch.float32, requires_grad=True)
+        for n, v in model.present[0].values.items()
+    }
+    prediction = _predict(model, model.present, {effect.name: tensors})
+    weights = torch.as_tensor(
+        np.random.default_rng(0).standard_normal(prediction.shape), dtype=prediction.dtype
+    )
+    found = torch.autograd.grad((weights * prediction).sum(), list(tensors.values()), allow_unused=True)
+    return {n: 0.0 if g is None else float(g.abs().sum()) for n, g in zip(tensors, found, strict=True)}
+
+
+def captures_with(
+    folder: Path, effect: Effect, values: Given, patterns: int = 6, seed: int = 0
+) -> CaptureSet:
+    """Writes and reads a capture set of the small bench with the effect hidden in it and camera noise."""
+    bench = small_bench()
+    model = Model(bench).having(placed(effect, bench, values))
+    rng = np.random.default_rng(seed)
+    blank = CaptureSet(folder, bench, ())
+    with CaptureWriter(folder, bench) as writer, torch.no_grad():
+        for number, pattern in enumerate(choose_patterns(bench, "green", bench.distance_mm, patterns, seed)):
+            signal = _predict(model, model.present, gray=pattern.gray)[0].double().numpy()
+            noisy = signal + np.sqrt(blank.noise_variance(signal)) * rng.standard_normal(signal.shape)
+            raw = np.clip(np.rint(noisy + bench.camera.black_level), 0, bench.camera.saturation)
+            writer.add(pattern.gray, raw.astype(np.uint16), "green", pattern=f"{number:03d}")
+    return read_captures(folder)
+
+
+def _predict(
+    model: Model,
+    present: tuple[Present, ...],
+    tensors: Mapping[str, Mapping[str, torch.Tensor]] | None = None,
+    gray: np.ndarray | None = None,
+) -> torch.Tensor:
+    """Counts above black [1, h, w] on the model's own grid, with only some of its effects."""
+    bench = model.bench
+    if gray is None:
+        gray = np.random.default_rng(1).integers(0, 256, bench.panel.shape)
+    scene = scene_for(model, bench.channels[0].name, bench.distance_mm)
+    stages = stages_for(scene, present, tensors)
+    point = trace(scene, stages, torch.as_tensor(gray.astype(np.int64))[None])
+    gain = torch.full((1, 1, 1), BRIGHTNESS * bench.camera.full_scale)
+    return counts(scene, stages, light_on_camera(scene, stages, point.image), gain, None)

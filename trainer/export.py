@@ -1,0 +1,138 @@
+"""A model as a bundle for the headset: each colour and plane's light path, baked into arrays.
+
+Only what the eye sees too goes in: effects that are told to the camera explain the measurement and stay out.
+Arrays are computed in double precision and stored as float32 and complex64.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from runtime.bundle import write_bundle
+from runtime.calibrated import pack_light_paths
+from runtime.lightpath import Grid, LightPath
+from trainer.captures import CaptureSet
+from trainer.effects.definition import Effect
+from trainer.evidence import scenes
+from trainer.model import Model
+from trainer.parameters import json_values
+from trainer.prediction import light_path, scene_for, stages_for
+
+
+def export_bundle(
+    model: Model, captures: CaptureSet | None, folder: Path | str, *, replace_folder: bool = False
+) -> dict[str, Any]:
+    """Write a model's light paths as a bundle, and say what went in.
+
+    captures: what the model was fitted to, for its planes and its hash; without it the bench's own distance,
+    for every colour. Raises InputError where the folder is not empty (unless `replace_folder`) or where a
+    plane cannot be computed.
+    """
+    shown, left_out = (
+        told_to_display(model),
+        [p.effect for p in model.present if p.effect.told_to != "display"],
+    )
+    wanted = _colours_and_planes(model, captures)
+    baked = [
+        (channel, plane, model.bench.channel(channel).wavelength_nm, baked_path(shown, channel, plane))
+        for channel, plane in wanted
+    ]
+    records, arrays = pack_light_paths(baked)
+    panel = model.bench.panel
+    description: dict[str, Any] = {
+        "panel": {
+            "height": panel.height,
+            "width": panel.width,
+            "pitch_um": panel.pitch_um,
+            "levels": panel.levels,
+            "phase_sign": panel.phase_sign,
+        },
+        "channels": [
+            {"name": c.name, "wavelength_nm": c.wavelength_nm}
+            for c in model.bench.channels
+            if c.name in {channel for channel, _ in wanted}
+        ],
+        "distance_mm": model.bench.distance_mm,
+        "planes_mm": sorted({plane for _, plane in wanted}),
+        "method": model.method,
+        "paths": records,
+    }
+    provenance: dict[str, Any] = {
+        "bench": model.bench.name,
+        "captures_sha256": captures.content_hash() if captures else None,
+        "code_version": code_version(),
+        "heldout": _last_errors(model),
+        "history": list(model.history),
+        "effects": [
+            {"effect": p.effect.name, "stage": p.effect.stage, "parameters": json_values(p, model.bench)}
+            for p in shown.present
+        ],
+        "effects_left_out": [_named(e) for e in left_out],
+    }
+    write_bundle(folder, arrays, description, provenance, replace=replace_folder)
+    return {
+        "bundle": str(folder),
+        "channels": [c["name"] for c in description["channels"]],
+        "planes_mm": description["planes_mm"],
+        "effects": list(shown.names),
+        "effects_left_out": [e.name for e in left_out],
+        "heldout": provenance["heldout"],
+        "arrays": len(arrays),
+        "megabytes": round(sum(a.nbytes for a in arrays.values()) / 1e6, 3),
+    }
+
+
+def told_to_display(model: Model) -> Model:
+    """The model with the effects that the eye sees too, and no others."""
+    return replace(model, present=tuple(p for p in model.present if p.effect.told_to == "display"))
+
+
+def baked_path(model: Model, channel: str, plane_mm: float) -> LightPath:
+    """A model's light path for one colour and plane, as float32 and complex64 NumPy arrays."""
+    with torch.no_grad():
+        scene = scene_for(model, channel, plane_mm, torch.float64)
+        path = light_path(scene, stages_for(scene, model.present))
+    return LightPath(**{f.name: _single(getattr(path, f.name)) for f in fields(path)})
+
+
+def code_version() -> str:
+    """Version of the installed distribution."""
+    try:
+        return version("hololoop")
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def _single(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(_single(part) for part in value)
+    if isinstance(value, Tensor):
+        return value.to(torch.complex64 if value.is_complex() else torch.float32).numpy()
+    if value is None or isinstance(value, Grid):
+        return value
+    raise TypeError(f"a light path does not hold {type(value).__name__}")
+
+
+def _colours_and_planes(model: Model, captures: CaptureSet | None) -> Sequence[tuple[str, float]]:
+    if captures is not None and len(captures):
+        return scenes(captures.captures)
+    return [(c.name, model.bench.distance_mm) for c in model.bench.channels]
+
+
+def _last_errors(model: Model) -> dict[str, float] | None:
+    for record in reversed(model.history):
+        errors = {k: record[k] for k in ("nrmse", "noise_nrmse", "excess") if k in record}
+        if errors:
+            return errors
+    return None
+
+
+def _named(effect: Effect) -> dict[str, str]:
+    return {"effect": effect.name, "stage": effect.stage, "told_to": effect.told_to}

@@ -1,0 +1,130 @@
+"""Numbers and parameters as a person reads them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from trainer.effects.definition import UNIT_SUFFIX
+
+TERMS = 4  # parameters with more numbers than this are summed up, and listed on demand
+UNITLESS = ("1", "")
+
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A parameter as it is printed: its name, one line, and every number where the line only sums them up."""
+
+    name: str
+    text: str
+    terms: tuple[str, ...] = ()
+
+
+def number(value: Any, digits: int = 3) -> str:
+    """A number with some significant digits; a dash for None or what is not finite."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    if value == 0:
+        return "0"
+    power = math.floor(math.log10(abs(value)))
+    if power < -4 or power > 6:
+        mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+        return f"{_minus(mantissa)} × 10{superscript(int(exponent))}"
+    text = f"{value:.{max(0, digits - 1 - power)}f}"
+    return _minus(text)
+
+
+def percent(share: Any, digits: int = 3) -> str:
+    """A share as per cent."""
+    return "–" if share is None or not math.isfinite(share) else f"{number(100 * share, digits)} %"
+
+
+def measured(value: Any, error: Any = None, unit: str = "") -> str:
+    """A value with its standard error, rounded to the error's second digit, and unit."""
+    tail = "" if unit in UNITLESS else f" {unit}"
+    if value is None or not math.isfinite(value):
+        return "–"
+    if error is None or not math.isfinite(error) or error <= 0:
+        return number(value) + tail
+    power = math.floor(math.log10(error))
+    if power < -5 or abs(value) >= 1e7:
+        return f"{number(value, 4)} ± {number(error, 2)}{tail}"
+    places = max(0, 1 - power)
+    return f"{_minus(f'{value:.{places}f}')} ± {error:.{places}f}{tail}"
+
+
+def parameters(given: Any) -> list[Shown]:
+    """The parameters of an effect, one line each.
+
+    given : {name: {"value", "error", "unit"}}, values being numbers, lists, or {colour: number or list}; or
+        {name: number or list}
+    """
+    shown = []
+    for name, one in (given or {}).items():
+        entry = one if isinstance(one, Mapping) and "value" in one else {"value": one}
+        value, error, unit = entry["value"], entry.get("error"), str(entry.get("unit") or "")
+        label = _label(str(name), unit)
+        if isinstance(value, Mapping):
+            for colour, own in value.items():
+                own_error = error.get(colour) if isinstance(error, Mapping) else None
+                shown.append(_parameter(f"{label}, {colour}", own, own_error, unit))
+        elif isinstance(value, int | float | list | tuple | np.ndarray):
+            shown.append(_parameter(label, value, error, unit))
+        elif value is not None:
+            shown.append(Shown(label, str(value)))
+    return shown
+
+
+def _label(name: str, unit: str) -> str:
+    """The name as words, without the unit that files put at its end."""
+    suffix = UNIT_SUFFIX.get(unit, unit)
+    return plain(name.removesuffix(f"_{suffix}") if suffix else name)
+
+
+def _parameter(label: str, value: Any, error: Any, unit: str) -> Shown:
+    values = np.atleast_1d(np.asarray(value, dtype=float)).ravel()
+    errors = np.full(values.shape, np.nan)
+    if error is not None:
+        given = np.atleast_1d(np.asarray(error, dtype=float)).ravel()
+        errors = given if given.shape == values.shape else errors
+    terms = [measured(float(v), float(e)) for v, e in zip(values, errors, strict=True)]
+    tail = "" if unit in UNITLESS else f" {unit}"
+    if len(terms) == 0:
+        return Shown(label, "–")
+    if len(terms) <= TERMS:
+        return Shown(label, ", ".join(terms) + tail)
+    largest = int(np.argmax(np.abs(values)))
+    size = math.sqrt(float(np.sum(values**2)))
+    text = f"{len(terms)} terms, together {number(size)}{tail}; largest, no. {largest + 1}: {terms[largest]}"
+    return Shown(label, text + tail, tuple(terms))
+
+
+def listed(names: Any) -> str:
+    """Names as a sentence has them: a, b and c."""
+    names = [str(n) for n in names]
+    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1] if names else ""
+
+
+def plain(name: Any) -> str:
+    """An effect's name as words."""
+    return str(name).replace("_", " ")
+
+
+def sentence(text: str) -> str:
+    """With a capital letter at its start."""
+    return text[:1].upper() + text[1:]
+
+
+def superscript(exponent: int) -> str:
+    """A whole number as an exponent."""
+    return str(exponent).translate(_SUPERSCRIPT)
+
+
+def _minus(text: str) -> str:
+    return text.replace("-", "−")

@@ -1,0 +1,97 @@
+"""The report of a comparison, a diagnosis, a ladder of effects and a model, as one file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+
+from runtime.files import whole_file
+from trainer.model import Model
+from trainer.report import explained, seen
+from trainer.report.numbers import listed, number, percent, sentence
+
+METHOD = (
+    "Every number comes from captures that no fit has seen: excess is the mean squared error beyond the "
+    "camera's expected noise, divided by the variance of the measured signal, so that 0 is a perfect model "
+    "and 1 one that predicts nothing but the mean.",
+    "Error (nrmse) is the root of the whole mean squared error over the same variance, noise included; "
+    "saturated pixels are left out of everything, and intervals come from the scatter between tiles of the "
+    "pictures.",
+)
+
+
+def write_report(
+    path: Path | str,
+    title: str,
+    comparison: Any = None,
+    diagnosis: Any = None,
+    ladder: Any = None,
+    model: Model | None = None,
+) -> None:
+    """Write a report; the file appears whole or not at all.
+
+    comparison : trainer.compare.Comparison, or anything with its `as_json()`; `pictures` if it has them
+    diagnosis : an object with `as_json()` (what `diagnose --json` prints, with `thresholds`, `ideal_excess`
+        and `sentence` if known), and `probe_pictures`: (stage, title, array of one or two dimensions, unit)
+    ladder : steps {"added", "removed", "nrmse", "excess", "indistinguishable_from"}, or what
+        `explain --json` prints; the model's history if not given
+    model : for a table of the effects that are present; the comparison's own if not given
+    Sections without data are left out. Raises InputError where the file cannot be written.
+    """
+    compared = comparison.as_json() if comparison is not None else None
+    found = diagnosis.as_json() if diagnosis is not None else None
+    if model is None:
+        model = getattr(comparison, "model", None)
+    if ladder is None and model is not None and len(model.history) > 1:
+        ladder = model.history
+    steps, floor = _steps(ladder)
+    if floor is None:
+        floor = next((d["heldout"]["noise_nrmse"] for d in (compared, found) if d and d.get("heldout")), None)
+    pictures = getattr(comparison, "pictures", None) or ()
+    heldout = next((d["heldout"] for d in (compared, found) if d and d.get("heldout")), None)
+    context = {
+        "title": title,
+        "headline": explained.headline(compared, found, steps),
+        "facts": seen.facts(compared, heldout, found),
+        "pictures": seen.pictures(pictures),
+        "where": seen.where(compared, model.bench.camera.shape if model else None) if compared else None,
+        "ladder": explained.ladder(steps, floor),
+        "stages": explained.stages(found, getattr(diagnosis, "probe_pictures", None) or ()),
+        "ranking": explained.ranking(found),
+        "apart": explained.apart(found, steps, _more(ladder)),
+        "thresholds": explained.thresholds(found),
+        "model": explained.model_table(model) if model is not None else None,
+        "method": METHOD,
+    }
+    html = _template().render(context)
+    with whole_file(path, "w") as stream:
+        stream.write(html)
+
+
+def _steps(ladder: Any) -> tuple[Sequence[Mapping[str, Any]], float | None]:
+    if ladder is None:
+        return (), None
+    if isinstance(ladder, Mapping):
+        return ladder.get("steps") or (), ladder.get("noise_nrmse")
+    return ladder, next((s["noise_nrmse"] for s in ladder if s.get("noise_nrmse") is not None), None)
+
+
+def _more(ladder: Any) -> Sequence[Any]:
+    return ladder.get("suggested_captures") or () if isinstance(ladder, Mapping) else ()
+
+
+@lru_cache(maxsize=1)
+def _template() -> Template:
+    environment = Environment(
+        loader=PackageLoader("trainer.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(number=number, percent=percent, listed=listed, sentence=sentence)
+    return environment.get_template("report.html")
