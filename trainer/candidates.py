@@ -26,6 +26,7 @@ from trainer.fit import (
     best_start,
     columns,
     fit,
+    pattern_search,
     raise_order,
     start_points,
     with_gain,
@@ -60,7 +61,8 @@ class Tried:
 
 
 @lru_cache(maxsize=4)
-def _captures(folder: Path) -> CaptureSet:
+def opened(folder: Path) -> CaptureSet:
+    """The capture set of a folder, read once a process."""
     return read_captures(folder)
 
 
@@ -82,7 +84,7 @@ def evaluate_captures(captures: CaptureSet, rows: Sequence[Capture], model: Mode
 
 def screen(folder: Path, ids: tuple[str, ...], model: Model, effects: tuple[Effect, ...]) -> list[Screened]:
     """Screen effects on some captures, for a model with fitted gains."""
-    captures = _captures(folder)
+    captures = opened(folder)
     batches = load(captures, chosen(captures, ids))
     with torch.no_grad():
         return _screen(batches, model, effects)
@@ -131,9 +133,8 @@ def _start(effect: Effect, model: Model, predictors: list[Predictor], points: li
         for values in effect.starts(evidence):
             full = {n: np.array(values[n], dtype=float) if n in values else base.values[n] for n in base.values}
             starts.append(base.with_values({n: v.reshape(base.values[n].shape) for n, v in full.items()}))
-    if len(starts) == 1:
-        return starts[0]
-    return best_start(model, predictors[:3], points[:3], starts)
+    best = starts[0] if len(starts) == 1 else best_start(model, predictors[:3], points[:3], starts)
+    return pattern_search(model, predictors[:3], points[:3], best) if effect.rugged else best
 
 
 def _stacked(
@@ -178,7 +179,7 @@ def try_effect(
     iterations: int = 8,
 ) -> Tried:
     """Fit one effect, with present ones as they are, and judge it on held-out captures."""
-    captures = _captures(folder)
+    captures = opened(folder)
     batches = load(captures, chosen(captures, ids))
     name = start.effect.name
     fitted = fit(model.having(start), [name], batches, iterations)

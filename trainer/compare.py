@@ -22,6 +22,7 @@ from trainer.fit import Predictor, fit, with_gain
 from trainer.localise import BrightnessSums, FieldSums, FrequencySums, Seen
 from trainer.model import Model
 from trainer.photon_transfer import compare_repeats
+from trainer.prediction import scene_for, stages_for
 
 PICTURES = 3  # held-out captures whose pictures are kept for the report
 PAIRS = 12  # pairs of repeats that the noise is checked on
@@ -182,8 +183,9 @@ def with_gains(
     """
     channels = list(dict.fromkeys(c.channel for c in rows))
     found = with_gain(replace(model, gain={}), _Predictors(captures, model, rows, done))
-    if any(p.effect.name == "sensor_response" or p.effect.source != "built in" for p in model.present):
-        # Counts may not be proportional to light: least squares is then only where the fit starts.
+    scene = scene_for(model, rows[0].channel, rows[0].plane_mm)
+    if stages_for(scene, model.present).sensor.response is not None:
+        # Counts are not proportional to light: least squares is only where the fit starts.
         found = fit(found, [], load(captures, rows)).model
     return replace(model, gain={**model.gain, **{c: found.gain[c] for c in channels}})
 

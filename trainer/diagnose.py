@@ -154,10 +154,8 @@ def parts_of(captures: CaptureSet) -> Parts:
 
 def with_gains(parts: Parts, model: Model) -> Model:
     """The model with gains fitted where it has none."""
-    names = parts.captures.channels
-    if all(n in model.gain for n in names):
-        return model
-    return fit(model, [], load(parts.captures, parts.fitted)).model
+    rows = [c for c in parts.fitted if c.channel not in model.gain]
+    return fit(model, [], load(parts.captures, rows)).model if rows else model
 
 
 def ideal_errors(parts: Parts, model: Model) -> Errors:

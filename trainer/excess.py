@@ -69,7 +69,7 @@ class Removed:
 def errors_of(batch: Batch, prediction: Tensor) -> Errors:
     """Errors of predicted counts [B, h, w] on a batch."""
     squared = batch.weight * (batch.signal - prediction) ** 2
-    count = batch.weight.sum((-2, -1))
+    count = batch.weight.sum((-2, -1)).clamp(min=1)  # a capture saturated throughout says nothing
     mean = (batch.weight * batch.signal).sum((-2, -1)) / count
     variance = (batch.weight * (batch.signal - mean[:, None, None]) ** 2).sum((-2, -1))
     noise = (batch.weight * batch.noise).sum((-2, -1))

@@ -21,6 +21,7 @@ from trainer.evidence import Batch
 from trainer.excess import Errors, errors_of, join
 from trainer.model import Model, Present, Values, absent, raised
 from trainer.prediction import Scene, Stages, Trace, counts, light_on_camera, scene_for, stages_for, trace
+from trainer.starts import Evidence
 
 STEP = 0.1  # of a parameter's scale: large against single precision's rounding, small against curvature
 
@@ -110,18 +111,42 @@ def start_points(effect: Effect, model: Model) -> list[Present]:
     ]
 
 
-def best_start(model: Model, predictors: Sequence[Predictor], points: Sequence[Trace], starts: list[Present]) -> Present:
+def best_start(
+    model: Model, predictors: Sequence[Predictor], points: Sequence[Trace], starts: list[Present]
+) -> Present:
     """The start whose prediction, with its own gain, has the smallest error."""
-    best, least = starts[0], np.inf
-    for start in starts:
-        trial = model.having(start)
-        stage = start.effect.stage
-        moved = [p.trace(trial, stage, t) for p, t in zip(predictors, points, strict=True)]
-        trial = with_gain(trial, predictors, moved)
-        error = sum(_cost(p, p.counts(trial, p.light(trial, t))) for p, t in zip(predictors, moved, strict=True))
-        if error < least:
-            best, least = start, error
+    return min(starts, key=lambda start: _start_cost(model, predictors, points, start))
+
+
+def pattern_search(
+    model: Model, predictors: Sequence[Predictor], points: Sequence[Trace], start: Present
+) -> Present:
+    """A better start by coordinate steps of shrinking size: for effects whose derivatives do not reach far.
+
+    The edge of an iris is one: its derivative sees one frequency sample, and the next one is unrelated.
+    """
+    best, least = start, _start_cost(model, predictors, points, start)
+    for factor in (6.0, 3.0, 1.5, 0.75, 0.35, 0.15):
+        improved = True
+        while improved:
+            improved = False
+            for key in _keys(model.having(best), [best.effect.name]):
+                for sign in (-1, 1):
+                    step = sign * factor * best.effect.parameter(key[1]).scale
+                    trial = _present(stepped(model.having(best), key, step), best.effect.name)
+                    cost = _start_cost(model, predictors, points, trial)
+                    if cost < 0.9999 * least:
+                        best, least, improved = trial, cost, True
     return best
+
+
+def _start_cost(
+    model: Model, predictors: Sequence[Predictor], points: Sequence[Trace], start: Present
+) -> float:
+    trial = model.having(start)
+    moved = [p.trace(trial, start.effect.stage, t) for p, t in zip(predictors, points, strict=True)]
+    trial = with_gain(trial, predictors, moved)
+    return sum(_cost(p, p.counts(trial, p.light(trial, t))) for p, t in zip(predictors, moved, strict=True))
 
 
 def _cost(predictor: Predictor, prediction: Tensor) -> float:
@@ -160,6 +185,7 @@ def _fit(
     points = [p.trace(model) for p in predictors]
     if not model.gain or any(b.channel not in model.gain for b in batches):
         model = with_gain(model, predictors, points)
+    channels = list(dict.fromkeys(b.channel for b in batches))
     damping = 1e-3
     errors, normal, gradient, scatter = _linearise(model, keys, predictors, points)
     for iteration in range(iterations):
@@ -169,7 +195,7 @@ def _fit(
         accepted = False
         for _ in range(6):
             step = _solve(normal, gradient, damping)
-            trial = _moved(model, keys, step)
+            trial = _moved(model, keys, channels, step)
             trial_points = [p.trace(trial, first, t) for p, t in zip(predictors, points, strict=True)]
             trial_errors = join(
                 [errors_of(p.batch, p.counts(trial, p.light(trial, t))) for p, t in zip(predictors, trial_points, strict=True)]
@@ -188,9 +214,24 @@ def _fit(
             break
         if iteration + 1 < iterations:
             errors, normal, gradient, scatter = _linearise(model, keys, predictors, points)
+    model = _measured(model, free, batches)
     inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
     covariance = inverse @ scatter @ inverse
     return Fitted(_with_errors(model, keys, covariance), errors, covariance, keys)
+
+
+def _measured(model: Model, free: Sequence[str], batches: Sequence[Batch]) -> Model:
+    """The model with the values that effects read off the captures rather than fit."""
+    for name in free:
+        present = _present(model, name)
+        if present.effect.measure is None:
+            continue
+        without = replace(model, present=tuple(p for p in model.present if p.effect.name != name))
+        evidence = [Evidence(p.scene, p.batch, p.predict(without)) for p in (Predictor(without, b) for b in batches)]
+        read = present.effect.measure(evidence)
+        values = {n: np.full_like(v, read[n]) if n in read else v for n, v in present.values.items()}
+        model = model.having(replace(present, values=values))
+    return model
 
 
 def _present(model: Model, name: str) -> Present:
@@ -273,8 +314,9 @@ def _solve(normal: np.ndarray, gradient: np.ndarray, damping: float) -> np.ndarr
     return np.linalg.solve(scaled, gradient / diagonal) / diagonal
 
 
-def _moved(model: Model, keys: tuple[tuple[str, str, int], ...], step: np.ndarray) -> Model:
-    channels = list(model.gain)
+def _moved(
+    model: Model, keys: tuple[tuple[str, str, int], ...], channels: list[str], step: np.ndarray
+) -> Model:
     for key, change in zip(keys, step, strict=False):
         model = stepped(model, key, float(change))
     logs = dict(zip(channels, step[len(keys) :], strict=False))

@@ -9,7 +9,7 @@ asks of a map is not what the others ask, so the first iterations find what all 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,9 @@ from torch import Tensor
 
 from runtime.lightpath import mode_irradiance, panel_phase, panel_spectrum
 from trainer.bases import legendre_count, legendre_curve, legendre_maps
-from trainer.candidates import _captures, chosen
-from trainer.evidence import Batch, load, load_batch
+from trainer.candidates import chosen, opened
+from trainer.captures import Capture
+from trainer.evidence import Batch, load, load_batch, scenes
 from trainer.excess import Errors, Removed, errors_of, join, removed
 from trainer.fit import Predictor
 from trainer.model import Model
@@ -78,11 +79,11 @@ class Probed:
 
 def probe(folder: Path, ids: tuple[str, ...], held_ids: tuple[str, ...], model: Model, stage: str) -> ProbeFit:
     """Fit one stage's probe on some captures and judge it on others."""
-    captures = _captures(folder)
+    captures = opened(folder)
     rows = chosen(captures, ids)
     last = {(c.channel, c.plane_mm): c for c in rows}.values()
-    first = [c for c in rows if c not in last] or rows
-    batches = load(captures, first[: CAPTURES[stage]])
+    each = max(1, CAPTURES[stage] // len(last))
+    batches = load(captures, [c for scene in scenes(rows) for c in _of(scene, rows, last)[:each]])
     kind = PROBES[stage](model, batches[0])
     seen = [_Working(model, b) for b in batches]
     unseen = [_Working(model, b) for b in load(captures, last)]
@@ -133,6 +134,12 @@ def probe(folder: Path, ids: tuple[str, ...], held_ids: tuple[str, ...], model: 
             working = _Working(model, load_batch(captures, [row]))
             parts.append(errors_of(working.batch, working.predict(kind, found, 0)))
         return ProbeFit(stage, join(parts), tuple(kind.pictures(found)))
+
+
+def _of(scene: tuple[str, float], rows: list[Capture], last: Collection[Capture]) -> list[Capture]:
+    """A scene's captures but for the one that says when to stop, unless it is the only one."""
+    own = [c for c in rows if (c.channel, c.plane_mm) == scene]
+    return [c for c in own if c not in last] or own
 
 
 class _Working:

@@ -116,6 +116,17 @@ def ghost_starts(evidence: Sequence[Evidence], most: int = 3) -> Starts:
     return starts
 
 
+def gain_spread(evidence: Sequence[Evidence]) -> dict[str, Any]:
+    """Standard deviation (%) of the gain from capture to capture, about each colour's mean."""
+    own: dict[str, list[float]] = {}
+    for one in evidence:
+        seen, expected, weight = (t.double() for t in (one.batch.signal, one.prediction, one.batch.weight))
+        gains = (weight * seen * expected).sum((-2, -1)) / (weight * expected**2).sum((-2, -1))
+        own.setdefault(one.batch.channel, []).extend(gains.tolist())
+    deviations = np.concatenate([np.array(g) / np.mean(g) - 1 for g in own.values()])
+    return {"spread": max(0.01, 100 * float(np.std(deviations)))}
+
+
 def _tops(length: int, size: int) -> list[int]:
     count = max(2, round(1.5 * length / size))
     return [round(k * (length - size) / (count - 1)) for k in range(count)]

@@ -216,7 +216,7 @@ def test_a_new_effect_is_written_and_listed(tmp_path: Path, capsys: pytest.Captu
     assert one_object(capsys)["effects"][0]["stage"] == "drive"
 
 
-# --- diagnose and explain are tried with stand-ins: how they are called, and what is made of their answers ---
+# --- diagnose and explain have stand-ins here: how they are called, and what is made of their answers ---
 
 DIAGNOSIS = {
     "heldout": {"nrmse": 0.2, "noise_nrmse": 0.05, "excess": 0.04},

@@ -15,7 +15,10 @@ from firmware_iface.errors import InputError
 from trainer import compare as module
 from trainer.captures import CaptureSet, read_captures, write_captures
 from trainer.compare import Comparison, compare
-from trainer.model import Model
+from trainer.effects import catalogue
+from trainer.evidence import load
+from trainer.fit import evaluate
+from trainer.model import Model, absent
 
 HEIGHT, WIDTH, PITCH, DISTANCE = 96, 128, 8e-6, 10e-3
 WAVELENGTH = {"green": 520e-9, "blue": 450e-9}
@@ -216,6 +219,19 @@ def test_a_models_own_gain_stands(ideal: CaptureSet) -> None:
     rows = {r["channel"]: r for r in result.as_json()["where"]["time"]}
     assert rows["green"]["gain"] == pytest.approx(1 / 0.9, rel=0.01)
     assert rows["blue"]["gain"] == pytest.approx(1, rel=0.01)
+
+
+def test_the_gain_of_a_curved_response_is_fitted(ideal: CaptureSet) -> None:
+    curve = absent(catalogue()["sensor_response"], ideal.bench)
+    model = Model(ideal.bench, (curve.with_values({"bend": np.array([0.3, 0.0])}),))
+    rows = [c for c in ideal.captures if c.channel == "green"][:3]
+    found = module.with_gains(ideal, model, rows)
+    batches = load(ideal, rows)
+
+    def excess(factor: float) -> float:
+        return evaluate(replace(found, gain={"green": found.gain["green"] * factor}), batches).excess
+
+    assert excess(1.0) < min(excess(0.98), excess(1.02))
 
 
 def test_one_capture_is_in_memory_at_a_time(ideal: CaptureSet, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -73,6 +73,8 @@ class Effect:
     orders : the orders a map or curve is raised through, lowest first; (0,) where there is nothing to raise
     starts : optional `(evidence) -> list of {parameter: value}`: starting points read off the data
     touches_iris : the effect may open the iris beyond what the bench says
+    rugged : derivatives do not reach far anywhere, so a pattern search comes before a fit
+    measure : optional `(evidence) -> {parameter: value}`: values read off the captures once all else is fitted
     """
 
     name: str
@@ -84,6 +86,8 @@ class Effect:
     orders: tuple[int, ...] = (0,)
     starts: Callable[..., list[dict[str, Any]]] | None = None
     touches_iris: bool = False
+    rugged: bool = False
+    measure: Callable[..., dict[str, Any]] | None = None
     source: str = "built in"
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -119,6 +123,8 @@ def effect(
     orders: tuple[int, ...] = (0,),
     starts: Callable[..., list[dict[str, Any]]] | None = None,
     touches_iris: bool = False,
+    rugged: bool = False,
+    measure: Callable[..., dict[str, Any]] | None = None,
 ) -> Callable[[Callable[..., Any]], Effect]:
     """Make an effect of a function: its name is the function's, its description the docstring's first line.
 
@@ -141,9 +147,21 @@ def effect(
                 f"({', '.join(named)}); make them the same, in the same order"
             )
         about = (inspect.getdoc(function) or name).splitlines()[0]
-        source = inspect.getsourcefile(function) or "built in"
+        own = function.__module__.startswith("trainer.effects.")
+        source = "built in" if own else inspect.getsourcefile(function) or "built in"
         return Effect(
-            name, stage, told_to, about, tuple(parameters), function, orders, starts, touches_iris, source
+            name,
+            stage,
+            told_to,
+            about,
+            tuple(parameters),
+            function,
+            orders,
+            starts,
+            touches_iris,
+            rugged,
+            measure,
+            source,
         )
 
     return make

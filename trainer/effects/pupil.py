@@ -64,6 +64,7 @@ def pupil_aberration(pupil: Pupil, zernike: Tensor) -> Pupil:
     stage="pupil",
     told_to="display",
     touches_iris=True,
+    rugged=True,
     parameters=[
         Parameter(
             "half_width",

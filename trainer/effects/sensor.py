@@ -12,7 +12,7 @@ from trainer.bases import legendre_count, legendre_curve, legendre_maps
 from trainer.effects.definition import Parameter, effect
 from trainer.effects.pupil import kernel_transfer
 from trainer.stages import Sensor
-from trainer.starts import ghost_starts, registration_starts
+from trainer.starts import gain_spread, ghost_starts, registration_starts
 
 
 @effect(
@@ -142,7 +142,10 @@ def sensor_response(sensor: Sensor, bend: Tensor) -> Sensor:
 @effect(
     stage="sensor",
     told_to="camera",
-    parameters=[Parameter("spread", "%", scale=1.0, low=0, high=100, about="rms of the gain from capture to capture")],
+    measure=gain_spread,
+    parameters=[
+        Parameter("spread", "%", scale=1.0, low=0, high=100, about="rms of the gain from capture to capture")
+    ],
 )
 def laser_drift(sensor: Sensor, spread: Tensor) -> Sensor:
     """The laser's power varies from capture to capture: each capture has its own gain, measured from it."""
@@ -157,9 +160,11 @@ def laser_drift(sensor: Sensor, spread: Tensor) -> Sensor:
         Parameter("amplitude", "1", scale=0.01, low=0, high=1, about="irradiance of the copy over that of the picture"),
         Parameter("shift_y", "pixels", scale=0.3, low=-200, high=200),
         Parameter("shift_x", "pixels", scale=0.3, low=-200, high=200),
+        Parameter("blur", "pixels", scale=0.3, low=0, high=20, even=True, about="rms of the copy's own blur along an axis"),
     ],
 )
-def ghost(sensor: Sensor, amplitude: Tensor, shift_y: Tensor, shift_x: Tensor) -> Sensor:
+def ghost(sensor: Sensor, amplitude: Tensor, shift_y: Tensor, shift_x: Tensor, blur: Tensor) -> Sensor:
     """A second, weak, displaced image, as from a reflection in a window."""
     angle = -2 * math.pi * (sensor.iy * shift_y + sensor.ix * shift_x)
-    return sensor.filtered(1 + amplitude * torch.complex(torch.cos(angle), torch.sin(angle)))
+    size = amplitude * kernel_transfer(sensor.iy, sensor.ix, blur, torch.zeros_like(blur))
+    return sensor.filtered(1 + size * torch.complex(torch.cos(angle), torch.sin(angle)))

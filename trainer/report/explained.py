@@ -87,6 +87,7 @@ def ladder(steps: Sequence[Mapping[str, Any]], noise: float | None) -> dict[str,
     return {
         "chart": charts.ladder([r["label"] for r in rows], [r["nrmse"] for r in rows], noise),
         "rows": rows,
+        "twins": any(r["others"] for r in rows),
         "noise": noise,
     }
 
@@ -165,7 +166,8 @@ def ranking(found: Any) -> dict[str, Any] | None:
                 "others": r.get("indistinguishable_from") or [],
             }
         )
-    return {"chart": charts.forest(rows, least), "rows": table, "least": least}
+    twins = any(r["others"] for r in table)
+    return {"chart": charts.forest(rows, least), "rows": table, "twins": twins}
 
 
 def _least(found: Mapping[str, Any]) -> float | None:

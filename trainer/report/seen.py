@@ -151,9 +151,9 @@ def _field(found: dict[str, Any], shape: tuple[int, int] | None) -> tuple[Map, s
     middle, worst = float(np.nanmedian(grid)), float(grid[i, j])
     at = f"row {min(int((i + 0.5) * tile), height)}, column {min(int((j + 0.5) * tile), width)}"
     spot = f"{place((i + 0.5) / grid.shape[0], (j + 0.5) / grid.shape[1])} ({at})"
-    if middle > 0 and worst < 3 * middle:
+    if middle > 0 and worst < 4 * middle:
         words = "the error is spread over the whole picture: "
-        words += f"excess {number(worst)} in the worst tile, median {number(middle)}."
+        words += f"median excess {number(middle)}, at worst {number(worst)} in the {spot}."
     else:
         words = f"the error is largest in the {spot}: excess {number(worst)} there, median {number(middle)}."
     alt = f"Excess over the picture in tiles of {tile} pixels, dark is small: {words}"
