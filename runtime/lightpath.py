@@ -204,7 +204,13 @@ def back_propagated(path: LightPath, z: Array, mode: int = 0) -> Array:
     all.
     """
     xp = array_namespace(z)
-    spectrum = _aperture(path, xp.real(z), (1, 1)) * _image_field_adjoint(path, z, mode)
+    ramp = 1
+    for axis in (0, 1):  # the linear phase that `image_field` leaves in the image
+        step = 2 * math.pi * path.grid.band[axis] / (FINE * path.grid.padded[axis])
+        sample = xp.arange(z.shape[axis - 2], dtype=xp.real(z).dtype) - FINE * path.grid.margin
+        turn = xp.cos(step * sample) + 1j * xp.sin(step * sample)
+        ramp = ramp * (turn[:, None] if axis == 0 else turn[None, :])
+    spectrum = _aperture(path, xp.real(z), (1, 1)) * _image_field_adjoint(path, z * ramp, mode)
     return _band_spectrum_adjoint(path.grid, spectrum)
 
 

@@ -8,7 +8,9 @@ as far as light allows.
 Start: double phase (Hsueh and Sawchuk 1978; Maimone et al. 2017) of the back-propagated picture with flat
 phase, which keeps the picture's phase smooth and so free of speckle. Steps: memoryless BFGS (Shanno 1978;
 L-BFGS with one pair), one forward and one adjoint pass each, no line search; the best pattern met is the one
-returned, so more iterations never give a worse one, up to the rounding to gray levels.
+returned, so more iterations never give a worse one, up to the rounding to gray levels. Where phases a turn
+apart are not alike (crosstalk mixes them; a drive of less than a turn lacks some), steps are projected onto
+the panel's range, and pixels that are pushed out of it stay out of the curvature (Bertsekas 1982).
 """
 
 from __future__ import annotations
@@ -32,7 +34,8 @@ from runtime.lightpath import (
 )
 
 FLOOR = 1e-4  # of the mean light: added before the square root, whose slope is unbounded in the dark
-FIRST_STEP = 1.0  # of the Gauss-Newton step for a path that loses no light
+FIRST_STEP = 0.5  # of the Gauss-Newton step for a path that loses no light
+LONGEST = 0.5  # step of a pixel, rad, where its range has ends
 LOUD = 0.98  # share of pixels whose amplitude double phase reproduces; brighter ones are cut
 
 Progress = Callable[[int, float], None]
@@ -84,7 +87,9 @@ def solve(
     if iterations < 0:
         raise InputError(f"{iterations} iterations: give 0 (the start alone) or more")
     drive = DriveRange(path, levels)
-    phase = drive.held(double_phase(path, target) if start is None else np.array(start, amplitude.dtype))
+    if start is None:
+        start = double_phase(path, target) if drive.gapless else flat_phase(path, target)
+    phase = drive.held(np.array(start, amplitude.dtype))
     descent = _Descent(path, amplitude, drive)
     history: list[float] = []
     for done in range(iterations + 1):
@@ -123,12 +128,7 @@ def double_phase(path: LightPath, target: np.ndarray) -> np.ndarray:
     t), a <= 1, is the mean of exp(j (t + acos a)) and exp(j (t - acos a)), which alternate as on a
     chequerboard.
     """
-    amplitude = _checked_amplitude(path, target)
-    mode = int(np.argmax(path.weights))
-    wave = back_propagated(path, _on_fine_grid(path, amplitude).astype(path.source.dtype), mode)
-    tiny = 1e-3 * np.sqrt(np.mean(np.abs(path.source) ** 2)) + 1e-30
-    lit = np.conj(path.source) / np.maximum(np.abs(path.source), tiny) ** 2
-    wave = wave * lit
+    wave, lit = _wave_at_panel(path, target)
     size = np.abs(wave)
     rank = min(size.size - 1, int(LOUD * size.size))
     wave = wave / max(float(np.partition(size, rank, axis=None)[rank]), 1e-30)
@@ -138,6 +138,24 @@ def double_phase(path: LightPath, target: np.ndarray) -> np.ndarray:
     spread[::2, 1::2] *= -1
     spread[1::2, ::2] *= -1
     return np.angle(wave) + spread
+
+
+def flat_phase(path: LightPath, target: np.ndarray) -> np.ndarray:
+    """Phase (rad) [H, W] of the target's amplitude with flat phase, taken back; its amplitude there is lost.
+
+    A better start than double phase where the panel does not reach a whole turn.
+    """
+    return np.angle(_wave_at_panel(path, target)[0])
+
+
+def _wave_at_panel(path: LightPath, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What the pixels would have to do to the beam, complex [H, W] of any scale; and 1 / source, bounded."""
+    amplitude = _checked_amplitude(path, target)
+    mode = int(np.argmax(path.weights))
+    wave = back_propagated(path, _on_fine_grid(path, amplitude).astype(path.source.dtype), mode)
+    tiny = 1e-3 * np.sqrt(np.mean(np.abs(path.source) ** 2)) + 1e-30
+    lit = np.conj(path.source) / np.maximum(np.abs(path.source), tiny) ** 2
+    return wave * lit, lit
 
 
 class DriveRange:
@@ -161,7 +179,7 @@ class DriveRange:
         # Where a whole turn is covered, phases beyond the ends come back inside; one step is no gap.
         gap = 2 * math.pi - np.min(self.high - self.low)
         self.gapless = bool(gap <= 1.5 * step)
-        self.wraps = path.crosstalk is not None or not self.gapless
+        self.bounded = path.crosstalk is not None or not self.gapless
 
     def held(self, phase: np.ndarray) -> np.ndarray:
         """Phases (rad) moved by whole turns into what the panel reaches; in a gap, to its nearer edge."""
@@ -171,6 +189,10 @@ class DriveRange:
         phase = np.where(outside, phase - turn * np.floor(above), phase)
         past = phase - self.high
         return np.where(past <= 0, phase, np.where(past <= self.low + turn - phase, self.high, self.low))
+
+    def pushed_out(self, phase: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+        """Where a step down the gradient would leave the range from its very edge, bool [H, W]."""
+        return ((phase <= self.low) & (gradient > 0)) | ((phase >= self.high) & (gradient < 0))
 
     def gray(self, phase: np.ndarray) -> np.ndarray:
         """Gray levels, uint8 [H, W], whose phase is nearest to `phase` (rad)."""
@@ -190,7 +212,6 @@ class _Descent:
         self.floor: float | None = None
         self.best_loss, self.best_phase = math.inf, amplitude
         self.first = FIRST_STEP / float(np.mean(np.abs(path.source) ** 2))
-        self.gradient: np.ndarray | None = None
         self.before: np.ndarray | None = None
         self.move: np.ndarray | None = None
 
@@ -212,33 +233,36 @@ class _Descent:
         return 20 * math.log10(self.peak / max(math.sqrt(loss), 1e-30))
 
     def step(self, phase: np.ndarray) -> np.ndarray:
-        """The next phase; the recurrences are those of L-BFGS with one pair, as a sum of three arrays."""
-        fresh = self.pullback(pixel_irradiance_adjoint(self.path, self.slope))
-        old, self.gradient = self.gradient, fresh
+        """The next phase; held within what the panel reaches where phases a turn apart are not alike."""
+        slope = self.pullback(pixel_irradiance_adjoint(self.path, self.slope))
+        gradient, change, before = slope, None, self.move
+        if self.before is not None:
+            change = slope - self.before
+        self.before = slope
+        if self.drive.bounded:
+            free = ~self.drive.pushed_out(phase, slope)
+            gradient = gradient * free
+            if change is not None and before is not None:
+                change, before = change * free, before * free
         move = None
-        if old is not None and self.move is not None:
-            gg, go, oo = (float(np.vdot(a, b)) for a, b in ((fresh, fresh), (fresh, old), (old, old)))
-            sg, so = float(np.vdot(self.move, fresh)), float(np.vdot(self.move, old))
-            sy, yy = sg - so, gg - 2 * go + oo
+        if change is not None and before is not None:
+            sy, yy = float(np.vdot(before, change)), float(np.vdot(change, change))
             if sy > 1e-12 * yy:
-                gamma, along = sy / yy, sg / sy
-                beta = gamma * (gg - go - along * yy) / sy
+                gamma, along = sy / yy, float(np.vdot(before, gradient)) / sy
+                beta = gamma * (float(np.vdot(change, gradient)) - along * yy) / sy
                 move = (
-                    self.real(gamma * (along - 1)) * fresh
-                    - self.real(gamma * along) * old
-                    + self.real(beta - along) * self.move
+                    self.real(-gamma) * gradient
+                    + self.real(gamma * along) * change
+                    + self.real(beta - along) * before
                 )
         if move is None:
-            move = self.real(-self.first / self.scale**2) * fresh
-        self.move = move
-        moved = phase + move
-        if not self.drive.wraps:
-            return moved
-        held = self.drive.held(moved)
-        if not self.drive.gapless:
-            turns = held - moved
-            self.move = move + (turns - self.real(2 * math.pi) * np.rint(turns / self.real(2 * math.pi)))
-        return held
+            move = self.real(-self.first / self.scale**2) * gradient
+        if not self.drive.bounded:
+            self.move = move
+            return phase + move
+        moved = np.clip(phase + np.clip(move, -LONGEST, LONGEST), self.drive.low, self.drive.high)
+        self.move = moved - phase
+        return moved
 
 
 def _checked_amplitude(path: LightPath, target: np.ndarray) -> np.ndarray:

@@ -11,27 +11,31 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from trainer.bench_file import Bench
 from trainer.captures import Capture, CaptureSet, read_captures
 from trainer.effects.definition import Effect
 from trainer.evidence import Batch, load, load_batch
 from trainer.excess import Errors, errors_of, join
 from trainer.fit import (
     Predictor,
-    _keys,
-    best_start,
-    columns,
     fit,
+    keys_of,
     pattern_search,
     raise_order,
+    slopes_of,
+    start_cost,
     start_points,
+    weighted_residuals,
     with_gain,
 )
-from trainer.model import Model, Present
+from trainer.model import Model, Present, absent
+from trainer.prediction import Trace
 from trainer.starts import Evidence
 
 
@@ -87,19 +91,19 @@ def screen(folder: Path, ids: tuple[str, ...], model: Model, effects: tuple[Effe
     captures = opened(folder)
     batches = load(captures, chosen(captures, ids))
     with torch.no_grad():
-        return _screen(batches, model, effects)
+        return screen_batches(batches, model, effects)
 
 
-def _screen(batches: list[Batch], model: Model, effects: tuple[Effect, ...]) -> list[Screened]:
+def screen_batches(batches: list[Batch], model: Model, effects: tuple[Effect, ...]) -> list[Screened]:
     results = []
-    known: dict[bool, tuple[list[Predictor], list, Tensor, Tensor]] = {}
+    known: dict[bool, tuple[list[Predictor], list[Trace], Tensor, Tensor]] = {}
     for effect in effects:
         wide = effect.touches_iris
         if wide not in known:
-            reach = model if not wide else model.having(_absent(effect, model))
+            reach = model if not wide else model.having(absent(effect, model.bench))
             predictors = [Predictor(reach, b) for b in batches]
             points = [p.trace(model) for p in predictors]
-            nuisance = _stacked(model, _keys(model, model.names), predictors, points)
+            nuisance = _stacked(model, keys_of(model, model.names), predictors, points)
             known[wide] = (predictors, points, *nuisance)
         predictors, points, residual, present = known[wide]
         noise = sum(float((b.weight * b.noise).sum()) for b in batches)
@@ -109,50 +113,57 @@ def _screen(batches: list[Batch], model: Model, effects: tuple[Effect, ...]) -> 
         trial = model.having(start)
         moved = [p.trace(trial, effect.stage, t) for p, t in zip(predictors, points, strict=True)]
         trial = with_gain(trial, predictors, moved)
-        residual_there, slopes = _stacked(trial, _keys(trial, [effect.name]), predictors, moved)
+        residual_there, slopes = _stacked(trial, keys_of(trial, [effect.name]), predictors, moved)
         after = (_remaining(residual_there, torch.cat([slopes, present])) - noise) / scale
-        # A start is only a start: a derivative there must not lose to the derivative at absent.
         results.append(Screened(effect.name, start, before, after))
     return results
 
 
-def _absent(effect: Effect, model: Model) -> Present:
-    from trainer.model import absent
-
-    return absent(effect, model.bench)
-
-
-def _start(effect: Effect, model: Model, predictors: list[Predictor], points: list) -> Present:
+def _start(effect: Effect, model: Model, predictors: list[Predictor], points: list[Trace]) -> Present:
     starts = start_points(effect, model)
     if effect.starts is not None:
         evidence = []
         for predictor, point in zip(predictors, points, strict=True):
             prediction = predictor.counts(model, predictor.light(model, point))
             evidence.append(Evidence(predictor.scene, predictor.batch, prediction))
-        base = _absent(effect, model)
-        for values in effect.starts(evidence):
-            full = {n: np.array(values[n], dtype=float) if n in values else base.values[n] for n in base.values}
-            starts.append(base.with_values({n: v.reshape(base.values[n].shape) for n, v in full.items()}))
-    best = starts[0] if len(starts) == 1 else best_start(model, predictors[:3], points[:3], starts)
+        starts += [placed(effect, model.bench, values) for values in effect.starts(evidence)]
+    if len(starts) == 1:
+        best = starts[0]
+    else:
+        few, there = predictors[:3], points[:3]
+        costs = [start_cost(model, few, there, start) for start in starts]
+        if max(costs) - min(costs) < 1e-9 * max(costs):
+            # A period or a place says nothing while the amplitude is zero: look one step ahead.
+            costs = [_one_step_ahead(model, few, there, start) for start in starts]
+        best = starts[costs.index(min(costs))]
     return pattern_search(model, predictors[:3], points[:3], best) if effect.rugged else best
 
 
+def placed(effect: Effect, bench: Bench, values: dict[str, Any]) -> Present:
+    """The effect with some values given, held within their physical range, and the others absent."""
+    base = absent(effect, bench)
+    full = dict(base.values)
+    for name, value in values.items():
+        p = effect.parameter(name)
+        full[name] = np.clip(np.asarray(value, dtype=float), p.low, p.high).reshape(base.values[name].shape)
+    return base.with_values(full)
+
+
+def _one_step_ahead(
+    model: Model, predictors: list[Predictor], points: list[Trace], start: Present
+) -> float:
+    """Squared error that a straight-line step from a start would leave."""
+    trial = model.having(start)
+    return _remaining(*_stacked(trial, keys_of(trial, [start.effect.name]), predictors, points))
+
+
 def _stacked(
-    model: Model, keys: Sequence[tuple[str, str, int]], predictors: list[Predictor], points: list
+    model: Model, keys: tuple[tuple[str, str, int], ...], predictors: list[Predictor], points: list[Trace]
 ) -> tuple[Tensor, Tensor]:
-    """Weighted residual [pixels] and derivatives [columns, pixels]; one gain column a colour."""
+    """Weighted residual [pixels] and derivatives [keys + colours, pixels] over all batches."""
     channels = list(dict.fromkeys(p.batch.channel for p in predictors))
-    residuals, blocks = [], []
-    for predictor, point in zip(predictors, points, strict=True):
-        base, slopes = columns(model, keys, predictor, point)
-        weight = predictor.batch.weight
-        residuals.append((weight * (predictor.batch.signal - base)).reshape(-1))
-        block = torch.zeros((len(keys) + len(channels), weight.numel()), dtype=weight.dtype)
-        for k, slope in enumerate(slopes[:-1]):
-            block[k] = (weight * slope).reshape(-1)
-        block[len(keys) + channels.index(predictor.batch.channel)] = (weight * slopes[-1]).reshape(-1)
-        blocks.append(block)
-    return torch.cat(residuals), torch.cat(blocks, dim=1)
+    residuals, _ = weighted_residuals(model, predictors, points)
+    return torch.cat(residuals), torch.cat(slopes_of(model, keys, channels, predictors, points), dim=1)
 
 
 def _remaining(residual: Tensor, slopes: Tensor) -> float:

@@ -34,7 +34,7 @@ Progress = Callable[[float, str], None]
 BENCH = "virtual:demo"
 QUICK_SHAPE, QUICK_DISTANCE_MM = (144, 192), 18.0
 PICTURES = ("astronaut", "coffee")  # not among those that are captured
-ITERATIONS, ORACLE_ITERATIONS = 100, 80
+ITERATIONS, ORACLE_ITERATIONS = 100, 40
 SHOTS = 4  # pictures of the camera that are averaged
 SATURATED = 0.001  # share of pixels
 

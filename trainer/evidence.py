@@ -51,7 +51,8 @@ def split(captures: CaptureSet) -> Split:
     plane with a single pattern is held out only if all of them are like that, with its fit on the same capture's
     repeats; otherwise it is fitted.
     """
-    fitted, held = [], []
+    fitted: list[Capture] = []
+    held: list[Capture] = []
     for channel, plane in scenes(captures.captures):
         rows = [c for c in captures.captures if (c.channel, c.plane_mm) == (channel, plane)]
         patterns = list(dict.fromkeys(c.pattern for c in rows))
@@ -70,14 +71,14 @@ def scenes(captures: Iterable[Capture]) -> list[tuple[str, float]]:
 
 def sample(captures: Iterable[Capture], pixels: int, most: int) -> list[Capture]:
     """Different patterns for a fit, spread over colours and planes: at most `most`, at least one a scene."""
-    by_scene = {}
+    by_scene: dict[tuple[str, float], dict[str, Capture]] = {}
     for c in captures:
         by_scene.setdefault((c.channel, c.plane_mm), {}).setdefault(c.pattern, c)
     columns = [list(patterns.values()) for patterns in by_scene.values()]
     # Patterns of one kind often follow each other: spread the choice over the whole list.
     columns = [[column[i] for i in _spread(len(column))] for column in columns]
     wanted = max(len(columns), min(most, FIT_PIXELS * max(1, len(columns)) // max(1, pixels)))
-    chosen = []
+    chosen: list[Capture] = []
     depth = 0
     while len(chosen) < wanted and any(depth < len(column) for column in columns):
         chosen += [column[depth] for column in columns if depth < len(column)][: wanted - len(chosen)]

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from trainer.candidates import Screened, _screen, evaluate_captures, least_for_order
+from trainer.candidates import Screened, evaluate_captures, least_for_order, screen_batches
 from trainer.captures import CaptureSet
 from trainer.diagnose import Diagnosis, Parts, Progress, diagnose, heldout_json, ideal_errors, parts_of, with_gains
 from trainer.effects.definition import Effect
@@ -99,7 +99,7 @@ def add(
     if effect.name in model.names:
         start = present_named(model, effect.name)
     else:
-        screened: list[Screened] = _screen(load(captures, parts.screened), model, (effect,))
+        screened: list[Screened] = screen_batches(load(captures, parts.screened), model, (effect,))
         start = screened[0].start
     say(0.3, f"fitting {effect.name}")
     added = add_from(parts, model, start)

@@ -111,13 +111,6 @@ def start_points(effect: Effect, model: Model) -> list[Present]:
     ]
 
 
-def best_start(
-    model: Model, predictors: Sequence[Predictor], points: Sequence[Trace], starts: list[Present]
-) -> Present:
-    """The start whose prediction, with its own gain, has the smallest error."""
-    return min(starts, key=lambda start: _start_cost(model, predictors, points, start))
-
-
 def pattern_search(
     model: Model, predictors: Sequence[Predictor], points: Sequence[Trace], start: Present
 ) -> Present:
@@ -125,24 +118,25 @@ def pattern_search(
 
     The edge of an iris is one: its derivative sees one frequency sample, and the next one is unrelated.
     """
-    best, least = start, _start_cost(model, predictors, points, start)
+    best, least = start, start_cost(model, predictors, points, start)
     for factor in (6.0, 3.0, 1.5, 0.75, 0.35, 0.15):
         improved = True
         while improved:
             improved = False
-            for key in _keys(model.having(best), [best.effect.name]):
+            for key in keys_of(model.having(best), [best.effect.name]):
                 for sign in (-1, 1):
                     step = sign * factor * best.effect.parameter(key[1]).scale
                     trial = _present(stepped(model.having(best), key, step), best.effect.name)
-                    cost = _start_cost(model, predictors, points, trial)
+                    cost = start_cost(model, predictors, points, trial)
                     if cost < 0.9999 * least:
                         best, least, improved = trial, cost, True
     return best
 
 
-def _start_cost(
+def start_cost(
     model: Model, predictors: Sequence[Predictor], points: Sequence[Trace], start: Present
 ) -> float:
+    """Squared error of a model with an effect at a start, gains fitted."""
     trial = model.having(start)
     moved = [p.trace(trial, start.effect.stage, t) for p, t in zip(predictors, points, strict=True)]
     trial = with_gain(trial, predictors, moved)
@@ -180,40 +174,43 @@ def _fit(
     progress: Callable[[float], None] | None,
 ) -> Fitted:
     predictors = [Predictor(model, b) for b in batches]
-    keys = _keys(model, free)
+    keys = keys_of(model, free)
     first = min((_present(model, n).effect.stage for n in free), key=STAGES.index, default="sensor")
     points = [p.trace(model) for p in predictors]
     if not model.gain or any(b.channel not in model.gain for b in batches):
         model = with_gain(model, predictors, points)
     channels = list(dict.fromkeys(b.channel for b in batches))
-    damping = 1e-3
-    errors, normal, gradient, scatter = _linearise(model, keys, predictors, points)
+    slopes = slopes_of(model, keys, channels, predictors, points)
+    residuals, errors = weighted_residuals(model, predictors, points)
+    damping, fresh = 1e-3, True
     for iteration in range(iterations):
         if progress:
             progress(iteration / iterations)
         before = errors.excess
+        normal, gradient = _normal(slopes), _gradient(slopes, residuals)
         accepted = False
-        for _ in range(6):
-            step = _solve(normal, gradient, damping)
-            trial = _moved(model, keys, channels, step)
+        for _ in range(6 if fresh else 1):
+            trial = _moved(model, keys, channels, _solve(normal, gradient, damping))
             trial_points = [p.trace(trial, first, t) for p, t in zip(predictors, points, strict=True)]
-            trial_errors = join(
-                [errors_of(p.batch, p.counts(trial, p.light(trial, t))) for p, t in zip(predictors, trial_points, strict=True)]
-            )
+            trial_residuals, trial_errors = weighted_residuals(trial, predictors, trial_points)
             if trial_errors.excess < before:
                 accepted = True
                 break
             damping = max(damping, 1e-4) * 8
-        if not accepted:
+        if accepted:
+            model, points = trial, trial_points
+            residuals, errors = trial_residuals, trial_errors
+            damping = max(damping / 10, 1e-7)
+        elif fresh:
             break
-        model, points = trial, trial_points
-        damping = max(damping / 10, 1e-7)
-        gone = before - trial_errors.excess
-        errors = trial_errors
-        if gone < max(tolerance * abs(trial_errors.excess), 2e-6):
+        gone = before - errors.excess
+        if fresh and gone < max(tolerance * abs(errors.excess), 2e-6):
             break
-        if iteration + 1 < iterations:
-            errors, normal, gradient, scatter = _linearise(model, keys, predictors, points)
+        # Secants are dear: they serve again while a step still takes more than half of what is left.
+        fresh = not gone > 0.5 * before
+        if fresh and iteration + 1 < iterations:
+            slopes = slopes_of(model, keys, channels, predictors, points)
+    normal, scatter = _normal(slopes), _scatter(slopes, residuals)
     model = _measured(model, free, batches)
     inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
     covariance = inverse @ scatter @ inverse
@@ -238,7 +235,7 @@ def _present(model: Model, name: str) -> Present:
     return next(p for p in model.present if p.effect.name == name)
 
 
-def _keys(model: Model, free: Sequence[str]) -> tuple[tuple[str, str, int], ...]:
+def keys_of(model: Model, free: Sequence[str]) -> tuple[tuple[str, str, int], ...]:
     keys = []
     for name in free:
         present = _present(model, name)
@@ -284,27 +281,50 @@ def columns(
     return base, result
 
 
-def _linearise(
-    model: Model, keys: tuple[tuple[str, str, int], ...], predictors: Sequence[Predictor], points: Sequence[Trace]
-) -> tuple[Errors, np.ndarray, np.ndarray, np.ndarray]:
-    channels = list(dict.fromkeys(p.batch.channel for p in predictors))
-    size = len(keys) + len(channels)
-    normal, scatter = np.zeros((size, size)), np.zeros((size, size))
-    gradient = np.zeros(size)
-    errors = []
+def slopes_of(
+    model: Model,
+    keys: tuple[tuple[str, str, int], ...],
+    channels: list[str],
+    predictors: Sequence[Predictor],
+    points: Sequence[Trace],
+) -> list[Tensor]:
+    """Weighted derivatives of each batch's prediction: [keys + channels, pixels]."""
+    blocks = []
+    for predictor, point in zip(predictors, points, strict=True):
+        weight = predictor.batch.weight
+        block = torch.zeros((len(keys) + len(channels), weight.numel()), dtype=weight.dtype)
+        _, slopes = columns(model, keys, predictor, point)
+        which = [*range(len(keys)), len(keys) + channels.index(predictor.batch.channel)]
+        for row, slope in zip(which, slopes, strict=True):
+            block[row] = (weight * slope).reshape(-1)
+        blocks.append(block)
+    return blocks
+
+
+def weighted_residuals(
+    model: Model, predictors: Sequence[Predictor], points: Sequence[Trace]
+) -> tuple[list[Tensor], Errors]:
+    """Weighted residuals of each batch [pixels], and the errors they make."""
+    residuals, errors = [], []
     for predictor, point in zip(predictors, points, strict=True):
         batch = predictor.batch
-        base, slopes = columns(model, keys, predictor, point)
-        errors.append(errors_of(batch, base))
-        which = [*range(len(keys)), len(keys) + channels.index(batch.channel)]
-        jacobian = (torch.stack(slopes) * batch.weight).reshape(len(slopes), -1)
-        residual = (batch.weight * (batch.signal - base)).reshape(-1)
-        place = np.ix_(which, which)
-        normal[place] += (jacobian @ jacobian.T).double().numpy()
-        gradient[which] += (jacobian @ residual).double().numpy()
-        weighted = jacobian * residual
-        scatter[place] += (weighted @ weighted.T).double().numpy()
-    return join(errors), normal, gradient, scatter
+        prediction = predictor.counts(model, predictor.light(model, point))
+        residuals.append((batch.weight * (batch.signal - prediction)).reshape(-1))
+        errors.append(errors_of(batch, prediction))
+    return residuals, join(errors)
+
+
+def _normal(slopes: list[Tensor]) -> np.ndarray:
+    return sum((s @ s.T).double().numpy() for s in slopes)  # type: ignore[return-value]
+
+
+def _gradient(slopes: list[Tensor], residuals: list[Tensor]) -> np.ndarray:
+    return sum((s @ r).double().numpy() for s, r in zip(slopes, residuals, strict=True))  # type: ignore[return-value]
+
+
+def _scatter(slopes: list[Tensor], residuals: list[Tensor]) -> np.ndarray:
+    weighted = [s * r for s, r in zip(slopes, residuals, strict=True)]
+    return sum((w @ w.T).double().numpy() for w in weighted)  # type: ignore[return-value]
 
 
 def _solve(normal: np.ndarray, gradient: np.ndarray, damping: float) -> np.ndarray:

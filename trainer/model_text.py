@@ -21,7 +21,7 @@ from trainer.effects.definition import Effect, Parameter
 from trainer.effects.registry import BUILT_IN
 from trainer.model import Model, Present
 
-LONGEST = 64  # numbers of an array that stay in the text
+LONGEST = 128  # numbers of an array that stay in the text: every built-in map and curve does
 WIDTH = 110
 
 Store = Callable[[str, np.ndarray], str]

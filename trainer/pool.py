@@ -5,7 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -69,7 +69,7 @@ def open_pool(workers: int | None = None, cluster: str | None = None) -> Iterato
     if count < 1:
         raise InputError(f"--workers {workers}: give a number of processes from 1 on")
     if count == 1:
-        executor: Executor = ThreadPoolExecutor(1)
+        executor: Executor = _Here()
     else:
         executor = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _single_threaded)
     try:
@@ -79,6 +79,19 @@ def open_pool(workers: int | None = None, cluster: str | None = None) -> Iterato
         _stop(executor)
         raise
     executor.shutdown()
+
+
+class _Here(Executor):
+    """Runs each task at once in this process, so that Ctrl-C stops it there and then."""
+
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        """The finished future of a call."""
+        future: Future[T] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
 
 
 def _stop(executor: Executor) -> None:

@@ -151,7 +151,7 @@ def _bare(scene: Scene) -> Stages:
 def _coordinates(height: int, width: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     y = (torch.arange(height, dtype=dtype) - (height - 1) / 2) / (height / 2)
     x = (torch.arange(width, dtype=dtype) - (width - 1) / 2) / (width / 2)
-    return torch.broadcast_tensors(y[:, None], x[None, :])  # type: ignore[return-value]
+    return torch.broadcast_tensors(y[:, None], x[None, :])
 
 
 def stages_for(scene: Scene, present: tuple[Present, ...], tensors: Any = None) -> Stages:

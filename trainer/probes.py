@@ -272,7 +272,7 @@ def _pupil(model: Model, batch: Batch) -> _Kind:
 
     nodes = (PUPIL_NODES, PUPIL_NODES)
     shapes = {"log": (nodes, PUPIL_NODES), "phase": (nodes, PUPIL_NODES), "extent": ((2,), 0.5)}
-    return _Kind("pupil", shapes, apply, pictures)  # type: ignore[arg-type]
+    return _Kind("pupil", shapes, apply, pictures)
 
 
 def _sensor(model: Model, batch: Batch) -> _Kind:
@@ -342,7 +342,7 @@ def _array(values: Tensor) -> np.ndarray:
 
 def _field(height: int, width: int) -> tuple[Tensor, Tensor]:
     y, x = ((torch.arange(n) - (n - 1) / 2) / (n / 2) for n in (height, width))
-    return torch.broadcast_tensors(y[:, None], x[None, :])  # type: ignore[return-value]
+    return torch.broadcast_tensors(y[:, None], x[None, :])
 
 
 def _nodes(height: int, width: int, stage: str) -> tuple[int, int]:

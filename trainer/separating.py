@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
 
 from firmware_iface.errors import InputError
-from trainer.evidence import load_batch
-from trainer.fit import Predictor, with_gain
+from trainer.evidence import Batch, load_batch
+from trainer.fit import Predictor
 from trainer.model import Model
 
 if TYPE_CHECKING:
@@ -27,11 +28,13 @@ def captures_that_separate(parts: Parts, one: tuple[str, Model], other: tuple[st
     batch = load_batch(parts.captures, [row])
     here = _difference(one[1], other[1], batch)
     channels = [c.name for c in parts.captures.bench.channels]
-    proposals = [(f"the same patterns at {row.plane_mm * f:.3g} mm", {"plane_mm": row.plane_mm * f}) for f in PLANES]
-    proposals += [(f"the same patterns in {c}", {"channel": c}) for c in channels if c not in parts.captures.channels]
+    proposals = [
+        (f"the same patterns at {row.plane_mm * f:.3g} mm", replace(batch, plane_mm=row.plane_mm * f)) for f in PLANES
+    ]
+    unused = [c for c in channels if c not in parts.captures.channels]
+    proposals += [(f"the same patterns in {c}", replace(batch, channel=c)) for c in unused]
     found = []
-    for words, change in proposals:
-        moved = type(batch)(**{**batch.__dict__, **change})
+    for words, moved in proposals:
         try:
             there = _difference(one[1], other[1], moved)
         except InputError:  # the plane is out of the light path's reach
@@ -45,7 +48,7 @@ def captures_that_separate(parts: Parts, one: tuple[str, Model], other: tuple[st
     ]
 
 
-def _difference(one: Model, other: Model, batch) -> float:  # type: ignore[no-untyped-def]
+def _difference(one: Model, other: Model, batch: Batch) -> float:
     with torch.no_grad():
         predictions = []
         for model in (one, other):

@@ -231,10 +231,23 @@ def test_back_propagation_is_the_adjoint_of_the_way_there() -> None:
     rng = np.random.default_rng(9)
     z = rng.normal(size=path.grid.image_shape) + 1j * rng.normal(size=path.grid.image_shape)
     phase = phases(path)
+    index = [np.arange(n) - FINE * path.grid.margin for n in path.grid.image_shape]
+    cycles = [b / (FINE * n) * i for b, n, i in zip(path.grid.band, path.grid.padded, index, strict=True)]
+    ramp = np.exp(2j * np.pi * (cycles[0][:, None] + cycles[1][None, :]))
     for mode in range(3):
-        there = np.vdot(z, image_field(path, panel_spectrum(path, phase), mode))
+        there = np.vdot(z * ramp, image_field(path, panel_spectrum(path, phase), mode))
         field = path.source * np.exp(1j * phase)
         assert there == pytest.approx(np.vdot(back_propagated(path, z, mode), field), rel=1e-10)
+
+
+def test_back_propagated_light_makes_the_picture() -> None:
+    """A smooth picture of flat phase, far from the border: taken to the panel as a complex field, and shown."""
+    path = ideal_path((64, 80), 0.006)
+    y, x = (np.arange(n) / FINE - path.grid.margin for n in path.grid.image_shape)
+    spot = np.exp(-((y[:, None] - 30) ** 2) / 120 - ((x[None, :] - 44) ** 2) / 150)
+    field = back_propagated(path, spot.astype(complex)) / FINE**2
+    light = irradiance(replace(path, source=field), np.zeros((64, 80)))
+    np.testing.assert_allclose(light, spot**2, atol=0.02)
 
 
 def test_light_does_not_come_back_on_the_other_side() -> None:

@@ -10,8 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from firmware_iface.errors import InputError
 from trainer.bench_file import Bench, Camera, Channel, Iris, Panel
@@ -139,7 +137,7 @@ def test_values_that_could_not_be_read_are_not_written(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def long_effect(count: int = 100, per_channel: bool = False) -> Effect:
+def long_effect(count: int = 200, per_channel: bool = False) -> Effect:
     parameter = Parameter("table", "rad", 0.1, low=-5, high=5, count=count, per_channel=per_channel)
     return Effect("long_table", "drive", "display", "A long table.", (parameter,), lambda drive, table: drive)
 
@@ -348,66 +346,4 @@ def test_a_missing_file_and_no_toml_are_input_errors(tmp_path: Path) -> None:
         read_model(tmp_path, KNOWN)
     (tmp_path / "m.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match="not TOML"):
-        read_model(tmp_path / "m.toml", KNOWN)
-
-
-SCRAP = st.one_of(
-    st.integers(-(10**40), 10**40),
-    st.floats(),
-    st.booleans(),
-    st.text(max_size=6),
-    st.just([]),
-    st.just([1, [2]]),
-    st.just({}),
-    st.just({"array": "x"}),
-    st.just({"red": 1.0, "green": 1e400}),
-    st.just([1.0] * 3),
-    st.just("2020-01-01T00:00:00Z"),
-)
-
-
-def toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        return '"' + "".join(c if c.isascii() and c.isalnum() else "_" for c in value) + '"'
-    if isinstance(value, list):
-        return "[" + ", ".join(toml(v) for v in value) + "]"
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{k} = {toml(v)}" for k, v in value.items()) + "}"
-    return repr(value)
-
-
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.data())
-def test_no_edit_gives_anything_but_a_model_or_an_input_error(tmp_path: Path, data: st.DataObject) -> None:
-    lines = GOOD.splitlines()
-    for _ in range(data.draw(st.integers(1, 3))):
-        at = data.draw(st.integers(0, len(lines) - 1))
-        what = data.draw(st.sampled_from(("value", "drop", "twice", "cut", "swap")))
-        if what == "value" and "=" in lines[at]:
-            lines[at] = lines[at].split("=")[0] + "= " + toml(data.draw(SCRAP))
-        elif what == "drop":
-            lines[at] = ""
-        elif what == "twice":
-            lines.insert(at, lines[at])
-        elif what == "cut":
-            lines[at] = lines[at][: data.draw(st.integers(0, len(lines[at])))]
-        else:
-            other = data.draw(st.integers(0, len(lines) - 1))
-            lines[at], lines[other] = lines[other], lines[at]
-    try:
-        model = read_text(tmp_path, "\n".join(lines))
-    except InputError as error:
-        assert "\n" not in str(error)
-        return
-    write_model(tmp_path / "again.toml", model)
-    assert read_model(tmp_path / "again.toml", KNOWN).names == model.names
-
-
-@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.binary(max_size=200))
-def test_no_bytes_give_anything_but_an_input_error(tmp_path: Path, data: bytes) -> None:
-    (tmp_path / "m.toml").write_bytes(data)
-    with pytest.raises(InputError):
         read_model(tmp_path / "m.toml", KNOWN)

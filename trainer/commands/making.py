@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -143,7 +144,10 @@ def show_export(result: Result, args: Namespace, screen: Screen) -> None:
     """What is in the bundle."""
     screen.say(f"The bundle is {args.out}.", style="bold")
     _facts(result, screen)
-    screen.next(f"hololoop-runtime solve --bundle {args.out} --target picture.png --out pattern.png")
+    screen.next(
+        shlex.join(["hololoop-runtime", "solve", str(args.out), "picture.png", "--out", "phase.png"]),
+        "On the headset",
+    )
 
 
 def run_demo(args: Namespace, screen: Screen) -> Result:
@@ -282,7 +286,7 @@ def commands() -> list[Command]:
             "export",
             "Make a bundle for the headset of a model.",
             "export --model model.toml --out bundle/",
-            "On the headset: hololoop-runtime solve",
+            "On the headset: hololoop-runtime solve bundle/ picture.png --out phase.png",
             _export_options,
             run_export,
             show_export,

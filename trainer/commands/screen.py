@@ -50,6 +50,7 @@ class Screen:
             title_justify="left",
             title_style="bold",
             box=None,
+            show_header=any(columns),
             pad_edge=False,
             header_style="dim",
             padding=(0, 2, 0, 0),

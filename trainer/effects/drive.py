@@ -54,7 +54,7 @@ def phase_response(drive: Drive, gain: Tensor, curvature: Tensor) -> Drive:
 @effect(
     stage="drive",
     told_to="display",
-    orders=(2, 4, 6),
+    orders=(2, 4, 6, 8, 10),
     parameters=[
         Parameter(
             "map",

@@ -43,7 +43,7 @@ def zero_order(panel: Panel, leak_real: Tensor, leak_imaginary: Tensor, fill_fac
 @effect(
     stage="panel",
     told_to="display",
-    orders=(2, 4, 6),
+    orders=(2, 4, 6, 8),
     parameters=[
         Parameter(
             "log_amplitude",
@@ -64,7 +64,7 @@ def illumination(panel: Panel, log_amplitude: Tensor) -> Panel:
 @effect(
     stage="panel",
     told_to="display",
-    orders=(2, 4, 6, 8),
+    orders=(2, 4, 6, 8, 10),
     starts=wavefront_starts,
     parameters=[
         Parameter(

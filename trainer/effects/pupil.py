@@ -92,11 +92,8 @@ def iris(pupil: Pupil, half_width: Tensor, centre_y: Tensor, centre_x: Tensor) -
 )
 def temporal_coherence(pupil: Pupil, line_width: Tensor) -> Pupil:
     """The laser has a line width (full width at half maximum of a Gaussian line)."""
-    nodes, weights = np.polynomial.hermite_e.hermegauss(LINES)
-    nodes, weights = (
-        torch.as_tensor(a, dtype=line_width.dtype, device=line_width.device)
-        for a in (nodes, weights / weights.sum())
-    )
+    rule = np.polynomial.hermite_e.hermegauss(LINES)
+    nodes, weights = (torch.as_tensor(a / s, dtype=line_width.dtype) for a, s in zip(rule, (1, rule[1].sum()), strict=True))
     return replace(pupil, lines=(nodes * line_width * 1e-9 / FWHM, weights))
 
 
@@ -104,34 +101,32 @@ def temporal_coherence(pupil: Pupil, line_width: Tensor) -> Pupil:
     stage="pupil",
     told_to="display",
     parameters=[
-        Parameter(
-            "extent",
-            "mrad",
-            scale=0.3,
-            low=0,
-            high=50,
-            even=True,
-            starts=(0.5, 1.5),
-            about="rms angle along an axis, seen from the panel",
-        ),
-        Parameter(
-            "kurtosis", "1", scale=0.5, low=-1.5, high=1.5, about="shape of the source: 0 Gaussian, -1 uniform disc"
-        ),
+        Parameter("extent_y", "mrad", scale=0.3, low=0, high=50, even=True, starts=(0.1, 0.3, 1.0), about="rms angle"),
+        Parameter("extent_x", "mrad", scale=0.3, low=0, high=50, even=True, starts=(0.1, 0.3, 1.0), about="rms angle"),
+        Parameter("kurtosis", "1", scale=0.5, low=-1.5, high=1.5, about="shape: 0 Gaussian, -1 uniform disc"),
+        Parameter("halo", "1", scale=0.05, low=0, high=0.9, about="share of the light in a wider, round part"),
+        Parameter("halo_extent", "mrad", scale=0.3, absent=1.0, low=0.01, high=100, about="rms angle of that part"),
     ],
 )
-def spatial_coherence(pupil: Pupil, extent: Tensor, kurtosis: Tensor) -> Pupil:
+def spatial_coherence(
+    pupil: Pupil, extent_y: Tensor, extent_x: Tensor, kurtosis: Tensor, halo: Tensor, halo_extent: Tensor
+) -> Pupil:
     """The source has an extent: each of its points tilts the light and displaces the picture by distance x angle."""
     # Exact but for the iris's edge, and hundreds of times cheaper than a propagation a source point.
-    spread = 1e-3 * extent * torch.abs(pupil.distance)
-    return pupil.filtered(kernel_transfer(pupil.iy, pupil.ix, spread, kurtosis))
+    reach = 1e-3 * torch.abs(pupil.distance)
+    widths = (reach * extent_y, reach * extent_x, reach * halo_extent)
+    return pupil.filtered(kernel_transfer(pupil.iy, pupil.ix, widths, kurtosis, halo))
 
 
-def kernel_transfer(iy: Tensor, ix: Tensor, spread: Tensor, kurtosis: Tensor) -> Tensor:
-    """Transfer function of a round kernel with an rms `spread` along an axis and an excess kurtosis.
+def kernel_transfer(
+    iy: Tensor, ix: Tensor, widths: tuple[Tensor, Tensor, Tensor], kurtosis: Tensor, halo: Tensor
+) -> Tensor:
+    """Transfer function of a kernel of rms `widths` (rows, columns; its halo's), shape `kurtosis`, and a halo.
 
-    The first two cumulants of the kernel: exp(-w^2/2 + kurtosis w^4/24), w = 2 pi spread f; the quartic is held to
-    half of the quadratic, where the expansion ends.
+    The core is the first two even cumulants of a kernel, exp(-w^2/2 + kurtosis w^4/24), w = 2 pi width f, with the
+    quartic held to half of the quadratic, where the expansion ends; the halo is a round Gaussian with a share
+    `halo` of the light.
     """
-    w2 = (2 * math.pi * spread) ** 2 * (iy**2 + ix**2)
-    quartic = torch.clamp(kurtosis * w2 / 24, -0.25, 0.25)
-    return torch.exp(w2 * (quartic - 0.5))
+    w2 = (2 * math.pi) ** 2 * ((widths[0] * iy) ** 2 + (widths[1] * ix) ** 2)
+    core = torch.exp(w2 * (torch.clamp(kurtosis * w2 / 24, -0.25, 0.25) - 0.5))
+    return (1 - halo) * core + halo * torch.exp(-0.5 * (2 * math.pi * widths[2]) ** 2 * (iy**2 + ix**2))

@@ -19,13 +19,19 @@ from trainer.starts import gain_spread, ghost_starts, registration_starts
     stage="sensor",
     told_to="camera",
     parameters=[
-        Parameter("width", "pixels", scale=0.15, low=0, high=20, even=True, starts=(0.3, 1.0), about="rms along an axis"),
+        Parameter("width_y", "pixels", scale=0.15, low=0, high=20, even=True, starts=(0.3, 0.6, 1.2), about="rms"),
+        Parameter("width_x", "pixels", scale=0.15, low=0, high=20, even=True, starts=(0.3, 0.6, 1.2), about="rms"),
         Parameter("kurtosis", "1", scale=0.5, low=-1.5, high=1.5, about="shape: 0 Gaussian, -1 uniform disc"),
+        Parameter("halo", "1", scale=0.05, low=0, high=0.9, about="share of the light in a wider, round part"),
+        Parameter("halo_width", "pixels", scale=0.3, absent=2.0, low=0.1, high=60, about="rms of that part"),
     ],
 )
-def sensor_blur(sensor: Sensor, width: Tensor, kurtosis: Tensor) -> Sensor:
+def sensor_blur(
+    sensor: Sensor, width_y: Tensor, width_x: Tensor, kurtosis: Tensor, halo: Tensor, halo_width: Tensor
+) -> Sensor:
     """The camera's lens and pixels blur the picture."""
-    return sensor.blurred(kernel_transfer(sensor.iy, sensor.ix, width, kurtosis))
+    widths = (width_y, width_x, halo_width)
+    return sensor.blurred(kernel_transfer(sensor.iy, sensor.ix, widths, kurtosis, halo))
 
 
 @effect(
@@ -74,7 +80,7 @@ def misregistration(
 @effect(
     stage="sensor",
     told_to="camera",
-    orders=(2, 4),
+    orders=(2, 4, 6),
     parameters=[
         Parameter(
             "log_gain", "1", scale=0.03, low=-4, high=4, count=legendre_count, about="Legendre terms over the picture"
@@ -113,14 +119,14 @@ def stray_light(sensor: Sensor, counts: Tensor) -> Sensor:
 @effect(
     stage="sensor",
     told_to="camera",
-    orders=(2, 4),
+    orders=(2, 4, 6),
     parameters=[
         Parameter(
             "bend",
             "1",
             scale=0.03,
-            low=-2,
-            high=2,
+            low=-6,
+            high=6,
             count=lambda order: order,
             about="Legendre terms of the deviation from a straight line, zero at both ends, share of full scale",
         )
@@ -166,5 +172,6 @@ def laser_drift(sensor: Sensor, spread: Tensor) -> Sensor:
 def ghost(sensor: Sensor, amplitude: Tensor, shift_y: Tensor, shift_x: Tensor, blur: Tensor) -> Sensor:
     """A second, weak, displaced image, as from a reflection in a window."""
     angle = -2 * math.pi * (sensor.iy * shift_y + sensor.ix * shift_x)
-    size = amplitude * kernel_transfer(sensor.iy, sensor.ix, blur, torch.zeros_like(blur))
+    none = torch.zeros_like(blur)
+    size = amplitude * kernel_transfer(sensor.iy, sensor.ix, (blur, blur, none), none, none)
     return sensor.filtered(1 + size * torch.complex(torch.cos(angle), torch.sin(angle)))

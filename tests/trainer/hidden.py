@@ -1,0 +1,62 @@
+"""Small virtual benches with hidden defects, and the commands run on them as a user would run them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from trainer.cli import main
+
+BENCH = """
+name = "bench"
+[panel]
+width = {width}
+height = {height}
+pitch_um = 8
+levels = 256
+fill_factor = 1.0
+[[channel]]
+name = "green"
+wavelength_nm = 520
+[propagation]
+distance_mm = {distance_mm}
+[iris]
+shape = "square"
+half_width = 1.0
+[camera]
+width = {width}
+height = {height}
+pixel_um = 8
+registered = true
+bit_depth = 12
+black_level = 64
+full_well_e = 10500
+read_noise_e = 5
+"""
+
+
+def bench_file(folder: Path, *defects: str, width: int = 160, height: int = 128, distance_mm: float = 15) -> Path:
+    """A virtual bench's TOML file with defects given as TOML lines after [[defect]]."""
+    path = folder / "bench-with-secrets.toml"
+    text = BENCH.format(width=width, height=height, distance_mm=distance_mm)
+    path.write_text(text + "".join(f"\n[[defect]]\n{d}\n" for d in defects))
+    return path
+
+
+def ran(capsys: pytest.CaptureFixture[str], *argv: object) -> dict[str, Any]:
+    """What a command of hololoop-trainer printed with --json."""
+    capsys.readouterr()
+    code = main([*map(str, argv), "--json"])
+    out, err = capsys.readouterr()
+    assert code == 0, err
+    return json.loads(out)
+
+
+def captured(capsys: pytest.CaptureFixture[str], folder: Path, *defects: str, options: tuple[object, ...] = ()) -> Path:
+    """A capture set taken from a bench with these defects."""
+    where = folder / "captures"
+    ran(capsys, "capture", "--bench", bench_file(folder, *defects), "--out", where, *options)
+    return where

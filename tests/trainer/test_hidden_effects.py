@@ -1,0 +1,140 @@
+"""Benches with something hidden, through the commands: what is hidden must be found, named and removed.
+
+The virtual bench shares no code with the light path: sub-pixels, dead space, fringing and coherence come from
+geometry.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.trainer.hidden import captured, ran
+from trainer.effects import catalogue
+
+ALONE = {name: f'kind = "{name}"' for name in catalogue()}
+
+
+def explained(capsys, captures: Path, folder: Path, *options: object) -> dict:
+    return ran(capsys, "explain", captures, "--out", folder / "model.toml", "--workers", 1, *options)
+
+
+@pytest.mark.parametrize("name", ALONE)
+def test_each_effect_is_found_first_and_removed(name, tmp_path, capsys):
+    captures = captured(capsys, tmp_path, ALONE[name])
+    found = explained(capsys, captures, tmp_path)
+    first, second = found["steps"][:2]
+    assert name == second["added"] or name in second["indistinguishable_from"], found["steps"]
+    assert found["verdict"] == "complete"
+    assert len(found["steps"]) == 2
+    assert found["steps"][-1]["excess"] < max(0.01 * first["excess"], 3e-4)
+
+
+def test_nothing_hidden_names_nothing(tmp_path, capsys):
+    captures = captured(capsys, tmp_path)
+    found = ran(capsys, "diagnose", captures, "--workers", 1)
+    assert found["verdict"] == "complete"
+    assert found["stage"] is None
+    assert not any(r["worth_adding"] for r in found["ranking"])
+    assert abs(found["heldout"]["excess"]) < 5e-5
+    assert [s["added"] for s in explained(capsys, captures, tmp_path)["steps"]] == [None]
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("phase_response", "pupil_aberration"),
+        ("distance", "ghost"),
+        ("crosstalk", "illumination", "distance"),
+        ("zero_order", "panel_wavefront", "laser_drift"),
+    ],
+    ids="+".join,
+)
+def test_several_effects_are_all_found(names, tmp_path, capsys):
+    captures = captured(capsys, tmp_path, *(ALONE[n] for n in names))
+    found = explained(capsys, captures, tmp_path)
+    kept = {s["added"] for s in found["steps"]} - {s.get("removed") for s in found["steps"]}
+    assert kept == set(names), found["steps"]
+    assert found["verdict"] == "complete"
+    assert found["steps"][-1]["excess"] < 0.02 * found["steps"][0]["excess"]
+
+
+OWN_EFFECTS = '''
+"""Two things that this bench does and the catalogue does not name."""
+import math
+import torch
+from trainer.effects import Parameter, effect
+
+@effect(stage="sensor", told_to="camera", parameters=[
+    Parameter("even", "1", scale=0.03, low=-1, high=1),
+    Parameter("odd", "1", scale=0.03, low=-1, high=1),
+    Parameter("period", "pixels", scale=0.3, absent=20.0, low=4, high=100, starts=(10.0, 14.0, 17.0, 21.0, 28.0)),
+    Parameter("angle", "rad", scale=0.03, low=-4, high=4, starts=tuple(math.pi * k / 12 for k in range(12))),
+])
+def cover_glass_fringes(sensor, even, odd, period, angle):
+    """Interference in the cover glass modulates the sensitivity."""
+    h, w = sensor.y.shape
+    along = sensor.x * w / 2 * torch.cos(angle) + sensor.y * h / 2 * torch.sin(angle)
+    turn = 2 * math.pi * along / period
+    return sensor.multiplied(1 + even * torch.cos(turn) + odd * torch.sin(turn))
+'''
+
+
+def test_what_the_catalogue_does_not_name_is_placed_and_then_explained_by_a_users_own_effect(tmp_path, capsys):
+    fringes = 'kind = "fringes"\ncontrast = 0.22\nperiod_px = 17\nangle_deg = 33\nchirp = 0.0'
+    captures = captured(capsys, tmp_path, fringes)
+    found = ran(capsys, "diagnose", captures, "--workers", 1)
+    assert (found["verdict"], found["stage"]) == ("outside_catalogue", "sensor")
+    assert not any(r["worth_adding"] for r in found["ranking"])
+
+    own = tmp_path / "own.py"
+    own.write_text(OWN_EFFECTS)
+    better = explained(capsys, captures, tmp_path, "--effects", own)
+    assert [s["added"] for s in better["steps"]] == [None, "cover_glass_fringes"]
+    assert better["verdict"] == "complete"
+    assert better["steps"][-1]["excess"] < 3e-4
+
+
+def test_specks_sit_on_the_panel(tmp_path, capsys):
+    captures = captured(capsys, tmp_path, 'kind = "specks"')
+    found = ran(capsys, "diagnose", captures, "--workers", 1)
+    assert (found["verdict"], found["stage"]) == ("outside_catalogue", "panel")
+
+
+def test_source_and_blur_look_alike_at_one_plane_and_part_at_three(tmp_path, capsys):
+    source = 'kind = "spatial_coherence"\nradius_mrad = 0.5'
+    captures = captured(capsys, tmp_path, source)
+    found = ran(capsys, "diagnose", captures, "--workers", 1)
+    best = found["ranking"][0]
+    assert {best["effect"], *best["indistinguishable_from"]} >= {"spatial_coherence", "sensor_blur"}
+    assert any("mm" in s for s in found["suggested_captures"])
+
+    (tmp_path / "three").mkdir()
+    captures = captured(capsys, tmp_path / "three", source, options=("--planes", "10,15,20", "--patterns", 6))
+    best = ran(capsys, "diagnose", captures, "--workers", 1)["ranking"][0]
+    assert best["effect"] == "spatial_coherence"
+    assert "sensor_blur" not in best["indistinguishable_from"]
+
+
+@pytest.mark.parametrize("name", ["ideal", "leak", "two", "colour", "outside"])
+def test_practice_sets_come_out_as_their_truth_says(name, shared, tmp_path, capsys):
+    truth = {
+        "ideal": [],
+        "leak": ["zero_order"],
+        "two": ["illumination", "phase_response"],
+        "colour": ["pupil_aberration"],
+        "outside": [],
+    }
+    captures = shared / "practice" / name
+    found = explained(capsys, captures, tmp_path)
+    assert sorted(s["added"] for s in found["steps"][1:]) == truth[name]
+    if name == "outside":
+        assert found["verdict"] == "outside_catalogue"
+        assert found["stage"] in ("panel", "sensor")
+    else:
+        assert found["verdict"] == "complete"
+        assert found["steps"][-1]["excess"] < 5e-4
+    if name == "ideal":
+        whole = ran(capsys, "compare", captures)
+        assert whole["heldout"]["excess"] < 5e-4
