@@ -178,9 +178,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _grid(given: Any, where: str) -> Grid:
-    wrong = InputError(
-        f"{MANIFEST}: the grid of {where} is not one that can be computed: export the bundle again"
-    )
+    wrong = InputError(f"{MANIFEST}: the grid of {where} cannot be computed: export the bundle again")
     if not isinstance(given, Mapping):
         raise wrong
 

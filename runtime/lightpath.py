@@ -24,6 +24,7 @@ import scipy.fft
 from array_api_compat import array_namespace
 
 from runtime.fft import fft, ifft, irfft2, rfft2
+from runtime.neighbours import mix_neighbours, mix_neighbours_adjoint
 from runtime.windows import put, ring, take
 
 Array = Any
@@ -126,9 +127,11 @@ def panel_spectrum(path: LightPath, phase: Array) -> Array:
     total = 0
     for i in range(sub[0]):
         mixed_rows = mix_neighbours(phase, ky[i, :], -2)
+        along_rows = 0
         for j in range(sub[1]):
             field = _panel_field(path, mix_neighbours(mixed_rows, kx[j, :], -1))
-            total = total + _offset(path, phase, sub, (i, j)) * _band_spectrum(path.grid, field)
+            along_rows = along_rows + _offset(path, phase, sub, j, 1) * _row_spectrum(path.grid, field)
+        total = total + _offset(path, phase, sub, i, 0) * _column_spectrum(path.grid, along_rows)
     return _aperture(path, phase, sub) * total / (sub[0] * sub[1])
 
 
@@ -197,8 +200,7 @@ def irradiance_and_pullback(path: LightPath, phase: Array) -> tuple[Array, Calla
 
 
 def back_propagated(path: LightPath, z: Array, mode: int = 0) -> Array:
-    """Field at the panel that a field [..., *grid.image_shape] in the image plane comes from: [..., H, W]
-    complex.
+    """Field at the panel [..., H, W] that a field in the image plane [..., *grid.image_shape] comes from.
 
     Adjoint of the way from the panel to one pupil mode's image, which is its inverse where the pupil passes
     all.
@@ -212,18 +214,6 @@ def back_propagated(path: LightPath, z: Array, mode: int = 0) -> Array:
         ramp = ramp * (turn[:, None] if axis == 0 else turn[None, :])
     spectrum = _aperture(path, xp.real(z), (1, 1)) * _image_field_adjoint(path, z * ramp, mode)
     return _band_spectrum_adjoint(path.grid, spectrum)
-
-
-def mix_neighbours(phase: Array, taps: Array, axis: int) -> Array:
-    """Weighted sum of each pixel and its neighbours along an axis; border pixels repeat beyond the border."""
-    xp = array_namespace(phase)
-    reach = (taps.shape[0] - 1) // 2
-    count = phase.shape[axis]
-    total = 0
-    for k in range(taps.shape[0]):
-        index = [min(max(i + k - reach, 0), count - 1) for i in range(count)]
-        total = total + taps[k] * xp.take(phase, _indices(phase, index), axis=axis)
-    return total
 
 
 def pixel_irradiance(path: LightPath, image: Array) -> Array:
@@ -282,16 +272,31 @@ def _panel_field(path: LightPath, phase: Array) -> Array:
 
 
 def _band_spectrum(grid: Grid, field: Array) -> Array:
-    rows, columns = _band_window(grid)
-    spectrum = take(fft(field, axis=-1, n=grid.padded[1]), columns, -1)
-    return take(fft(spectrum, axis=-2, n=grid.padded[0]), rows, -2)
+    return _column_spectrum(grid, _row_spectrum(grid, field))
+
+
+def _row_spectrum(grid: Grid, field: Array) -> Array:
+    """Spectrum along the rows alone, over the band's columns: [..., H, W] to [..., H, m]."""
+    return take(fft(field, axis=-1, n=grid.padded[1]), _band_window(grid)[1], -1)
+
+
+def _column_spectrum(grid: Grid, spectrum: Array) -> Array:
+    """Spectrum along the columns, over the band's rows: [..., H, m] to [..., n, m]."""
+    return take(fft(spectrum, axis=-2, n=grid.padded[0]), _band_window(grid)[0], -2)
 
 
 def _band_spectrum_adjoint(grid: Grid, spectrum: Array) -> Array:
-    rows, columns = _band_window(grid)
-    field = ifft(put(spectrum, rows, -2, grid.padded[0]), axis=-2)[..., : grid.shape[0], :]
-    field = ifft(put(field, columns, -1, grid.padded[1]), axis=-1)[..., :, : grid.shape[1]]
-    return field * (grid.padded[0] * grid.padded[1])
+    return _row_spectrum_adjoint(grid, _column_spectrum_adjoint(grid, spectrum))
+
+
+def _row_spectrum_adjoint(grid: Grid, spectrum: Array) -> Array:
+    padded = grid.padded[1]
+    return padded * ifft(put(spectrum, _band_window(grid)[1], -1, padded), axis=-1)[..., :, : grid.shape[1]]
+
+
+def _column_spectrum_adjoint(grid: Grid, spectrum: Array) -> Array:
+    padded = grid.padded[0]
+    return padded * ifft(put(spectrum, _band_window(grid)[0], -2, padded), axis=-2)[..., : grid.shape[0], :]
 
 
 def _image_field_adjoint(path: LightPath, z: Array, mode: int) -> Array:
@@ -320,30 +325,13 @@ def _panel_spectrum_adjoint(path: LightPath, phase: Array, spectrum: Array) -> A
     for i in range(sub[0]):
         mixed_rows = mix_neighbours(phase, ky[i, :], -2)
         row_gradient = 0
+        rows_back = _column_spectrum_adjoint(path.grid, xp.conj(_offset(path, phase, sub, i, 0)) * spectrum)
         for j in range(sub[1]):
             driven = mix_neighbours(mixed_rows, kx[j, :], -1)
-            back = _band_spectrum_adjoint(path.grid, xp.conj(_offset(path, phase, sub, (i, j))) * spectrum)
-            row_gradient = row_gradient + _mix_neighbours_adjoint(to_phase(back, driven), kx[j, :], -1)
-        total = total + _mix_neighbours_adjoint(row_gradient, ky[i, :], -2)
+            back = _row_spectrum_adjoint(path.grid, xp.conj(_offset(path, phase, sub, j, 1)) * rows_back)
+            row_gradient = row_gradient + mix_neighbours_adjoint(to_phase(back, driven), kx[j, :], -1)
+        total = total + mix_neighbours_adjoint(row_gradient, ky[i, :], -2)
     return total
-
-
-def _mix_neighbours_adjoint(gradient: Array, taps: Array, axis: int) -> Array:
-    xp = array_namespace(gradient)
-    reach = (taps.shape[0] - 1) // 2
-    moved = xp.moveaxis(gradient, axis, -1)
-    count = moved.shape[-1]
-    total = xp.zeros_like(moved)
-    for k in range(taps.shape[0]):
-        shift = k - reach
-        part = taps[k] * moved
-        first, last = max(0, shift), min(count, count + shift)
-        total[..., first:last] += part[..., first - shift : last - shift]
-        if shift < 0:
-            total[..., 0] += xp.sum(part[..., :-shift], axis=-1)
-        elif shift > 0:
-            total[..., -1] += xp.sum(part[..., count - shift :], axis=-1)
-    return xp.moveaxis(total, -1, axis)
 
 
 def _aperture(path: LightPath, like: Array, sub: tuple[int, int]) -> Array:
@@ -355,14 +343,14 @@ def _aperture(path: LightPath, like: Array, sub: tuple[int, int]) -> Array:
     return rows[:, None] * columns[None, :]
 
 
-def _offset(path: LightPath, like: Array, sub: tuple[int, int], index: tuple[int, int]) -> Array:
-    """Linear phase over the band that puts a sub-pixel where it is within the pixel's active area."""
+def _offset(path: LightPath, like: Array, sub: tuple[int, int], index: int, axis: int) -> Array:
+    """Linear phase over the band that puts a sub-pixel where it is within the pixel's active area, an axis:
+    [n, 1] or [1, m].
+    """
     xp = array_namespace(like)
-    fy, fx = band_frequencies(path.grid, like)
-    y, x = (
-        path.grid.pitch * path.aperture[axis] * ((index[axis] + 0.5) / sub[axis] - 0.5) for axis in (0, 1)
-    )
-    angle = -2 * math.pi * (fy[:, None] * y + fx[None, :] * x)
+    frequency = band_frequencies(path.grid, like)[axis]
+    place = path.grid.pitch * path.aperture[axis] * ((index + 0.5) / sub[axis] - 0.5)
+    angle = -2 * math.pi * place * (frequency[:, None] if axis == 0 else frequency[None, :])
     return xp.cos(angle) + 1j * xp.sin(angle)
 
 
@@ -382,8 +370,3 @@ def _image_window(grid: Grid) -> tuple[list[tuple[int, int]], list[tuple[int, in
     first = -FINE * grid.margin
     height, width = grid.image_shape
     return ring(first, height, FINE * grid.padded[0]), ring(first, width, FINE * grid.padded[1])
-
-
-def _indices(like: Array, index: list[int]) -> Array:
-    xp = array_namespace(like)
-    return xp.asarray(index)

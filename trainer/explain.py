@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,9 +13,9 @@ from trainer.captures import CaptureSet
 from trainer.diagnose import Diagnosis, Parts, Progress, diagnose, heldout_json, ideal_errors, parts_of, with_gains
 from trainer.effects.definition import Effect
 from trainer.effects.registry import Catalogue
-from trainer.evidence import load
+from trainer.evidence import Batch, load
 from trainer.excess import Errors, removed
-from trainer.fit import fit, raise_order
+from trainer.fit import Fitted, fit, raise_order
 from trainer.model import Model, Present
 from trainer.parameters import json_values, present_named
 from trainer.pool import Pool
@@ -115,11 +115,15 @@ def add_from(parts: Parts, model: Model, start: Present) -> Model:
     name = start.effect.name
     fitted = fit(model.having(start), [name], batches)
     fitted = raise_order(fitted, name, batches, least_for_order)
-    if len(fitted.model.names) > 1:
-        fitted = fit(fitted.model, fitted.model.names, batches)
-        for present in fitted.model.names:
-            fitted = raise_order(fitted, present, batches, least_for_order)
-    return fitted.model
+    return settled(fitted.model, batches).model if len(fitted.model.names) > 1 else fitted.model
+
+
+def settled(model: Model, batches: Sequence[Batch]) -> Fitted:
+    """The model with all of its effects fitted together, and their orders raised as far as that helps."""
+    fitted = fit(model, model.names, batches)
+    for name in model.names:
+        fitted = raise_order(fitted, name, batches, least_for_order, model.names)
+    return fitted
 
 
 def recorded(model: Model, name: str | None, errors: Errors, dropped: str | None = None) -> Model:
@@ -177,12 +181,13 @@ def explain(
         if save:
             save(model)
         slimmer = _without_needless(parts, model, errors, best.effect.name, thresholds, ideal.excess)
-        if slimmer is not None:
+        while slimmer is not None:
             dropped, model, errors = slimmer
             model = recorded(model, None, errors, dropped)
             steps.append(Step(None, errors, removed=dropped))
             if save:
                 save(model)
+            slimmer = _without_needless(parts, model, errors, best.effect.name, thresholds, ideal.excess)
     say(1.0, "done")
     return Explanation(tuple(steps), model, diagnoses[-1], tuple(diagnoses))
 
@@ -195,7 +200,9 @@ def _without_needless(
         if name == newest:
             continue
         rest = replace(model, present=tuple(p for p in model.present if p.effect.name != name))
-        fitted = fit(rest, rest.names, load(parts.captures, parts.fitted)).model
+        batches = load(parts.captures, parts.fitted)
+        unexplained = not thresholds.complete(errors.excess, ideal_excess)
+        fitted = (settled(rest, batches) if unexplained else fit(rest, rest.names, batches)).model
         without = evaluate_captures(parts.captures, parts.held_out, fitted)
         if not thresholds.worth_adding(removed(without, errors), ideal_excess, 1):
             return name, fitted, without

@@ -356,10 +356,17 @@ def _with_errors(model: Model, keys: tuple[tuple[str, str, int], ...], covarianc
     return model
 
 
-def raise_order(fitted: Fitted, name: str, batches: Sequence[Batch], gain_needed: Callable[[float], float]) -> Fitted:
+def raise_order(
+    fitted: Fitted,
+    name: str,
+    batches: Sequence[Batch],
+    gain_needed: Callable[[float], float],
+    free: Sequence[str] | None = None,
+) -> Fitted:
     """Raise the order of an effect's map or curve while the error keeps falling.
 
-    `gain_needed(excess)` is how much excess a higher order must remove to be kept.
+    `gain_needed(excess)` is how much excess a higher order must remove to be kept; `free` are the effects that are
+    refitted along, the effect alone by default.
     """
     while True:
         present = _present(fitted.model, name)
@@ -367,7 +374,7 @@ def raise_order(fitted: Fitted, name: str, batches: Sequence[Batch], gain_needed
         if not higher:
             return fitted
         trial = fitted.model.having(raised(present, fitted.model.bench, higher[0]))
-        better = fit(trial, [name], batches)
+        better = fit(trial, free or [name], batches, iterations=8)
         if fitted.errors.excess - better.errors.excess < gain_needed(fitted.errors.excess):
             return fitted
         fitted = better

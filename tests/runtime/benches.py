@@ -11,6 +11,17 @@ from runtime.lightpath import LightPath, band_frequencies, grid_for
 from runtime.propagation import band_limit, transfer_function
 
 PITCH, WAVELENGTH = 8e-6, 520e-9
+ARRAYS = (
+    "response",
+    "source",
+    "transfers",
+    "weights",
+    "gain",
+    "crosstalk",
+    "leak",
+    "aperture",
+    "irradiance_filter",
+)
 
 
 def ideal_path(
@@ -41,7 +52,7 @@ def ideal_path(
 def random_path(
     shape: tuple[int, int] = (24, 30), half_width: float = 0.8, dtype: type = np.float64, **without: None
 ) -> LightPath:
-    """Everything at once: gain, crosstalk, leak, three modes, an irradiance filter; `without` says what not."""
+    """Gain, crosstalk, leak, three modes, an irradiance filter, all at once; less what `without` names."""
     rng = np.random.default_rng(3)
     path = ideal_path(shape, 0.005, half_width)
     grid = path.grid
@@ -79,10 +90,7 @@ def converted(path: LightPath, dtype: type) -> LightPath:
             return tuple(one(part) for part in value)
         return np.asarray(value).astype(pair if np.iscomplexobj(value) else dtype)
 
-    names = (
-        "response", "source", "transfers", "weights", "gain", "crosstalk", "leak", "aperture", "irradiance_filter",
-    )  # fmt: skip
-    return replace(path, **{name: one(getattr(path, name)) for name in names})
+    return replace(path, **{name: one(getattr(path, name)) for name in ARRAYS})
 
 
 def torch_path(path: LightPath) -> LightPath:
@@ -94,17 +102,14 @@ def torch_path(path: LightPath) -> LightPath:
             return None
         return tuple(one(part) for part in value) if isinstance(value, tuple) else torch.as_tensor(value)
 
-    names = (
-        "response", "source", "transfers", "weights", "gain", "crosstalk", "leak", "aperture", "irradiance_filter",
-    )  # fmt: skip
-    return replace(path, **{name: one(getattr(path, name)) for name in names})
+    return replace(path, **{name: one(getattr(path, name)) for name in ARRAYS})
 
 
 def padded_irradiance(phase: np.ndarray, distance: float, oversampling: int = 4, pad: int = 3) -> np.ndarray:
     """What panel-sized pixels integrate, [H, W], of square pixels of this phase: an independent simulation.
 
-    Plain double-precision FFTs of the panel drawn on sub-pixels, each a square, `pad` times larger all round; the
-    exact transfer function of free space; only the panel's own band passes.
+    Plain double-precision FFTs of the panel drawn on sub-pixels, each a square, `pad` times larger all round;
+    the exact transfer function of free space; only the panel's own band passes.
     """
     height, width = phase.shape
     q = oversampling

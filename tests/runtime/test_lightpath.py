@@ -17,7 +17,6 @@ from runtime.lightpath import (
     image_field,
     irradiance,
     irradiance_and_pullback,
-    mix_neighbours,
     mode_irradiance,
     panel_phase,
     panel_spectrum,
@@ -25,6 +24,7 @@ from runtime.lightpath import (
     pixel_irradiance,
     pixel_irradiance_adjoint,
 )
+from runtime.neighbours import mix_neighbours
 from runtime.windows import put, ring, take
 from tests.runtime.benches import PITCH, converted, ideal_path, padded_irradiance, random_path, torch_path
 
@@ -60,7 +60,9 @@ def relative(a: np.ndarray, b: np.ndarray) -> float:
 def test_agrees_with_a_padded_propagation_of_the_panel_drawn_on_subpixels(
     distance: float, grain: float, most: float
 ) -> None:
-    """Share of the variance that differs; where light fills the band, what a bin of the iris's edge holds is seen."""
+    """Share of the variance that differs; where light fills the band, what a bin of the iris's edge holds is
+    seen.
+    """
     path = ideal_path((48, 64), distance)
     phase = gaussian_filter(np.random.default_rng(5).normal(size=(48, 64)), grain)
     phase *= 2 / phase.std()
@@ -84,7 +86,9 @@ def test_gray_levels_are_looked_up_and_scaled_over_the_panel() -> None:
 
 
 def test_energy_is_conserved_where_nothing_is_lost() -> None:
-    """Parseval: the whole fine grid holds the energy of all pixels, when the whole period of frequencies passes."""
+    """Parseval: the whole fine grid holds the energy of all pixels, when the whole period of frequencies
+    passes.
+    """
     shape, pitch = (20, 24), PITCH
     grid = grid_for(shape, pitch, 520e-9, 0.002, 1.0, margin=6)
     # Every frequency of the period once, and none twice: indices -n/2+1 .. n/2 of the band -n/2 .. n/2.
@@ -108,7 +112,9 @@ def test_energy_is_conserved_where_nothing_is_lost() -> None:
 
 
 def test_irradiance_needs_no_finer_grid() -> None:
-    """Four times finer samples of the same field, taken directly: equal where they coincide, and band-limited."""
+    """Four times finer samples of the same field, taken directly: equal where they coincide, and
+    band-limited.
+    """
     path = random_path((20, 24), irradiance_filter=None)
     grid, phase = path.grid, phases(random_path((20, 24)))
     spectrum = panel_spectrum(path, phase)
@@ -164,7 +170,9 @@ def test_neighbours_mix_towards_the_side_that_the_taps_say() -> None:
 
 @pytest.mark.parametrize("name", PATHS)
 def test_the_gradient_is_the_adjoint_of_the_derivative(name: str) -> None:
-    """<G, J d> = <J* G, d>, with J d by forward-mode differentiation, which shares nothing with the hand's adjoint."""
+    """<G, J d> = <J* G, d>, with J d by forward-mode differentiation, which shares nothing with the hand's
+    adjoint.
+    """
     path = PATHS[name]
     phase, direction = phases(path, 2), phases(path, 2, seed=4)
     gradient = np.random.default_rng(6).normal(size=(2, *path.grid.image_shape))
@@ -241,7 +249,7 @@ def test_back_propagation_is_the_adjoint_of_the_way_there() -> None:
 
 
 def test_back_propagated_light_makes_the_picture() -> None:
-    """A smooth picture of flat phase, far from the border: taken to the panel as a complex field, and shown."""
+    """A smooth picture of flat phase, far from the border: taken to the panel as a field, and shown."""
     path = ideal_path((64, 80), 0.006)
     y, x = (np.arange(n) / FINE - path.grid.margin for n in path.grid.image_shape)
     spot = np.exp(-((y[:, None] - 30) ** 2) / 120 - ((x[None, :] - 44) ** 2) / 150)

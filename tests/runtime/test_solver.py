@@ -1,8 +1,9 @@
-"""Patterns: judged by an independent propagation, through paths with everything, and rounded to gray levels."""
+"""Patterns: judged by an independent propagation, through paths with every fault, rounded to gray levels."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ def test_double_phase_shows_the_picture_where_the_iris_stops_its_chequerboard() 
 def test_more_iterations_never_give_a_worse_pattern(ideal: LightPath) -> None:
     target = scene(SHAPE, 2)
     qualities = [solve(ideal, target, n).quality.psnr_db for n in (0, 1, 2, 3, 5, 8, 13, 21, 40)]
-    assert all(b > a - 0.02 for a, b in zip(qualities[:-1], qualities[1:], strict=True))
+    assert all(b > a - 0.02 for a, b in pairwise(qualities))
     assert qualities[-1] > qualities[0] + 12
 
 
@@ -167,7 +168,7 @@ def test_quality_is_free_of_scale() -> None:
     ("target", "message"),
     [
         (np.ones((96, 100)), r"the target is 96 x 100 \(height x width\) and the panel 96 x 128"),
-        (np.ones(SHAPE + (3,)), "96 x 128 x 3"),
+        (np.ones((*SHAPE, 3)), "96 x 128 x 3"),
         (np.full(SHAPE, -1.0), "never below zero"),
         (np.full(SHAPE, np.nan), "non-finite"),
         (np.zeros(SHAPE), "all dark"),

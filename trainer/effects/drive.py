@@ -106,8 +106,8 @@ def _taps(width: Tensor, asymmetry: Tensor) -> Tensor:
         share = left / (left + right)
         return torch.where(x > 0, 1 - (1 - share) * falling, share * rising)
 
-    centre = (torch.arange(SUB_PIXELS, device=width.device) + 0.5) / SUB_PIXELS - 0.5
-    pixel = torch.arange(-REACH, REACH + 1, device=width.device)
+    centre = (torch.arange(SUB_PIXELS, dtype=width.dtype) + 0.5) / SUB_PIXELS - 0.5
+    pixel = torch.arange(-REACH, REACH + 1, dtype=width.dtype)
     distance = centre[:, None] - pixel[None, :]
     taps = below(distance + 0.5) - below(distance - 0.5)
     return taps / taps.sum(dim=1, keepdim=True)

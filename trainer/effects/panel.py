@@ -17,6 +17,7 @@ from trainer.starts import wavefront_starts
 @effect(
     stage="panel",
     told_to="display",
+    orders=(0, 2, 4),
     parameters=[
         Parameter(
             "leak_real", "1", scale=0.02, low=-1, high=1, about="in phase with gray level 0, of the modulated amplitude"
@@ -31,12 +32,26 @@ from trainer.starts import wavefront_starts
             high=1.0,
             about="lit share of a pixel's area, which also sets the pixel's aperture",
         ),
+        Parameter(
+            "leak_wavefront",
+            "rad",
+            scale=0.1,
+            low=-60,
+            high=60,
+            count=legendre_count,
+            about="Legendre terms of the leak's phase against the modulated light's: a first surface has its own shape",
+        ),
     ],
 )
-def zero_order(panel: Panel, leak_real: Tensor, leak_imaginary: Tensor, fill_factor: Tensor) -> Panel:
+def zero_order(
+    panel: Panel, leak_real: Tensor, leak_imaginary: Tensor, fill_factor: Tensor, leak_wavefront: Tensor
+) -> Panel:
     """Light that the pattern does not modulate: dead space between pixels, first-surface reflection."""
     side = torch.sqrt(fill_factor)
     leak = panel.source * torch.complex(leak_real, leak_imaginary)
+    if leak_wavefront.shape[0]:
+        phase = _smooth(panel, leak_wavefront)
+        leak = leak * torch.polar(torch.ones_like(phase), phase)
     return replace(panel.leaking(leak), aperture=torch.stack((side, side)))
 
 

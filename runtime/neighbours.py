@@ -1,0 +1,40 @@
+"""Pixels that hear their neighbours: weighted sums along an axis, and their adjoint, by the array API."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from array_api_compat import array_namespace
+
+Array = Any
+
+
+def mix_neighbours(phase: Array, taps: Array, axis: int) -> Array:
+    """Weighted sum of each pixel and its neighbours along an axis; border pixels repeat beyond the border."""
+    xp = array_namespace(phase)
+    reach = (taps.shape[0] - 1) // 2
+    count = phase.shape[axis]
+    total = 0
+    for k in range(taps.shape[0]):
+        index = [min(max(i + k - reach, 0), count - 1) for i in range(count)]
+        total = total + taps[k] * xp.take(phase, xp.asarray(index), axis=axis)
+    return total
+
+
+def mix_neighbours_adjoint(gradient: Array, taps: Array, axis: int) -> Array:
+    """Adjoint of `mix_neighbours`."""
+    xp = array_namespace(gradient)
+    reach = (taps.shape[0] - 1) // 2
+    moved = xp.moveaxis(gradient, axis, -1)
+    count = moved.shape[-1]
+    total = xp.zeros_like(moved)
+    for k in range(taps.shape[0]):
+        shift = k - reach
+        part = taps[k] * moved
+        first, last = max(0, shift), min(count, count + shift)
+        total[..., first:last] += part[..., first - shift : last - shift]
+        if shift < 0:
+            total[..., 0] += xp.sum(part[..., :-shift], axis=-1)
+        elif shift > 0:
+            total[..., -1] += xp.sum(part[..., count - shift :], axis=-1)
+    return xp.moveaxis(total, -1, axis)

@@ -1,0 +1,53 @@
+"""The demo: what it leaves behind, and that the display gets better by what was found."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from firmware_iface.errors import InputError
+from runtime.solver import quality
+from trainer.captures import read_captures
+from trainer.demo import run_demo
+from trainer.shown import Shown, display_section, with_display
+
+
+def test_a_folder_that_holds_something_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("keep me")
+    with pytest.raises(InputError, match="not an empty folder"):
+        run_demo(tmp_path)
+    with pytest.raises(InputError, match="not an empty folder"):
+        run_demo(tmp_path / "mine.txt")
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_the_display_goes_to_the_end_of_the_reports_main_part() -> None:
+    target = np.random.default_rng(0).random((12, 16))
+    light = 3 * target**1.1
+    shown = [Shown("a <picture>", target, {"before": light}, {"before": quality(light, target)})]
+    html = with_display("<main><p>x</p></main></body>", shown, "better & better")
+    assert html.index("<p>x</p>") < html.index("<section>") < html.index("</main>")
+    assert "better &amp; better" in html
+    assert html.count("data:image/png;base64,") == 2
+    assert "dB, nrmse" in html
+    assert with_display("no main", shown, "") == "no main" + display_section(shown, "")
+
+
+@pytest.mark.slow
+def test_the_quick_demo(tmp_path: Path) -> None:
+    told: list[float] = []
+    result = run_demo(tmp_path / "demo", quick=True, progress=lambda done, what: told.append(done))
+    assert set(result["found"]) == {"zero_order", "illumination", "phase_response"}
+    assert result["verdict"] == "complete"
+    display = {name: numbers["psnr_db"] for name, numbers in result["display"].items()}
+    assert display["after"] > display["before"] + 8
+    assert display["oracle"] > display["after"] - 0.5
+    assert told == sorted(told) and told[-1] == 1
+    assert len(read_captures(Path(result["captures"]))) > 5
+    page = Path(result["report"]).read_text(encoding="utf-8")
+    assert "What the display shows" in page
+    with Image.open(tmp_path / "demo" / "patterns" / "astronaut-after.png") as pattern:
+        assert pattern.mode == "L"
