@@ -33,6 +33,20 @@ def legendre_maps(y: Tensor, x: Tensor, order: int, lowest: int = 1) -> Tensor:
     )
 
 
+def legendre_surface(terms: Tensor, y: Tensor, x: Tensor, lowest: int = 1) -> Tensor:
+    """Sum of `terms` times `legendre_maps`, over the grid that y [H, W] (rows) and x [H, W] (columns) span: [H, W].
+
+    Two small matrix products instead of a stack of maps. The order follows from the number of terms.
+    """
+    order = next(n for n in range(64) if legendre_count(n, lowest) == terms.shape[0])
+    places = [(n - m, m) for n in range(lowest, order + 1) for m in range(n + 1)]
+    table = torch.zeros((order + 1, order + 1), dtype=terms.dtype)
+    if places:
+        rows, columns = (torch.tensor(k) for k in zip(*places, strict=True))
+        table = table.index_put((rows, columns), terms)
+    return legendre_curve(y[:, 0], order + 1).T @ table @ legendre_curve(x[0, :], order + 1)
+
+
 def zernike_indices(order: int, without_defocus: bool = False) -> list[tuple[int, int]]:
     """(n, m) of the Zernike polynomials from tilt (n = 1) to n = `order`, or without tilt and defocus."""
     every = [(n, m) for n in range(1, order + 1) for m in range(-n, n + 1, 2)]

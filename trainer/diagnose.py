@@ -176,8 +176,8 @@ def diagnose(
 ) -> Diagnosis:
     """What is missing from `model` on a capture set.
 
-    `ideal`: the ideal model's held-out errors, if they are known. `with_probes=False` leaves the stages' free-form
-    probes out, unless nothing named fits.
+    `ideal`: the ideal model's held-out errors, if they are known. `with_probes=False` leaves out what the verdict
+    does not need: the stages' free-form probes unless nothing named fits, and all of it for a complete model.
     """
     thresholds = thresholds or Thresholds()
     say = progress or (lambda done, what: None)
@@ -187,6 +187,9 @@ def diagnose(
     before = evaluate_captures(captures, parts.held_out, model)
     ideal_excess = (ideal or (before if not model.present else ideal_errors(parts, model))).excess
     complete = thresholds.complete(before.excess, ideal_excess)
+
+    if complete and not with_probes:
+        return Diagnosis(model, before, ideal_excess, "complete", None, (), (), (), thresholds)
 
     candidates = [e for e in known.values() if e.name not in model.names]
     screened = screen_all(parts, model, candidates, pool, say)

@@ -83,13 +83,13 @@ def raised(present: Present, bench: Bench, order: int) -> Present:
         blocks = _blocks(p, present.effect)
         source, target = old.reshape(-1), new.reshape(-1)
         rows = (len(bench.channels) if p.per_channel else 1) * blocks
-        if source.size:
+        if new.ndim == 0:
+            new = old.copy()
+        elif source.size:
             length, longer = source.size // rows, target.size // rows
             for k in range(rows):
                 target[k * longer : k * longer + length] = source[k * length : (k + 1) * length]
-        else:
-            target[:] = p.absent_value(bench)
-        values[p.name] = new if new.ndim else old.copy()
+        values[p.name] = new
     return replace(higher, values=values)
 
 

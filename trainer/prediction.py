@@ -200,8 +200,17 @@ def display_filter(stages: Stages) -> Tensor | None:
     return parts[0] if len(parts) == 1 else parts[0] * parts[1]
 
 
+@lru_cache(maxsize=16)
+def _bare_modes(scene: Scene) -> tuple[Tensor, Tensor]:
+    return _modes(scene, _bare(scene).pupil)
+
+
 def pupil_modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
-    """Transfer functions [M, n, m] and weights [M] of the pupil's modes."""
+    """Transfer functions [M, n, m] and weights [M] of the pupil's modes; kept where no effect touches the pupil."""
+    return _bare_modes(scene) if pupil is _bare(scene).pupil else _modes(scene, pupil)
+
+
+def _modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
     if pupil.lines is None:
         offsets, weights = torch.zeros(1, dtype=scene.dtype), torch.ones(1, dtype=scene.dtype)
     else:

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from runtime.lightpath import mode_irradiance, panel_phase, panel_spectrum
-from trainer.bases import legendre_count, legendre_curve, legendre_maps
+from trainer.bases import legendre_count, legendre_curve, legendre_surface
 from trainer.candidates import chosen, opened
 from trainer.captures import Capture
 from trainer.evidence import Batch, load, load_batch, scenes
@@ -200,13 +200,13 @@ def _drive(model: Model, batch: Batch) -> _Kind:
         knots = t["table"][channels.index(drive.channel)]
         bend = _interpolated(knots, drive.level * (drive.level.shape[0] / 256))
         moved = replace(drive, response=drive.response + bend)
-        moved = moved.scaled(1 + torch.tensordot(t["gain"], legendre_maps(y, x, SMOOTH_ORDER), dims=1))
+        moved = moved.scaled(1 + legendre_surface(t["gain"], y, x))
         if drive.crosstalk is None:
             moved = replace(moved, crosstalk=(taps + t["rows"], taps + t["columns"]))
         return replace(stages, drive=moved)
 
     def pictures(t: Tensors) -> list[Picture]:
-        gain = torch.tensordot(t["gain"], legendre_maps(y, x, SMOOTH_ORDER), dims=1)
+        gain = legendre_surface(t["gain"], y, x)
         return [
             *((f"response, deviation ({c})", _array(t["table"][k]), "rad") for k, c in enumerate(channels)),
             ("gain of the phase over the panel", _array(gain), "relative"),
@@ -280,7 +280,6 @@ def _sensor(model: Model, batch: Batch) -> _Kind:
     nodes = _nodes(height, width, "sensor")
     full_scale = model.bench.camera.full_scale
     y, x = _field(height, width)
-    smooth = legendre_maps(y, x, 3, 0)
     reach = (torch.arange(TAPS) - TAPS // 2) / 2
 
     def apply(stages: Stages, t: Tensors) -> Stages:
@@ -288,7 +287,7 @@ def _sensor(model: Model, batch: Batch) -> _Kind:
         gain = torch.exp(torch.clamp(_resized(t["gain"], (height, width)), -3, 3))
         moved = replace(sensor, free_capture_gain=True).multiplied(gain)
         moved = moved.brightened(full_scale * _resized(t["offset"], (height, width)))
-        moved = moved.displaced(*(torch.tensordot(t["shift"][k], smooth, dims=1) for k in (0, 1)))
+        moved = moved.displaced(*(legendre_surface(t["shift"][k], y, x, 0) for k in (0, 1)))
         kernel = t["kernel"]
         rows = 2 * math.pi * sensor.iy * reach
         columns = 2 * math.pi * sensor.ix.T * reach
@@ -305,7 +304,7 @@ def _sensor(model: Model, batch: Batch) -> _Kind:
         return replace(stages, sensor=moved.responding(curve))
 
     def pictures(t: Tensors) -> list[Picture]:
-        shift = torch.tensordot(t["shift"], smooth, dims=1)
+        shift = [legendre_surface(t["shift"][k], y, x, 0) for k in (0, 1)]
         share = torch.linspace(0, 1, 101)
         bend = share * (1 - share) * (t["bend"] @ legendre_curve(2 * share - 1, t["bend"].shape[0]))
         return [

@@ -161,6 +161,8 @@ def test_every_number_of_every_effect_has_a_derivative(name: str) -> None:
         value = (predicted(scene, stages_for(scene, (one,), {name: tensors})) * weight).sum()
         value.backward()
         for p in one.effect.parameters:
+            if tensors[p.name].numel() == 0:  # a map that has no terms at the lowest order
+                continue
             slope = tensors[p.name].grad
             assert slope is not None, p.name
             assert torch.isfinite(slope).all(), p.name

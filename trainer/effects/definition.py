@@ -53,8 +53,8 @@ class Parameter:
 
     def shape(self, order: int, channels: int) -> tuple[int, ...]:
         """Shape of the parameter's values for an order and a number of colours."""
-        count = self.count(order) if callable(self.count) else self.count
-        return (*((channels,) if self.per_channel else ()), *((count,) if count else ()))
+        row = (self.count(order),) if callable(self.count) else (self.count,) if self.count else ()
+        return (*((channels,) if self.per_channel else ()), *row)
 
     @property
     def key(self) -> str:

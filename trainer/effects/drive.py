@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from trainer.bases import legendre_count, legendre_curve, legendre_maps
+from trainer.bases import legendre_count, legendre_curve, legendre_surface
 from trainer.effects.definition import Parameter, effect
 from trainer.stages import Drive
 
@@ -69,8 +69,7 @@ def phase_response(drive: Drive, gain: Tensor, curvature: Tensor) -> Drive:
 )
 def phase_nonuniformity(drive: Drive, map: Tensor) -> Drive:
     """The phase's gain varies over the panel, as the cell's thickness does."""
-    order = _order_of(map.shape[0])
-    return drive.scaled(1 + torch.tensordot(map, legendre_maps(drive.y, drive.x, order), dims=1))
+    return drive.scaled(1 + legendre_surface(map, drive.y, drive.x))
 
 
 @effect(
@@ -112,7 +111,3 @@ def _taps(width: Tensor, asymmetry: Tensor) -> Tensor:
     taps = below(distance + 0.5) - below(distance - 0.5)
     return taps / taps.sum(dim=1, keepdim=True)
 
-
-def _order_of(count: int) -> int:
-    """Order of a full set of Legendre products without the constant."""
-    return next(n for n in range(1, 40) if legendre_count(n) == count)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from trainer.bases import legendre_count, legendre_maps
+from trainer.bases import legendre_count, legendre_surface
 from trainer.effects.definition import Parameter, effect
 from trainer.stages import Panel
 from trainer.starts import wavefront_starts
@@ -50,7 +49,7 @@ def zero_order(
     side = torch.sqrt(fill_factor)
     leak = panel.source * torch.complex(leak_real, leak_imaginary)
     if leak_wavefront.shape[0]:
-        phase = _smooth(panel, leak_wavefront)
+        phase = legendre_surface(leak_wavefront, panel.y, panel.x)
         leak = leak * torch.polar(torch.ones_like(phase), phase)
     return replace(panel.leaking(leak), aperture=torch.stack((side, side)))
 
@@ -73,7 +72,7 @@ def zero_order(
 )
 def illumination(panel: Panel, log_amplitude: Tensor) -> Panel:
     """The beam that lights the panel is not uniform."""
-    return panel.multiplied(torch.exp(_smooth(panel, log_amplitude)))
+    return panel.multiplied(torch.exp(legendre_surface(log_amplitude, panel.y, panel.x)))
 
 
 @effect(
@@ -95,10 +94,6 @@ def illumination(panel: Panel, log_amplitude: Tensor) -> Panel:
 )
 def panel_wavefront(panel: Panel, wavefront: Tensor) -> Panel:
     """The beam or the panel is not flat."""
-    phase = _smooth(panel, wavefront) * (panel.reference_wavelength / panel.wavelength)
+    phase = legendre_surface(wavefront, panel.y, panel.x) * (panel.reference_wavelength / panel.wavelength)
     return panel.multiplied(torch.polar(torch.ones_like(phase), phase))
 
-
-def _smooth(panel: Panel, terms: Tensor) -> Tensor:
-    order = round((math.sqrt(9 + 8 * terms.shape[0]) - 3) / 2)
-    return torch.tensordot(terms, legendre_maps(panel.y, panel.x, order), dims=1)

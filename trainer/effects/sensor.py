@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from trainer.bases import legendre_count, legendre_curve, legendre_maps
+from trainer.bases import legendre_count, legendre_curve, legendre_surface
 from trainer.effects.definition import Parameter, effect
 from trainer.effects.pupil import kernel_transfer
 from trainer.stages import Sensor
@@ -68,13 +68,13 @@ def misregistration(
     y, x = sensor.y * half_height, sensor.x * half_width
     angle, size = 1e-3 * rotation, 1e-2 * magnification
     dy, dx = shift_y + size * y + angle * x, shift_x + size * x - angle * y
-    order = next(n for n in range(1, 40) if 2 * (legendre_count(n) - 1) == distortion.shape[0])
-    # What an affine map does is held above, but for one share of it: stretch of rows against columns.
-    maps = legendre_maps(sensor.y, sensor.x, order)[1:]
-    rows, columns = distortion.reshape(2, -1)
-    return sensor.displaced(
-        dy + torch.tensordot(rows, maps, dims=1), dx + torch.tensordot(columns, maps, dims=1)
+    # What an affine map does is held above, but for one share of it: stretch of rows against columns. So the first
+    # term, P1(y), is left out.
+    rows, columns = (
+        legendre_surface(torch.cat((torch.zeros_like(part[:1]), part)), sensor.y, sensor.x)
+        for part in distortion.reshape(2, -1)
     )
+    return sensor.displaced(dy + rows, dx + columns)
 
 
 @effect(
@@ -89,9 +89,7 @@ def misregistration(
 )
 def vignetting(sensor: Sensor, log_gain: Tensor) -> Sensor:
     """The camera's sensitivity falls off over the field."""
-    order = round((math.sqrt(9 + 8 * log_gain.shape[0]) - 3) / 2)
-    maps = legendre_maps(sensor.y, sensor.x, order)
-    return sensor.multiplied(torch.exp(torch.tensordot(log_gain, maps, dims=1)))
+    return sensor.multiplied(torch.exp(legendre_surface(log_gain, sensor.y, sensor.x)))
 
 
 @effect(
@@ -112,8 +110,7 @@ def vignetting(sensor: Sensor, log_gain: Tensor) -> Sensor:
 )
 def stray_light(sensor: Sensor, counts: Tensor) -> Sensor:
     """Light is simply added, smooth over the picture."""
-    order = round((math.sqrt(1 + 8 * counts.shape[0]) - 3) / 2)
-    return sensor.brightened(torch.tensordot(counts, legendre_maps(sensor.y, sensor.x, order, 0), dims=1))
+    return sensor.brightened(legendre_surface(counts, sensor.y, sensor.x, lowest=0))
 
 
 @effect(
