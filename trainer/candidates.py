@@ -145,7 +145,7 @@ def placed(effect: Effect, bench: Bench, values: dict[str, Any]) -> Present:
     full = dict(base.values)
     for name, value in values.items():
         p = effect.parameter(name)
-        full[name] = np.clip(np.asarray(value, dtype=float), p.low, p.high).reshape(base.values[name].shape)
+        full[name] = np.array(np.clip(value, p.low, p.high), dtype=float).reshape(base.values[name].shape)
     return base.with_values(full)
 
 

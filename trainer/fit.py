@@ -249,7 +249,7 @@ def stepped(model: Model, key: tuple[str, str, int], change: float) -> Model:
     name, parameter, index = key
     present = _present(model, name)
     p = present.effect.parameter(parameter)
-    values = present.values[parameter].copy()
+    values = np.array(present.values[parameter], dtype=float)
     flat = values.reshape(-1)
     flat[index] = min(max(flat[index] + change, p.low), p.high)
     return model.having(replace(present, values={**present.values, parameter: values}))

@@ -95,7 +95,7 @@ def vignetting(sensor: Sensor, log_gain: Tensor) -> Sensor:
 @effect(
     stage="sensor",
     told_to="camera",
-    orders=(1, 2, 4),
+    orders=(1, 2, 4, 6, 8),
     parameters=[
         Parameter(
             "counts",
