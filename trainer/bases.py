@@ -28,9 +28,7 @@ def legendre_count(order: int, lowest: int = 1) -> int:
 def legendre_maps(y: Tensor, x: Tensor, order: int, lowest: int = 1) -> Tensor:
     """Products P_i(y) P_j(x), lowest <= i + j <= order, y and x in -1 .. 1 (broadcast): [count, rows, columns]."""
     rows, columns = legendre_curve(y, order + 1), legendre_curve(x, order + 1)
-    return torch.stack(
-        [rows[n - m] * columns[m] for n in range(lowest, order + 1) for m in range(n + 1)]
-    )
+    return torch.stack([rows[n - m] * columns[m] for n in range(lowest, order + 1) for m in range(n + 1)])
 
 
 def legendre_surface(terms: Tensor, y: Tensor, x: Tensor, lowest: int = 1) -> Tensor:

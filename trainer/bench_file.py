@@ -92,7 +92,7 @@ class Camera:
     @property
     def saturation(self) -> int:
         """The top count; a pixel that shows it says nothing."""
-        return 2 ** self.bit_depth - 1
+        return 2**self.bit_depth - 1
 
     @property
     def full_scale(self) -> float:
@@ -151,7 +151,8 @@ class _Key:
 
 _TABLES: dict[str, dict[str, _Key]] = {
     "panel": {
-        "width": _Key(int, 2, 16384), "height": _Key(int, 2, 16384),
+        "width": _Key(int, 2, 16384),
+        "height": _Key(int, 2, 16384),
         "pitch_um": _Key(float, 0.05, 1000, unit="um"),
         "levels": _Key(int, 2, 65536, default=256),
         "fill_factor": _Key(float, 0, 1, above=True, default=1.0),
@@ -159,10 +160,13 @@ _TABLES: dict[str, dict[str, _Key]] = {
     },
     "channel": {"name": _Key(str), "wavelength_nm": _Key(float, 100, 20000, unit="nm")},
     "propagation": {"distance_mm": _Key(float, -1e4, 1e4, unit="mm")},
-    "iris": {"shape": _Key(str, choices=("square", "circle"), default="square"),
-             "half_width": _Key(float, 0, 4, above=True, default=1.0)},
+    "iris": {
+        "shape": _Key(str, choices=("square", "circle"), default="square"),
+        "half_width": _Key(float, 0, 4, above=True, default=1.0),
+    },
     "camera": {
-        "width": _Key(int, 2, 16384), "height": _Key(int, 2, 16384),
+        "width": _Key(int, 2, 16384),
+        "height": _Key(int, 2, 16384),
         "pixel_um": _Key(float, 0.05, 1000, unit="um"),
         "registered": _Key(bool),
         "bit_depth": _Key(int, 4, 16),
@@ -204,10 +208,15 @@ def bench_tables(bench: Bench) -> dict[str, Any]:
         del camera["homography"]
     else:
         camera["homography"] = [list(row) for row in camera["homography"]]
-    return {"schema": 1, "name": bench.name, "panel": panel,
-            "channel": [dict(vars(c)) for c in bench.channels],
-            "propagation": {"distance_mm": bench.distance_mm}, "iris": dict(vars(bench.iris)),
-            "camera": camera}
+    return {
+        "schema": 1,
+        "name": bench.name,
+        "panel": panel,
+        "channel": [dict(vars(c)) for c in bench.channels],
+        "propagation": {"distance_mm": bench.distance_mm},
+        "iris": dict(vars(bench.iris)),
+        "camera": camera,
+    }
 
 
 def _bench(tables: Mapping[str, Any]) -> Bench:
@@ -221,8 +230,9 @@ def _bench(tables: Mapping[str, Any]) -> Bench:
     panel = Panel(**_table("panel", tables.get("panel")))
     rows = tables.get("channel")
     if not isinstance(rows, (list, tuple)) or not rows:
-        raise InputError("bench.toml has no [[channel]]: add one with a name and a wavelength_nm for each "
-                         "colour")
+        raise InputError(
+            "bench.toml has no [[channel]]: add one with a name and a wavelength_nm for each colour"
+        )
     channels = tuple(Channel(**_table("channel", row)) for row in rows)
     names = [c.name for c in channels]
     for channel in names:
@@ -237,25 +247,33 @@ def _bench(tables: Mapping[str, Any]) -> Bench:
 def _camera(values: dict[str, Any], panel: Panel) -> Camera:
     camera = Camera(**{**values, "homography": None})
     if camera.black_level >= camera.saturation:
-        raise InputError(f"camera.black_level is {camera.black_level:g}, but bit_depth = {camera.bit_depth} "
-                         f"ends at {camera.saturation}: write the dark picture's mean count")
+        raise InputError(
+            f"camera.black_level is {camera.black_level:g}, but bit_depth = {camera.bit_depth} "
+            f"ends at {camera.saturation}: write the dark picture's mean count"
+        )
     if camera.read_noise_e >= camera.full_well_e:
-        raise InputError(f"camera.read_noise_e is {camera.read_noise_e:g}, not below full_well_e = "
-                         f"{camera.full_well_e:g}: write both in electrons")
+        raise InputError(
+            f"camera.read_noise_e is {camera.read_noise_e:g}, not below full_well_e = "
+            f"{camera.full_well_e:g}: write both in electrons"
+        )
     given = values.get("homography")
     if camera.registered:
         if given is not None:
-            raise InputError("camera.homography is given with registered = true: "
-                             "take it out, or write registered = false")
+            raise InputError(
+                "camera.homography is given with registered = true: take it out, or write registered = false"
+            )
         if camera.shape != panel.shape:
             raise InputError(
                 f"camera.width and height are {camera.width} x {camera.height} but the panel's are "
                 f"{panel.width} x {panel.height}, though registered = true says that they are the same "
-                "pixels: turn or crop the images, or write registered = false with a homography")
+                "pixels: turn or crop the images, or write registered = false with a homography"
+            )
         return camera
     if given is None:
-        raise InputError("camera.homography is missing: with registered = false, give the 3 x 3 matrix from "
-                         "the centre of a camera pixel (x, y, 1) to panel pixels")
+        raise InputError(
+            "camera.homography is missing: with registered = false, give the 3 x 3 matrix from "
+            "the centre of a camera pixel (x, y, 1) to panel pixels"
+        )
     return Camera(**{**values, "homography": _matrix(given)})
 
 
@@ -263,8 +281,10 @@ def _matrix(given: Any) -> Matrix:
     rows = given
     if isinstance(given, (list, tuple)) and len(given) == 9:
         rows = [given[0:3], given[3:6], given[6:9]]
-    wrong = InputError("camera.homography is not an invertible 3 x 3 matrix of finite numbers: "
-                       "write [[a, b, c], [d, e, f], [g, h, i]], one list a row")
+    wrong = InputError(
+        "camera.homography is not an invertible 3 x 3 matrix of finite numbers: "
+        "write [[a, b, c], [d, e, f], [g, h, i]], one list a row"
+    )
     if not isinstance(rows, (list, tuple)) or len(rows) != 3:
         raise wrong
     flat: list[float] = []
@@ -277,7 +297,7 @@ def _matrix(given: Any) -> Matrix:
             flat.append(float(value))
     a, b, c, d, e, f, g, h, i = flat
     scale = max(map(abs, flat)) or 1.0
-    if abs(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)) <= 1e-15 * scale ** 3:
+    if abs(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)) <= 1e-15 * scale**3:
         raise wrong
     return (a, b, c), (d, e, f), (g, h, i)
 
@@ -290,8 +310,9 @@ def _table(table: str, given: Any) -> dict[str, Any]:
         raise InputError(f"bench.toml has no table {header}: add it with {', '.join(keys)}")
     for key in given:
         if key not in keys:
-            raise InputError(f"{table}.{str(key)[:60]} is not known in bench.toml: "
-                             f"{_suggest(key, tuple(keys))}")
+            raise InputError(
+                f"{table}.{str(key)[:60]} is not known in bench.toml: {_suggest(key, tuple(keys))}"
+            )
     return {key: _value(f"{table}.{key}", rule, given.get(key)) for key, rule in keys.items()}
 
 

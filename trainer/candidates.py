@@ -149,9 +149,7 @@ def placed(effect: Effect, bench: Bench, values: dict[str, Any]) -> Present:
     return base.with_values(full)
 
 
-def _one_step_ahead(
-    model: Model, predictors: list[Predictor], points: list[Trace], start: Present
-) -> float:
+def _one_step_ahead(model: Model, predictors: list[Predictor], points: list[Trace], start: Present) -> float:
     """Squared error that a straight-line step from a start would leave."""
     trial = model.having(start)
     return _remaining(*_stacked(trial, keys_of(trial, [start.effect.name]), predictors, points))

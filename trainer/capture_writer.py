@@ -49,12 +49,22 @@ class CaptureWriter:
             (self._work / "image").mkdir()
             (self._work / "bench.toml").write_text(toml_text(self.tables), encoding="utf-8")
         except OSError as error:
-            raise InputError(f"{self.folder} cannot be made ({error.strerror}): "
-                             "choose another folder") from None
+            raise InputError(
+                f"{self.folder} cannot be made ({error.strerror}): choose another folder"
+            ) from None
 
-    def add(self, gray: np.ndarray, counts: np.ndarray, channel: str, capture: str | None = None,
-            plane_mm: float | None = None, pattern: str | None = None, exposure_ms: float = 1.0,
-            time_s: float | None = None, **extra: Any) -> str:
+    def add(
+        self,
+        gray: np.ndarray,
+        counts: np.ndarray,
+        channel: str,
+        capture: str | None = None,
+        plane_mm: float | None = None,
+        pattern: str | None = None,
+        exposure_ms: float = 1.0,
+        time_s: float | None = None,
+        **extra: Any,
+    ) -> str:
         """Writes one capture and returns its id.
 
         gray : uint8 [H, W], gray levels sent; counts : uint16 [h, w], raw camera counts
@@ -74,23 +84,33 @@ class CaptureWriter:
         for column, value in (("plane_mm", plane), ("exposure_ms", exposure_ms), ("time_s", time)):
             if not math.isfinite(value):
                 raise InputError(f"capture {name} has {column} = {value}: give a finite number")
-        row = {"capture": name, "channel": channel, "plane_mm": repr(plane), "pattern": pattern or name,
-               "phase": f"phase/{index:04d}.png", "image": f"image/{index:04d}.png",
-               "exposure_ms": repr(float(exposure_ms)), "time_s": repr(time)}
+        row = {
+            "capture": name,
+            "channel": channel,
+            "plane_mm": repr(plane),
+            "pattern": pattern or name,
+            "phase": f"phase/{index:04d}.png",
+            "image": f"image/{index:04d}.png",
+            "exposure_ms": repr(float(exposure_ms)),
+            "time_s": repr(time),
+        }
         row |= {column: str(value) for column, value in extra.items()}
         for column, text in row.items():
             if column in COLUMNS[:4] and not (text.strip() == text != ""):
-                raise InputError(f"capture {name} has {column} = {text!r}: give text without spaces around "
-                                 "it")
+                raise InputError(
+                    f"capture {name} has {column} = {text!r}: give text without spaces around it"
+                )
         gray = _whole(gray, self.bench.panel.shape, 255, f"the pattern of capture {name}")
-        counts = _whole(counts, self.bench.camera.shape, self.bench.camera.saturation, "the image of "
-                                                                                       f"capture {name}")
+        counts = _whole(
+            counts, self.bench.camera.shape, self.bench.camera.saturation, f"the image of capture {name}"
+        )
         try:
             Image.fromarray(gray.astype(np.uint8)).save(self._work / row["phase"], compress_level=3)
             Image.fromarray(counts.astype(np.uint16)).save(self._work / row["image"], compress_level=1)
         except OSError as error:
-            raise InputError(f"capture {name} cannot be written ({error.strerror}): "
-                             "make room on the disk") from None
+            raise InputError(
+                f"capture {name} cannot be written ({error.strerror}): make room on the disk"
+            ) from None
         self._ids.add(name)
         self._rows.append(row)
         return name
@@ -99,15 +119,17 @@ class CaptureWriter:
         """Adds a text file, such as truth.json, to the set. Raises InputError if the set has it already."""
         path = self._work / name
         if Path(name).name != name or path.exists() or name in ("captures.csv", ""):
-            raise InputError(f"{name!r} cannot be attached: choose a plain file name that the set does not "
-                             "use")
+            raise InputError(
+                f"{name!r} cannot be attached: choose a plain file name that the set does not use"
+            )
         path.write_text(text, encoding="utf-8")
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None,
-                 trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
         try:
             if kind is None:
                 self._finish()
@@ -135,12 +157,14 @@ class CaptureWriter:
     def _refuse_existing(self) -> None:
         path = self.folder
         if (path.exists() or path.is_symlink()) and not (path.is_dir() and not any(path.iterdir())):
-            raise InputError(f"{path} exists already and is not empty: choose another folder, or remove it "
-                             "first")
+            raise InputError(
+                f"{path} exists already and is not empty: choose another folder, or remove it first"
+            )
 
 
-def write_captures(folder: Path | str, bench: Bench | Mapping[str, Any],
-                   rows: Iterable[Mapping[str, Any]]) -> Path:
+def write_captures(
+    folder: Path | str, bench: Bench | Mapping[str, Any], rows: Iterable[Mapping[str, Any]]
+) -> Path:
     """Writes a capture set from an iterator of rows, each with the arguments of `CaptureWriter.add`.
 
     Returns the folder. Raises InputError as the writer does; then no folder is left behind.
@@ -153,8 +177,11 @@ def write_captures(folder: Path | str, bench: Bench | Mapping[str, Any],
 
 def toml_text(tables: Mapping[str, Any]) -> str:
     """TOML for the tables of a bench: plain values first, then one table each, lists of tables as [[...]]."""
-    lines = [f"{key} = {_literal(value)}" for key, value in tables.items()
-             if not isinstance(value, Mapping) and key != "channel"]
+    lines = [
+        f"{key} = {_literal(value)}"
+        for key, value in tables.items()
+        if not isinstance(value, Mapping) and key != "channel"
+    ]
     for key, value in tables.items():
         if isinstance(value, Mapping):
             lines += ["", f"[{key}]", *(f"{k} = {_literal(v)}" for k, v in value.items())]

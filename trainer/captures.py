@@ -28,8 +28,22 @@ from trainer.bench_file import Bench, Camera, Channel, Iris, Panel, bench_tables
 from trainer.capture_writer import CaptureWriter, write_captures
 
 __all__ = [
-    "Bench", "Camera", "Capture", "CaptureSet", "CaptureWriter", "Channel", "Iris", "Panel", "PictureError",
-    "RowFault", "bench_tables", "read_bench", "read_captures", "read_picture", "scan_rows", "write_captures",
+    "Bench",
+    "Camera",
+    "Capture",
+    "CaptureSet",
+    "CaptureWriter",
+    "Channel",
+    "Iris",
+    "Panel",
+    "PictureError",
+    "RowFault",
+    "bench_tables",
+    "read_bench",
+    "read_captures",
+    "read_picture",
+    "scan_rows",
+    "write_captures",
 ]
 
 REQUIRED = ("capture", "channel", "phase", "image")
@@ -124,7 +138,8 @@ class CaptureSet:
             raise InputError(
                 f"{what} has counts up to {top}, but camera.bit_depth = {camera.bit_depth} ends at "
                 f"{camera.saturation}: shift the counts down if they sit in the top bits, "
-                "or correct bit_depth")
+                "or correct bit_depth"
+            )
         return counts
 
     def signal(self, capture: Capture) -> tuple[np.ndarray, np.ndarray]:
@@ -133,8 +148,9 @@ class CaptureSet:
         Raises InputError as `counts` does.
         """
         counts = self.counts(capture)
-        return counts.astype(np.float32) - np.float32(self.bench.camera.black_level), \
-            counts < self.bench.camera.saturation
+        return counts.astype(np.float32) - np.float32(
+            self.bench.camera.black_level
+        ), counts < self.bench.camera.saturation
 
     def noise_variance(self, signal: Any) -> Any:
         """Variance that the camera's noise gives a signal of counts above black, counts^2, same shape.
@@ -177,35 +193,61 @@ def read_picture(path: Path, shape: tuple[int, int], bits: int, what: str) -> np
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise PictureError("missing_file", f"{what} cannot be read at {path} ({error.strerror}): "
-                           "put the file back") from None
+        raise PictureError(
+            "missing_file", f"{what} cannot be read at {path} ({error.strerror}): put the file back"
+        ) from None
     try:
         with Image.open(io.BytesIO(data), formats=["PNG"]) as picture:
             mode, size = picture.mode, (picture.size[1], picture.size[0])
             picture.verify()  # every chunk's checksum; decoding alone does not look at those of the pixels
-    except (OSError, ValueError, SyntaxError, KeyError, IndexError, EOFError, zlib.error, MemoryError,
-            Image.DecompressionBombError, OverflowError) as error:
-        raise PictureError("unreadable", f"{what} is not a whole PNG at {path} ({_short(error)}): "
-                           "write the file again") from None
+    except (
+        OSError,
+        ValueError,
+        SyntaxError,
+        KeyError,
+        IndexError,
+        EOFError,
+        zlib.error,
+        MemoryError,
+        Image.DecompressionBombError,
+        OverflowError,
+    ) as error:
+        raise PictureError(
+            "unreadable", f"{what} is not a whole PNG at {path} ({_short(error)}): write the file again"
+        ) from None
     if PNG_END not in data:  # which Pillow does not miss
         raise PictureError("unreadable", f"{what} is cut off at its end at {path}: write the file again")
     depth = {"L": 8, "I;16": 16, "I;16B": 16, "I": 16}.get(mode)
     if depth is None or (bits and depth != bits):
         kind = f"{depth}-bit gray" if depth else f"of mode {mode}"
-        raise PictureError("bit_depth" if depth else "unreadable",
-                           f"{what} at {path} is {kind}: save it as {bits or '8 or 16'}-bit gray PNG, "
-                           "unscaled")
+        raise PictureError(
+            "bit_depth" if depth else "unreadable",
+            f"{what} at {path} is {kind}: save it as {bits or '8 or 16'}-bit gray PNG, unscaled",
+        )
     if size != tuple(shape):
-        raise PictureError("wrong_size", f"{what} at {path} is {size[0]} x {size[1]} (height x width), but "
-                           f"bench.toml says {shape[0]} x {shape[1]}: correct the file or bench.toml")
+        raise PictureError(
+            "wrong_size",
+            f"{what} at {path} is {size[0]} x {size[1]} (height x width), but "
+            f"bench.toml says {shape[0]} x {shape[1]}: correct the file or bench.toml",
+        )
     try:
         with Image.open(io.BytesIO(data), formats=["PNG"]) as picture:
             picture.load()
             pixels = np.array(picture)
-    except (OSError, ValueError, SyntaxError, KeyError, IndexError, EOFError, zlib.error, MemoryError,
-            OverflowError) as error:
-        raise PictureError("unreadable", f"{what} is not a whole PNG at {path} ({_short(error)}): "
-                           "write the file again") from None
+    except (
+        OSError,
+        ValueError,
+        SyntaxError,
+        KeyError,
+        IndexError,
+        EOFError,
+        zlib.error,
+        MemoryError,
+        OverflowError,
+    ) as error:
+        raise PictureError(
+            "unreadable", f"{what} is not a whole PNG at {path} ({_short(error)}): write the file again"
+        ) from None
     return pixels.astype(np.uint8 if bits == 8 else np.uint16, copy=False)
 
 
@@ -234,11 +276,22 @@ def scan_rows(folder: Path, bench: Bench) -> tuple[list[Capture], list[RowFault]
         text = path.read_text(encoding="utf-8-sig")
         table = list(csv.reader(io.StringIO(text, newline=""), strict=True))
     except OSError as error:
-        return [], [RowFault("unreadable", "", f"{path} cannot be read ({error.strerror}): "
-                             "a capture set needs a captures.csv with one row a capture")]
+        return [], [
+            RowFault(
+                "unreadable",
+                "",
+                f"{path} cannot be read ({error.strerror}): "
+                "a capture set needs a captures.csv with one row a capture",
+            )
+        ]
     except (UnicodeDecodeError, csv.Error) as error:
-        return [], [RowFault("unreadable", "", f"{path} is not a comma-separated UTF-8 table "
-                             f"({_short(error)}): save it again as CSV, UTF-8")]
+        return [], [
+            RowFault(
+                "unreadable",
+                "",
+                f"{path} is not a comma-separated UTF-8 table ({_short(error)}): save it again as CSV, UTF-8",
+            )
+        ]
     numbered = [(n, row) for n, row in enumerate(table, 1) if any(cell.strip() for cell in row)]
     header = [cell.strip() for cell in numbered[0][1]] if numbered else []
     fault = _header_fault(path, header, len(numbered))
@@ -252,13 +305,25 @@ def scan_rows(folder: Path, bench: Bench) -> tuple[list[Capture], list[RowFault]
         name = cells.get("capture", "")
         where = f"captures.csv row {number} (capture {name})" if name else f"captures.csv row {number}"
         if len(row) != len(header):
-            faults.append(RowFault("unreadable", name, f"{where} has {len(row)} cells, but the header has "
-                                   f"{len(header)}: put the row right, with quotes around text with commas"))
+            faults.append(
+                RowFault(
+                    "unreadable",
+                    name,
+                    f"{where} has {len(row)} cells, but the header has "
+                    f"{len(header)}: put the row right, with quotes around text with commas",
+                )
+            )
             continue
         capture, wrong = _row(folder, bench, cells, where, len(captures))
         if name in seen:
-            wrong.insert(0, RowFault("duplicate", name, f"{where} repeats the id of an earlier row: "
-                                     "give every capture its own id"))
+            wrong.insert(
+                0,
+                RowFault(
+                    "duplicate",
+                    name,
+                    f"{where} repeats the id of an earlier row: give every capture its own id",
+                ),
+            )
         seen.add(name)
         faults += wrong
         if capture:
@@ -284,8 +349,9 @@ def _header_fault(path: Path, header: list[str], rows: int) -> RowFault | None:
     return None
 
 
-def _row(folder: Path, bench: Bench, cells: dict[str, str], where: str,
-         index: int) -> tuple[Capture | None, list[RowFault]]:
+def _row(
+    folder: Path, bench: Bench, cells: dict[str, str], where: str, index: int
+) -> tuple[Capture | None, list[RowFault]]:
     """The capture that a row of cells describes (None where it cannot be known), and the row's faults."""
     faults: list[RowFault] = []
     name = cells["capture"]
@@ -312,9 +378,15 @@ def _row(folder: Path, bench: Bench, cells: dict[str, str], where: str,
     names = [c.name for c in bench.channels]
     if cells["channel"] and cells["channel"] not in names:
         near = get_close_matches(cells["channel"], names, 1)
-        fault("unknown_channel", f"channel {cells['channel'][:40]!r} is not in bench.toml; "
-              + (f"did you mean {near[0]!r}?" if near else
-                 f"use one of {', '.join(names)}, or add a [[channel]]"))
+        fault(
+            "unknown_channel",
+            f"channel {cells['channel'][:40]!r} is not in bench.toml; "
+            + (
+                f"did you mean {near[0]!r}?"
+                if near
+                else f"use one of {', '.join(names)}, or add a [[channel]]"
+            ),
+        )
     plane = number("plane_mm", bench.distance_mm, -1e4, 1e4, "a distance in mm, from -10000 to 10000")
     exposure = number("exposure_ms", 1.0, 1e-6, 1e7, "an exposure in ms, above 0")
     time = number("time_s", float(index), -1e9, 1e9, "a time in seconds")
@@ -322,8 +394,11 @@ def _row(folder: Path, bench: Bench, cells: dict[str, str], where: str,
     for column in ("phase", "image"):
         relative = PurePosixPath(cells[column].replace("\\", "/"))
         if relative.is_absolute() or ".." in relative.parts or ":" in str(relative) or "\0" in str(relative):
-            fault("missing_file", f"{column} {str(relative)[:80]!r} is not inside the set; "
-                  "copy the file into the folder and give its path from there")
+            fault(
+                "missing_file",
+                f"{column} {str(relative)[:80]!r} is not inside the set; "
+                "copy the file into the folder and give its path from there",
+            )
             continue
         files.append(folder / relative)
         try:
@@ -331,13 +406,16 @@ def _row(folder: Path, bench: Bench, cells: dict[str, str], where: str,
         except OSError:
             there = False
         if cells[column] and not there:
-            fault("missing_file", f"{column} {str(relative)[:80]!r} is not there; "
-                  "put the file back or take the row out")
+            fault(
+                "missing_file",
+                f"{column} {str(relative)[:80]!r} is not there; put the file back or take the row out",
+            )
     if faults:
         return None, faults
     extra = {column: text for column, text in cells.items() if column not in KNOWN}
-    return Capture(name, cells["channel"], plane, cells.get("pattern") or name, files[0], files[1],
-                   exposure, time, extra), faults
+    return Capture(
+        name, cells["channel"], plane, cells.get("pattern") or name, files[0], files[1], exposure, time, extra
+    ), faults
 
 
 def _short(error: BaseException) -> str:

@@ -19,11 +19,11 @@ from trainer.captures import Bench, Camera, Capture, PictureError, read_bench, r
 from trainer.conventions import Predict, Sample, compare_conventions
 from trainer.photon_transfer import Repeats, black_estimate, compare_repeats
 
-SATURATED_SHARE = 0.03      # of the pixels at the top count
-DARK_SHARE = 1e-3           # of the pixels that lie well below the stated black level
-NOISE_FACTOR = 2.25         # measured noise variance over the camera model's
+SATURATED_SHARE = 0.03  # of the pixels at the top count
+DARK_SHARE = 1e-3  # of the pixels that lie well below the stated black level
+NOISE_FACTOR = 2.25  # measured noise variance over the camera model's
 FEWEST_PATTERNS = 4
-MOST_PAIRS = 12             # pairs of repeated pictures that are compared
+MOST_PAIRS = 12  # pairs of repeated pictures that are compared
 
 Progress = Callable[[int, int], None]
 
@@ -48,7 +48,7 @@ class Problem:
 class _Seen:
     """What the pass over the captures leaves for the tests that need several of them."""
 
-    patterns: dict[str, dict[str, str]] = field(default_factory=dict)   # channel: digest: name
+    patterns: dict[str, dict[str, str]] = field(default_factory=dict)  # channel: digest: name
     names: dict[tuple[str, str], tuple[str, str]] = field(default_factory=dict)
     repeats: dict[tuple[str, float, str, float], list[Capture]] = field(default_factory=dict)
     dark: np.ndarray = field(default_factory=lambda: np.zeros(65536, np.int64))
@@ -56,8 +56,9 @@ class _Seen:
     shift: dict[str, int] = field(default_factory=dict)
 
 
-def check_captures(folder: Path | str, progress: Progress | None = None,
-                   predict: Predict | None = None) -> list[Problem]:
+def check_captures(
+    folder: Path | str, progress: Progress | None = None, predict: Predict | None = None
+) -> list[Problem]:
     """Every problem of the capture set in a folder, errors and warnings, in the order of the captures.
 
     progress : called with (captures done, captures in all)
@@ -83,8 +84,12 @@ def check_captures(folder: Path | str, progress: Progress | None = None,
 
 def _load(capture: Capture, bench: Bench, seen: _Seen) -> tuple[np.ndarray, np.ndarray]:
     gray = read_picture(capture.phase, bench.panel.shape, 8, f"the pattern of capture {capture.capture}")
-    counts = read_picture(capture.image, bench.camera.shape, 16 if bench.camera.bit_depth > 8 else 0,
-                          f"the image of capture {capture.capture}")
+    counts = read_picture(
+        capture.image,
+        bench.camera.shape,
+        16 if bench.camera.bit_depth > 8 else 0,
+        f"the image of capture {capture.capture}",
+    )
     return gray, counts >> seen.shift.get(capture.capture, 0)
 
 
@@ -99,10 +104,15 @@ def _one(bench: Bench, capture: Capture, seen: _Seen) -> list[Problem]:
     seen.patterns.setdefault(capture.channel, {}).setdefault(digest, capture.pattern)
     known, first = seen.names.setdefault((capture.channel, capture.pattern), (digest, capture.capture))
     if known != digest:
-        problems.append(Problem(
-            "error", "pattern", capture.capture,
-            f"capture {capture.capture} shows other gray levels than {first} "
-            f"though both are pattern {capture.pattern!r}: give it another pattern name, or the right file"))
+        problems.append(
+            Problem(
+                "error",
+                "pattern",
+                capture.capture,
+                f"capture {capture.capture} shows other gray levels than {first} "
+                f"though both are pattern {capture.pattern!r}: give it another pattern name, or the right file",
+            )
+        )
     camera = bench.camera
     shift, wrong = _bits(counts, camera, capture.capture)
     problems += wrong
@@ -133,18 +143,36 @@ def _bits(counts: np.ndarray, camera: Camera, name: str) -> tuple[int, list[Prob
     if not justified and values >= 8 and top >> empty <= camera.saturation < top:
         spare, justified = empty, True
     if justified:
-        return spare, [Problem(
-            "error", "left_justified", name, f"the image of capture {name} holds its counts shifted up "
-            f"by {spare} bits (up to {top}, in steps of {1 << spare}): divide them by {1 << spare}")]
+        return spare, [
+            Problem(
+                "error",
+                "left_justified",
+                name,
+                f"the image of capture {name} holds its counts shifted up "
+                f"by {spare} bits (up to {top}, in steps of {1 << spare}): divide them by {1 << spare}",
+            )
+        ]
     if top > camera.saturation:
-        return 0, [Problem(
-            "error", "bit_depth", name, f"the image of capture {name} has counts up to {top}, but "
-            f"camera.bit_depth = {camera.bit_depth} ends at {camera.saturation}: correct bit_depth, or save "
-            "raw counts")]
+        return 0, [
+            Problem(
+                "error",
+                "bit_depth",
+                name,
+                f"the image of capture {name} has counts up to {top}, but "
+                f"camera.bit_depth = {camera.bit_depth} ends at {camera.saturation}: correct bit_depth, or save "
+                "raw counts",
+            )
+        ]
     if empty and values >= 16:
-        return 0, [Problem(
-            "warning", "bit_depth", name, f"every count in the image of capture {name} is a multiple of "
-            f"{1 << empty}: state the bits that the camera really gives, and save raw counts")]
+        return 0, [
+            Problem(
+                "warning",
+                "bit_depth",
+                name,
+                f"every count in the image of capture {name} is a multiple of "
+                f"{1 << empty}: state the bits that the camera really gives, and save raw counts",
+            )
+        ]
     return 0, []
 
 
@@ -152,18 +180,39 @@ def _brightness(counts: np.ndarray, camera: Camera, name: str) -> list[Problem]:
     top = int(counts.max())
     share = float((counts == camera.saturation).mean())
     if share > SATURATED_SHARE:
-        return [Problem("error", "saturated", name, f"{100 * share:.1f} % of the pixels of capture {name} "
-                        f"are at the top count {camera.saturation}: take it again with less light")]
+        return [
+            Problem(
+                "error",
+                "saturated",
+                name,
+                f"{100 * share:.1f} % of the pixels of capture {name} "
+                f"are at the top count {camera.saturation}: take it again with less light",
+            )
+        ]
     share = float((counts == top).mean())
     bright = top > camera.black_level + 0.25 * camera.full_scale
     beside = float(((counts < top) & (counts >= top - 16)).mean()) / 16
     if share > SATURATED_SHARE and bright and share > 10 * beside:
-        return [Problem("error", "saturated", name, f"{100 * share:.1f} % of the pixels of capture {name} "
-                        f"pile up at {top}, below camera.bit_depth's top count {camera.saturation}: take it "
-                        "again with less light, or correct bit_depth if that is the camera's top")]
+        return [
+            Problem(
+                "error",
+                "saturated",
+                name,
+                f"{100 * share:.1f} % of the pixels of capture {name} "
+                f"pile up at {top}, below camera.bit_depth's top count {camera.saturation}: take it "
+                "again with less light, or correct bit_depth if that is the camera's top",
+            )
+        ]
     if float(counts[counts < camera.saturation].std()) < 2 * _dark_noise(camera):
-        return [Problem("warning", "no_signal", name, f"the image of capture {name} holds nothing above the "
-                        "camera's noise: see that the laser was on and the exposure long enough")]
+        return [
+            Problem(
+                "warning",
+                "no_signal",
+                name,
+                f"the image of capture {name} holds nothing above the "
+                "camera's noise: see that the laser was on and the exposure long enough",
+            )
+        ]
     return []
 
 
@@ -172,10 +221,16 @@ def _patterns(bench: Bench, seen: _Seen) -> list[Problem]:
     for channel in bench.channels:
         number = len(seen.patterns.get(channel.name, {}))
         if number < FEWEST_PATTERNS:
-            problems.append(Problem(
-                "warning", "too_few", "", f"channel {channel.name!r} has {number} different patterns: take "
-                f"at least {FEWEST_PATTERNS}, so that some can be held back, and better 10 with one of them "
-                "repeated"))
+            problems.append(
+                Problem(
+                    "warning",
+                    "too_few",
+                    "",
+                    f"channel {channel.name!r} has {number} different patterns: take "
+                    f"at least {FEWEST_PATTERNS}, so that some can be held back, and better 10 with one of them "
+                    "repeated",
+                )
+            )
     return problems
 
 
@@ -194,11 +249,17 @@ def _camera(bench: Bench, seen: _Seen) -> list[Problem]:
     for name, repeats in measured:
         if repeats.ratio > NOISE_FACTOR or repeats.ratio < 1 / NOISE_FACTOR:
             more = repeats.ratio > 1
-            problems.append(Problem(
-                "warning", "noise", name, f"capture {name} differs from an earlier capture of its pattern "
-                f"by {repeats.ratio ** 0.5:.2g} times the noise that the camera's numbers give: "
-                + ("look for vibration, drift or flicker, or " if more else "")
-                + "correct full_well_e and read_noise_e"))
+            problems.append(
+                Problem(
+                    "warning",
+                    "noise",
+                    name,
+                    f"capture {name} differs from an earlier capture of its pattern "
+                    f"by {repeats.ratio**0.5:.2g} times the noise that the camera's numbers give: "
+                    + ("look for vibration, drift or flicker, or " if more else "")
+                    + "correct full_well_e and read_noise_e",
+                )
+            )
     return problems
 
 
@@ -213,7 +274,7 @@ def _black(camera: Camera, dark: np.ndarray, measured: Sequence[Repeats]) -> Pro
     if pixels < 256:
         return None
     noise = _dark_noise(camera)
-    below = np.cumsum(dark) / pixels                    # share of pixels at or below a count
+    below = np.cumsum(dark) / pixels  # share of pixels at or below a count
 
     def share(count: float) -> float:
         return float(below[int(count)]) if count >= 0 else 0.0
@@ -229,16 +290,31 @@ def _black(camera: Camera, dark: np.ndarray, measured: Sequence[Repeats]) -> Pro
     much = share(stated - 6 * noise - 0.001 * camera.full_scale) > DARK_SHARE
     some = share(stated - 4.5 * noise) > DARK_SHARE / 20
     if much or (estimate and off < -sure and some):
-        return Problem("error", "black_level", "", f"camera.black_level = {stated:g} is too high: pixels go "
-                       f"down to {darkest} counts, further than noise goes; {advice}")
+        return Problem(
+            "error",
+            "black_level",
+            "",
+            f"camera.black_level = {stated:g} is too high: pixels go "
+            f"down to {darkest} counts, further than noise goes; {advice}",
+        )
     if estimate and off > sure and darkest >= estimate.level - 4 * noise:
-        return Problem("error", "black_level", "", f"camera.black_level = {stated:g} is too low: no pixel "
-                       f"is darker than about {darkest} counts, and {advice}")
+        return Problem(
+            "error",
+            "black_level",
+            "",
+            f"camera.black_level = {stated:g} is too low: no pixel "
+            f"is darker than about {darkest} counts, and {advice}",
+        )
     lowest = int(np.searchsorted(below, 1e-12))
     if not measured and stated < noise and lowest > stated + max(10 * noise, 0.002 * camera.full_scale):
-        return Problem("warning", "black_level", "", f"camera.black_level = {stated:g} is in doubt: no "
-                       f"pixel of any capture is darker than {lowest} counts, which is a black level or "
-                       f"stray light; {advice}")
+        return Problem(
+            "warning",
+            "black_level",
+            "",
+            f"camera.black_level = {stated:g} is in doubt: no "
+            f"pixel of any capture is darker than {lowest} counts, which is a black level or "
+            f"stray light; {advice}",
+        )
     return None
 
 
@@ -259,7 +335,15 @@ def _convention(bench: Bench, seen: _Seen, predict: Predict | None) -> list[Prob
     for place in sorted({round(i) for i in np.linspace(0, len(distinct) - 1, min(3, len(distinct)))}):
         capture = distinct[place]
         gray, counts = _load(capture, bench, seen)
-        samples.append(Sample(capture.capture, gray, counts.astype(np.float32) - bench.camera.black_level,
-                              counts < bench.camera.saturation, capture.channel, capture.plane_mm))
+        samples.append(
+            Sample(
+                capture.capture,
+                gray,
+                counts.astype(np.float32) - bench.camera.black_level,
+                counts < bench.camera.saturation,
+                capture.channel,
+                capture.plane_mm,
+            )
+        )
     found = compare_conventions(bench, samples, predict, quick=True)
     return [Problem("error", "convention", "", found.change)] if found.decisive else []

@@ -28,8 +28,8 @@ from trainer.captures import Bench, CaptureSet
 T_LEVEL = 6.0
 R_RATIO = 2.0
 R_LEAST = 0.05
-WINDOW = 8          # pixels, the largest shift that is looked for along each axis
-CORE = 512          # pixels, the part of a large registered image that is compared
+WINDOW = 8  # pixels, the largest shift that is looked for along each axis
+CORE = 512  # pixels, the part of a large registered image that is compared
 
 Predict = Callable[[Bench, np.ndarray, str, float], np.ndarray]
 
@@ -124,8 +124,9 @@ def find_convention(captures: CaptureSet, count: int = 3, predict: Predict | Non
     return compare_conventions(captures.bench, samples, predict)
 
 
-def compare_conventions(bench: Bench, samples: Sequence[Sample],
-                        predict: Predict | None = None, quick: bool = False) -> Convention:
+def compare_conventions(
+    bench: Bench, samples: Sequence[Sample], predict: Predict | None = None, quick: bool = False
+) -> Convention:
     """Scores every combination that the image's shape allows; see the module's text for the test.
 
     predict : (bench, gray, channel, plane_mm) -> irradiance [h, w], any scale; the ideal model by default
@@ -159,27 +160,43 @@ def compare_conventions(bench: Bench, samples: Sequence[Sample],
     return _conclude(tiles, shifts, stated_sign)
 
 
-def _conclude(tiles: dict[tuple[str, int], list[np.ndarray]],
-              shifts: dict[tuple[str, int], list[tuple[int, int]]], stated_sign: int) -> Convention:
+def _conclude(
+    tiles: dict[tuple[str, int], list[np.ndarray]],
+    shifts: dict[tuple[str, int], list[tuple[int, int]]],
+    stated_sign: int,
+) -> Convention:
     joined = {key: np.concatenate(values) for key, values in tiles.items()}
     reference = joined["as_stated", stated_sign]
-    scores = [Score(turn, sign, float(np.mean(values)), tuple(shifts[turn, sign]),
-                    _paired_t(values, reference)) for (turn, sign), values in joined.items()]
+    scores = [
+        Score(turn, sign, float(np.mean(values)), tuple(shifts[turn, sign]), _paired_t(values, reference))
+        for (turn, sign), values in joined.items()
+    ]
     scores.sort(key=lambda score: -score.correlation)
     best = scores[0]
     stated = next(s for s in scores if s.turn == "as_stated" and s.phase_sign == stated_sign)
-    decisive = bool(best is not stated and best.t > T_LEVEL and best.correlation >= R_LEAST
-                    and best.correlation >= R_RATIO * max(stated.correlation, 0.0))
-    alike = tuple(s for s in scores[1:] if decisive and s.correlation * R_RATIO > best.correlation
-                  and _paired_t(joined[best.turn, best.phase_sign], joined[s.turn, s.phase_sign]) < T_LEVEL)
+    decisive = bool(
+        best is not stated
+        and best.t > T_LEVEL
+        and best.correlation >= R_LEAST
+        and best.correlation >= R_RATIO * max(stated.correlation, 0.0)
+    )
+    alike = tuple(
+        s
+        for s in scores[1:]
+        if decisive
+        and s.correlation * R_RATIO > best.correlation
+        and _paired_t(joined[best.turn, best.phase_sign], joined[s.turn, s.phase_sign]) < T_LEVEL
+    )
     change = _change(best, stated, alike) if decisive else ""
     return Convention(best, stated, decisive, change, tuple(scores), alike)
 
 
 def _change(best: Score, stated: Score, alike: tuple[Score, ...]) -> str:
     steps = _steps(best, stated)
-    text = (f"the images fit the ideal model with correlation {stated.correlation:.2f} as stated and "
-            f"{best.correlation:.2f} after a change of convention: {steps}")
+    text = (
+        f"the images fit the ideal model with correlation {stated.correlation:.2f} as stated and "
+        f"{best.correlation:.2f} after a change of convention: {steps}"
+    )
     if alike:
         text += "; these captures cannot tell this from: " + ", or ".join(_steps(s, stated) for s in alike)
     return text
@@ -188,16 +205,19 @@ def _change(best: Score, stated: Score, alike: tuple[Score, ...]) -> str:
 def _steps(score: Score, stated: Score) -> str:
     steps = []
     if score.phase_sign != stated.phase_sign:
-        steps.append(f"in bench.toml [panel] set phase_sign = {score.phase_sign} (more gray means "
-                     f"{'less' if score.phase_sign < 0 else 'more'} phase; a distance counted the other way "
-                     "looks the same, and this puts it right too)")
+        steps.append(
+            f"in bench.toml [panel] set phase_sign = {score.phase_sign} (more gray means "
+            f"{'less' if score.phase_sign < 0 else 'more'} phase; a distance counted the other way "
+            "looks the same, and this puts it right too)"
+        )
     if score.turn in _WORDS:
         steps.append(_WORDS[score.turn] + " (or the panel's patterns)" * (score.turn.startswith("mirror")))
     return " and ".join(steps) or "leave everything as stated"
 
 
-def _central(bench: Bench, sample: Sample) -> tuple[Bench, np.ndarray, np.ndarray, np.ndarray,
-                                                    tuple[slice, slice]]:
+def _central(
+    bench: Bench, sample: Sample
+) -> tuple[Bench, np.ndarray, np.ndarray, np.ndarray, tuple[slice, slice]]:
     """A large registered capture, cut to its centre and what diffracts into it.
 
     Returns the smaller bench and gray pattern, the image and its mask, and where the image is in the
@@ -207,7 +227,7 @@ def _central(bench: Bench, sample: Sample) -> tuple[Bench, np.ndarray, np.ndarra
     if not bench.camera.registered:
         return bench, sample.gray, sample.signal, sample.valid, whole
     wave, pitch = bench.channel(sample.channel).wavelength, bench.panel.pitch
-    reach = math.ceil(abs(sample.plane_mm) * 1e-3 * wave / (2 * pitch ** 2)) + 8
+    reach = math.ceil(abs(sample.plane_mm) * 1e-3 * wave / (2 * pitch**2)) + 8
     outer, core, inside = [], [], []
     for size in bench.panel.shape:
         small = min(size, CORE + size % 2)
@@ -220,8 +240,13 @@ def _central(bench: Bench, sample: Sample) -> tuple[Bench, np.ndarray, np.ndarra
     gray = sample.gray[outer[0], outer[1]]
     panel = replace(bench.panel, height=gray.shape[0], width=gray.shape[1])
     camera = replace(bench.camera, height=gray.shape[0], width=gray.shape[1])
-    return (replace(bench, panel=panel, camera=camera), gray, sample.signal[core[0], core[1]],
-            sample.valid[core[0], core[1]], (inside[0], inside[1]))
+    return (
+        replace(bench, panel=panel, camera=camera),
+        gray,
+        sample.signal[core[0], core[1]],
+        sample.valid[core[0], core[1]],
+        (inside[0], inside[1]),
+    )
 
 
 def _flattened(image: np.ndarray, valid: np.ndarray) -> np.ndarray:
@@ -230,18 +255,19 @@ def _flattened(image: np.ndarray, valid: np.ndarray) -> np.ndarray:
     amplitude = gaussian_filter(amplitude, 0.7, mode="nearest")
     wide = max(4.0, min(16.0, min(image.shape) / 8))
     detail = amplitude - gaussian_filter(amplitude, wide, mode="nearest")
-    spread = np.sqrt(gaussian_filter(detail ** 2, wide, mode="nearest"))
-    floor = 0.1 * float(np.sqrt(np.mean(detail ** 2))) + 1e-12
+    spread = np.sqrt(gaussian_filter(detail**2, wide, mode="nearest"))
+    floor = 0.1 * float(np.sqrt(np.mean(detail**2))) + 1e-12
     return np.where(valid, detail / (spread + floor), 0).astype(np.float32)
 
 
-def _tile_correlations(image: np.ndarray, valid: np.ndarray,
-                       model: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
+def _tile_correlations(
+    image: np.ndarray, valid: np.ndarray, model: np.ndarray
+) -> tuple[np.ndarray, tuple[int, int]]:
     """Correlation of each tile, at the shift (row, column) within WINDOW that suits the whole best."""
     rows, columns = image.shape
     window = max(1, min(WINDOW, min(rows, columns) // 8))
     cross = spfft.irfft2(spfft.rfft2(image) * np.conj(spfft.rfft2(model)), s=image.shape)
-    near = np.roll(cross, (window, window), (0, 1))[:2 * window + 1, :2 * window + 1]
+    near = np.roll(cross, (window, window), (0, 1))[: 2 * window + 1, : 2 * window + 1]
     at = np.unravel_index(int(np.argmax(near)), near.shape)
     shift = (int(at[0]) - window, int(at[1]) - window)
     moved = np.roll(model, shift, (0, 1))

@@ -17,6 +17,7 @@ from trainer.evidence import load, sample, scenes, split
 from trainer.excess import Errors, Removed, removed
 from trainer.fit import fit
 from trainer.model import Model
+from trainer.numbers import number
 from trainer.parameters import describe, json_values, present_named
 from trainer.pool import Pool
 from trainer.probes import Probed, probe
@@ -85,9 +86,9 @@ class Diagnosis:
     @property
     def sentence(self) -> str:
         """The verdict in one sentence."""
-        left = f"{self.held_out.excess:.2g}"
+        left = number(self.held_out.excess, 2)
         if self.verdict == "complete":
-            return f"Nothing is missing: the model is within {left} of the camera's noise (excess over signal variance)."
+            return f"Nothing is missing: what remains above the camera's noise is {left} of the signal's variance."
         if self.best is None:
             where = f" The {self.stage} stage is where it sits." if self.stage else ""
             return f"Something is missing that the catalogue does not name (excess {left}).{where}"
@@ -97,7 +98,8 @@ class Diagnosis:
         also = ""
         if best.indistinguishable_from:
             also = f" These captures cannot tell it from {' or '.join(best.indistinguishable_from)}."
-        return f"{best.effect.name} is missing ({size}): it explains {min(share, 100):.0f} % of the excess {left}.{also}"
+        gain = f"it explains {min(share, 100):.0f} % of the excess {left}"
+        return f"{best.effect.name} is missing ({size}): {gain}.{also}"
 
     def as_json(self) -> dict[str, Any]:
         """The contract's keys, and the thresholds and the sentence."""
@@ -228,13 +230,17 @@ def diagnose(
     )
 
 
-def screen_all(parts: Parts, model: Model, effects: Sequence[Effect], pool: Pool, say: Progress) -> list[Screened]:
+def screen_all(
+    parts: Parts, model: Model, effects: Sequence[Effect], pool: Pool, say: Progress
+) -> list[Screened]:
     """Screen every effect, dealt out among the pool's workers."""
     hands = min(pool.workers, len(effects)) or 1
     ids = tuple(c.capture for c in parts.screened)
     tasks = [(parts.folder, ids, model, tuple(effects[k::hands])) for k in range(hands)]
     say(0.05, f"screening {len(effects)} effects")
-    dealt = pool.map(screen, tasks, lambda n: say(0.05 + 0.25 * n / hands, f"screening {len(effects)} effects"))
+    dealt = pool.map(
+        screen, tasks, lambda n: say(0.05 + 0.25 * n / hands, f"screening {len(effects)} effects")
+    )
     return [s for hand in dealt for s in hand]
 
 
@@ -267,10 +273,19 @@ def try_all(
         and most - t.held_out.excess > 0.3 * (most - least)
     ]
     tasks = [
-        (parts.folder, ids, held, _without_gain_of(tried[k].model, model), present_named(tried[k].model, tried[k].effect), True)
+        (
+            parts.folder,
+            ids,
+            held,
+            _without_gain_of(tried[k].model, model),
+            present_named(tried[k].model, tried[k].effect),
+            True,
+        )
         for k in again
     ]
-    for k, better in zip(again, pool.map(try_effect, tasks, lambda n: say(end, "raising orders")), strict=True):
+    for k, better in zip(
+        again, pool.map(try_effect, tasks, lambda n: say(end, "raising orders")), strict=True
+    ):
         tried[k] = better
     return tried
 
@@ -283,7 +298,12 @@ def _without_gain_of(fitted: Model, model: Model) -> Model:
 
 
 def rank(
-    before: Errors, tried: Sequence[Tried], known: Catalogue, thresholds: Thresholds, ideal_excess: float, candidates: int
+    before: Errors,
+    tried: Sequence[Tried],
+    known: Catalogue,
+    thresholds: Thresholds,
+    ideal_excess: float,
+    candidates: int,
 ) -> list[Ranked]:
     """Candidates by excess removed, each with those that the captures cannot tell it from."""
     complete = thresholds.complete(before.excess, ideal_excess)
@@ -295,7 +315,9 @@ def rank(
         twins = tuple(
             other.effect
             for other in ordered
-            if other is not one and worth and _inseparable(one, other, before, thresholds, ideal_excess, candidates)
+            if other is not one
+            and worth
+            and _inseparable(one, other, before, thresholds, ideal_excess, candidates)
         )
         ranked.append(Ranked(known[one.effect], one.model, one.held_out, gone, worth, twins))
     return ranked
@@ -331,5 +353,7 @@ def suggest(parts: Parts, verdict: str, ranking: Sequence[Ranked]) -> list[str]:
             )
     patterns = [c.pattern for c in parts.captures.captures]
     if len(set(patterns)) == len(patterns):
-        suggestions.append("one pattern captured twice: without a repeat the camera's noise is taken on trust")
+        suggestions.append(
+            "one pattern captured twice: without a repeat the camera's noise is taken on trust"
+        )
     return list(dict.fromkeys(suggestions))

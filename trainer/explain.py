@@ -10,7 +10,16 @@ from typing import Any
 
 from trainer.candidates import Screened, evaluate_captures, least_for_order, screen_batches
 from trainer.captures import CaptureSet
-from trainer.diagnose import Diagnosis, Parts, Progress, diagnose, heldout_json, ideal_errors, parts_of, with_gains
+from trainer.diagnose import (
+    Diagnosis,
+    Parts,
+    Progress,
+    diagnose,
+    heldout_json,
+    ideal_errors,
+    parts_of,
+    with_gains,
+)
 from trainer.effects.definition import Effect
 from trainer.effects.registry import Catalogue
 from trainer.evidence import Batch, load
@@ -88,7 +97,11 @@ class Explanation:
 
 
 def add(
-    captures: CaptureSet, model: Model, effect: Effect, known: Catalogue | None = None, progress: Progress | None = None
+    captures: CaptureSet,
+    model: Model,
+    effect: Effect,
+    known: Catalogue | None = None,
+    progress: Progress | None = None,
 ) -> Addition:
     """Add one effect to a model and refit all that is in it; an effect that is already there is refitted."""
     say = progress or (lambda done, what: None)
@@ -128,7 +141,11 @@ def settled(model: Model, batches: Sequence[Batch]) -> Fitted:
 
 def recorded(model: Model, name: str | None, errors: Errors, dropped: str | None = None) -> Model:
     """The model with one more record in its history."""
-    record: dict[str, Any] = {"added": name or "", **heldout_json(errors), "date": datetime.now(UTC).date().isoformat()}
+    record: dict[str, Any] = {
+        "added": name or "",
+        **heldout_json(errors),
+        "date": datetime.now(UTC).date().isoformat(),
+    }
     if dropped:
         record["removed"] = dropped
     return replace(model, history=(*model.history, record))

@@ -83,7 +83,9 @@ def with_gain(model: Model, predictors: Sequence[Predictor], points: Sequence[Tr
         linear = replace(stages.sensor, offset=None, response=None, free_capture_gain=False)
         point = predictor.trace(unit) if points is None else points[k]
         light = light_on_camera(predictor.scene, stages, point.image)
-        one = counts(predictor.scene, replace(stages, sensor=linear), light, batch.exposure[:, None, None], None)
+        one = counts(
+            predictor.scene, replace(stages, sensor=linear), light, batch.exposure[:, None, None], None
+        )
         seen = batch.signal if stages.sensor.offset is None else batch.signal - stages.sensor.offset
         total = sums.setdefault(batch.channel, [0.0, 0.0])
         total[0] += float((batch.weight * seen * one).sum(dtype=torch.float64))
@@ -224,7 +226,9 @@ def _measured(model: Model, free: Sequence[str], batches: Sequence[Batch]) -> Mo
         if present.effect.measure is None:
             continue
         without = replace(model, present=tuple(p for p in model.present if p.effect.name != name))
-        evidence = [Evidence(p.scene, p.batch, p.predict(without)) for p in (Predictor(without, b) for b in batches)]
+        evidence = [
+            Evidence(p.scene, p.batch, p.predict(without)) for p in (Predictor(without, b) for b in batches)
+        ]
         read = present.effect.measure(evidence)
         values = {n: np.full_like(v, read[n]) if n in read else v for n, v in present.values.items()}
         model = model.having(replace(present, values=values))

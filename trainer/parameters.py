@@ -9,6 +9,7 @@ import numpy as np
 from trainer.bench_file import Bench
 from trainer.effects.definition import Parameter
 from trainer.model import Model, Present
+from trainer.numbers import measured
 
 
 def present_named(model: Model, name: str) -> Present:
@@ -41,26 +42,17 @@ def describe(present: Present, bench: Bench) -> str:
     for p in present.effect.parameters:
         values = present.values[p.name]
         errors = np.zeros_like(values) if present.errors is None else present.errors[p.name]
-        unit = "" if p.unit == "1" else f" {p.unit}"
         label = p.name.replace("_", " ")
         away = values - p.absent_value(bench)
         if values.size == 0 or not np.any(np.abs(away) > 1e-12):
             continue
         if values.ndim == 0:
-            words.append(f"{label} {_with_error(float(values), float(errors))}{unit}")
+            words.append(f"{label} {measured(float(values), float(errors), p.unit)}")
         elif p.per_channel and values.ndim == 1:
             for k, channel in enumerate(bench.channels):
                 name = f"{label} " if len(bench.channels) == 1 else f"{label} ({channel.name}) "
-                words.append(f"{name}{_with_error(float(values[k]), float(errors[k]))}{unit}")
+                words.append(f"{name}{measured(float(values[k]), float(errors[k]), p.unit)}")
         else:
             size, error = float(np.sqrt((away**2).sum())), float(np.sqrt((errors**2).mean()))
-            words.append(f"{label} {_with_error(size, error)}{unit} in {values.size} terms")
+            words.append(f"{label} {measured(size, error, p.unit)} in {values.size} terms")
     return ", ".join(words) or "at its absent values"
-
-
-def _with_error(value: float, error: float) -> str:
-    """A value rounded to its standard error's second digit."""
-    if not error > 0:
-        return f"{value:.4g}"
-    digits = max(0, min(9, 1 - int(np.floor(np.log10(error)))))
-    return f"{value:.{digits}f} ± {error:.{digits}f}"

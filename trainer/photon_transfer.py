@@ -15,7 +15,7 @@ import numpy as np
 from trainer.captures import Camera
 
 BINS = 32
-SLOPE_DOUBT = 0.008     # relative standard error that a stated full well has at best
+SLOPE_DOUBT = 0.008  # relative standard error that a stated full well has at best
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def compare_repeats(first: np.ndarray, second: np.ndarray, camera: Camera) -> Re
     spread = float(a.std()) / max(float(b.std()), 1e-9)
     gain = spread if 0.5 < spread < 2 and np.corrcoef(a, b)[0, 1] > 0.5 else 1.0
     mean = (a + b) / 2
-    halved = (a - a.mean() - gain * (b - b.mean())) ** 2 / (1 + gain ** 2)
+    halved = (a - a.mean() - gain * (b - b.mean())) ** 2 / (1 + gain**2)
     edges = np.unique(np.quantile(mean, np.linspace(0, 1, BINS + 1)))
     place = np.clip(np.searchsorted(edges, mean, side="right") - 1, 0, max(len(edges) - 2, 0))
     number = np.bincount(place, minlength=max(len(edges) - 1, 1))
@@ -61,8 +61,9 @@ def compare_repeats(first: np.ndarray, second: np.ndarray, camera: Camera) -> Re
     center = np.bincount(place, mean, minlength=len(number))[full] / number[full]
     variance = np.bincount(place, halved, minlength=len(number))[full] / number[full]
     expected = _expected(mean - camera.black_level, camera)
-    return Repeats(center, variance, variance * np.sqrt(2 / number[full]),
-                   float(halved.mean() / expected.mean()))
+    return Repeats(
+        center, variance, variance * np.sqrt(2 / number[full]), float(halved.mean() / expected.mean())
+    )
 
 
 def black_estimate(repeats: list[Repeats], camera: Camera) -> BlackEstimate | None:
@@ -79,14 +80,14 @@ def black_estimate(repeats: list[Repeats], camera: Camera) -> BlackEstimate | No
     place = (mean - low) / step
     floor = float(_expected(np.zeros(1), camera)[0])
     line = _fit(np.stack([np.ones_like(place), place], 1), variance, relative)
-    bent = _fit(np.stack([np.ones_like(place), place, place ** 2], 1), variance, relative)
+    bent = _fit(np.stack([np.ones_like(place), place, place**2], 1), variance, relative)
     if line is None or bent is None:
         return None
     fit, covariance = bent if abs(bent[0][2]) > 4 * math.sqrt(bent[1][2, 2]) else line
     if fit[1] <= 3 * math.sqrt(covariance[1, 1]):
         return None
     reach = (fit[0] - floor) / fit[1]  # how far below the darkest bin, in units of the range
-    gradient = np.array([-1 / fit[1], reach / fit[1], 0])[:len(fit)]
+    gradient = np.array([-1 / fit[1], reach / fit[1], 0])[: len(fit)]
     free = BlackEstimate(low - step * float(reach), step * math.sqrt(float(gradient @ covariance @ gradient)))
     slope, spread = float(fit[1]) / step, math.sqrt(covariance[1, 1]) / step
     if abs(slope - camera.counts_per_electron) > 3 * spread:
@@ -95,13 +96,16 @@ def black_estimate(repeats: list[Repeats], camera: Camera) -> BlackEstimate | No
     weight = 1 / (relative * np.maximum(line[0][0] + line[0][1] * place, 1e-2 * float(variance.mean()))) ** 2
     above = (variance - floor) / camera.counts_per_electron
     level = float(np.average(mean - above, weights=weight))
-    error = math.hypot(1 / (math.sqrt(float(weight.sum())) * camera.counts_per_electron),
-                       SLOPE_DOUBT * float(np.average(above, weights=weight)))
+    error = math.hypot(
+        1 / (math.sqrt(float(weight.sum())) * camera.counts_per_electron),
+        SLOPE_DOUBT * float(np.average(above, weights=weight)),
+    )
     return BlackEstimate(level, error) if error < free.error else free
 
 
-def _fit(terms: np.ndarray, variance: np.ndarray,
-         relative: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+def _fit(
+    terms: np.ndarray, variance: np.ndarray, relative: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
     """Weighted least squares and its covariance; None where the terms do not determine it.
 
     The weights follow the fit, not each bin's own variance: a bin that came out low must not count for more.

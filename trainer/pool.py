@@ -23,7 +23,10 @@ class Pool:
     workers: int
 
     def map(
-        self, function: Callable[..., T], tasks: Iterable[tuple[Any, ...]], progress: Callable[[int], None] | None = None
+        self,
+        function: Callable[..., T],
+        tasks: Iterable[tuple[Any, ...]],
+        progress: Callable[[int], None] | None = None,
     ) -> list[T]:
         """Results of `function(*task)` in the order of the tasks; `progress` is told how many are done."""
         futures = [self.executor.submit(function, *task) for task in tasks]
@@ -60,7 +63,9 @@ def open_pool(workers: int | None = None, cluster: str | None = None) -> Iterato
         try:
             client = Client(cluster, timeout="10s", set_as_default=False)
         except (OSError, ValueError, TimeoutError) as error:
-            raise InputError(f"no Dask scheduler answers at {cluster} ({error}): start one, or leave --cluster out") from error
+            raise InputError(
+                f"no Dask scheduler answers at {cluster} ({error}): start one, or leave --cluster out"
+            ) from error
         try:
             threads = sum(client.nthreads().values())
             yield Pool(client.get_executor(pure=False), max(1, threads))

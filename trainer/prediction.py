@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from runtime.fft import irfft2, rfft2
 from runtime.lightpath import (
     Grid,
     LightPath,
@@ -26,7 +27,6 @@ from runtime.lightpath import (
     panel_phase,
     panel_spectrum,
 )
-from runtime.fft import irfft2, rfft2
 from runtime.propagation import Aperture, band_limit, check_sampling, transfer_function
 from trainer.bench_file import Bench
 from trainer.effects.definition import STAGES, Effect
@@ -113,7 +113,9 @@ def _bare(scene: Scene) -> Stages:
         bench.panel.phase_sign * 2 * math.pi * level,
     )
     side = torch.full((2,), math.sqrt(bench.panel.fill_factor), dtype=dtype)
-    source = torch.ones((height, width), dtype=dtype).to(torch.complex64 if dtype == torch.float32 else torch.complex128)
+    source = torch.ones((height, width), dtype=dtype).to(
+        torch.complex64 if dtype == torch.float32 else torch.complex128
+    )
     panel = Panel(
         scene.channel, scene.wavelength, reference, bench.panel.pitch, panel_y, panel_x, source, None, side
     )
@@ -219,9 +221,7 @@ def _modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
     if pupil.transmission is not None:
         opening = opening * pupil.transmission
     grid = scene.grid
-    limits = tuple(
-        band_limit(scene.wavelength, scene.plane_mm * 1e-3, n * grid.pitch) for n in grid.padded
-    )
+    limits = tuple(band_limit(scene.wavelength, scene.plane_mm * 1e-3, n * grid.pitch) for n in grid.padded)
     modes = []
     for offset in offsets:
         wavelength = scene.wavelength + offset
@@ -263,7 +263,9 @@ class Trace:
     image: Tensor
 
 
-def trace(scene: Scene, stages: Stages, gray: Tensor, start: str = "drive", before: Trace | None = None) -> Trace:
+def trace(
+    scene: Scene, stages: Stages, gray: Tensor, start: str = "drive", before: Trace | None = None
+) -> Trace:
     """Spectrum and irradiance of patterns [B, H, W], recomputed from stage `start` on; earlier ones from `before`."""
     if before is not None and start == "sensor":
         return before
@@ -295,7 +297,9 @@ def light_on_camera(scene: Scene, stages: Stages, image: Tensor) -> Tensor:
     return _spline_samples(filtered, 2 * (y + grid.margin), 2 * (x + grid.margin))
 
 
-def counts(scene: Scene, stages: Stages, light: Tensor, gain: Tensor, measured: tuple[Tensor, Tensor] | None) -> Tensor:
+def counts(
+    scene: Scene, stages: Stages, light: Tensor, gain: Tensor, measured: tuple[Tensor, Tensor] | None
+) -> Tensor:
     """Counts above black [B, h, w] for light on the camera; `gain` [B, 1, 1] is counts a unit of light.
 
     `measured` (signal, weight) is what each capture's own gain is taken from where laser power drifts.

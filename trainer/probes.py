@@ -77,7 +77,9 @@ class Probed:
         }
 
 
-def probe(folder: Path, ids: tuple[str, ...], held_ids: tuple[str, ...], model: Model, stage: str) -> ProbeFit:
+def probe(
+    folder: Path, ids: tuple[str, ...], held_ids: tuple[str, ...], model: Model, stage: str
+) -> ProbeFit:
     """Fit one stage's probe on some captures and judge it on others."""
     captures = opened(folder)
     rows = chosen(captures, ids)
@@ -115,7 +117,9 @@ def probe(folder: Path, ids: tuple[str, ...], held_ids: tuple[str, ...], model: 
     def unseen_error() -> float:
         with torch.no_grad():
             found = physical()
-            return sum(float(w.squared_error(kind, found, k)) for w in unseen for k in range(len(w.batch.ids)))
+            return sum(
+                float(w.squared_error(kind, found, k)) for w in unseen for k in range(len(w.batch.ids))
+            )
 
     # One capture a colour and plane is kept from the gradient and says when to stop.
     best, least = {n: t.detach().clone() for n, t in raw.items()}, unseen_error()
@@ -291,8 +295,12 @@ def _sensor(model: Model, batch: Batch) -> _Kind:
         kernel = t["kernel"]
         rows = 2 * math.pi * sensor.iy * reach
         columns = 2 * math.pi * sensor.ix.T * reach
-        real = torch.cos(rows) @ kernel @ torch.cos(columns).T - torch.sin(rows) @ kernel @ torch.sin(columns).T
-        odd = -(torch.sin(rows) @ kernel @ torch.cos(columns).T + torch.cos(rows) @ kernel @ torch.sin(columns).T)
+        real = (
+            torch.cos(rows) @ kernel @ torch.cos(columns).T - torch.sin(rows) @ kernel @ torch.sin(columns).T
+        )
+        odd = -(
+            torch.sin(rows) @ kernel @ torch.cos(columns).T + torch.cos(rows) @ kernel @ torch.sin(columns).T
+        )
         moved = moved.blurred(torch.complex(1 + real, odd))
 
         def curve(share: Tensor) -> Tensor:

@@ -19,11 +19,11 @@ from scipy.spatial import cKDTree
 
 from firmware_iface.errors import InputError
 
-SPREAD = 0.11               # standard deviation of a plain dot, share of the spacing
-BROAD = (1.7, 1.35)        # of the marker's two dots, against a plain dot
-LIGHT = (1.8, 1.3)          # the least light of the marker's two dots, against their neighbours
-TOLERANCE = 0.25            # share of the spacing within which a found dot is an expected one
-FEWEST = 0.6                # share of the expected dots that must be found
+SPREAD = 0.11  # standard deviation of a plain dot, share of the spacing
+BROAD = (1.7, 1.35)  # of the marker's two dots, against a plain dot
+LIGHT = (1.8, 1.3)  # the least light of the marker's two dots, against their neighbours
+TOLERANCE = 0.25  # share of the spacing within which a found dot is an expected one
+FEWEST = 0.6  # share of the expected dots that must be found
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,10 @@ def dots_of(shape: tuple[int, int], spacing: float) -> Dots:
     """
     rows, columns = (int((n - 1.2 * spacing) // spacing) + 1 if spacing > 0 else 0 for n in shape)
     if not spacing >= 8 or rows < 4 or columns < 4:
-        raise InputError(f"dots {spacing:g} pixels apart do not make a grid of 4 x 4 on a panel of "
-                         f"{shape[0]} x {shape[1]} pixels: choose a spacing from 8 to {min(shape) / 4.4:.0f}")
+        raise InputError(
+            f"dots {spacing:g} pixels apart do not make a grid of 4 x 4 on a panel of "
+            f"{shape[0]} x {shape[1]} pixels: choose a spacing from 8 to {min(shape) / 4.4:.0f}"
+        )
     left, top = (shape[1] - 1 - (columns - 1) * spacing) / 2, (shape[0] - 1 - (rows - 1) * spacing) / 2
     grid = [(left + i * spacing, top + j * spacing) for j in range(rows) for i in range(columns)]
     return Dots(np.asarray(grid), float(spacing), columns, rows)
@@ -60,8 +62,8 @@ def dot_pattern(shape: tuple[int, int], spacing: float) -> np.ndarray:
     target = np.zeros(shape, np.float32)
     for number, (px, py) in enumerate(dots.xy):
         sigma = SPREAD * spacing * (BROAD[number] if number < 2 else 1.0)
-        across = np.exp(-((x - px) / sigma) ** 2 / 2)
-        target = np.maximum(target, np.exp(-((y - py) / sigma) ** 2 / 2) * across).astype(np.float32)
+        across = np.exp(-(((x - px) / sigma) ** 2) / 2)
+        target = np.maximum(target, np.exp(-(((y - py) / sigma) ** 2) / 2) * across).astype(np.float32)
     return target
 
 
@@ -73,9 +75,11 @@ def find_homography(image: np.ndarray, dots: Dots) -> np.ndarray:
     """
     points, light = _spots(image)
     if len(points) < FEWEST * len(dots.xy):
-        raise InputError(f"only {len(points)} of {len(dots.xy)} dots are seen in the dot picture: focus the "
-                         "camera, see that the whole pattern is in view, and expose so that the dots are "
-                         "bright but not saturated")
+        raise InputError(
+            f"only {len(points)} of {len(dots.xy)} dots are seen in the dot picture: focus the "
+            "camera, see that the whole pattern is in view, and expose so that the dots are "
+            "bright but not saturated"
+        )
     best: tuple[float, np.ndarray] | None = None
     for first, second in _markers(points, light):
         for guess in _guesses(points, first, second, dots):
@@ -85,10 +89,12 @@ def find_homography(image: np.ndarray, dots: Dots) -> np.ndarray:
         if best is not None and best[0] > len(dots.xy) * 0.9:
             break
     if best is None or best[0] < FEWEST * len(dots.xy):
-        raise InputError(f"{len(points)} dots are seen but they do not fit the expected {dots.columns} x "
-                         f"{dots.rows} grid with its marker: show this dot pattern with its corner of two "
-                         "broad dots in view, or space the dots wider if they are less than 8 camera pixels "
-                         "apart")
+        raise InputError(
+            f"{len(points)} dots are seen but they do not fit the expected {dots.columns} x "
+            f"{dots.rows} grid with its marker: show this dot pattern with its corner of two "
+            "broad dots in view, or space the dots wider if they are less than 8 camera pixels "
+            "apart"
+        )
     return best[1] / best[1][2, 2]
 
 
@@ -104,8 +110,9 @@ def resample(image: np.ndarray, homography: np.ndarray, shape: tuple[int, int]) 
     Interpolates with a Lanczos kernel: to look at, and to make registered sets of finely sampled pictures.
     """
     there = np.ascontiguousarray(image, np.float32)
-    return cv2.warpPerspective(there, np.asarray(homography, np.float64), (shape[1], shape[0]),
-                               flags=cv2.INTER_LANCZOS4)
+    return cv2.warpPerspective(
+        there, np.asarray(homography, np.float64), (shape[1], shape[0]), flags=cv2.INTER_LANCZOS4
+    )
 
 
 def _spots(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -144,7 +151,7 @@ def _flux(light: np.ndarray, xy: np.ndarray, radius: float) -> np.ndarray:
     flux = np.zeros(len(xy))
     for number, (x, y) in enumerate(xy):
         left, top = max(round(x) - reach, 0), max(round(y) - reach, 0)
-        part = light[top:round(y) + reach + 1, left:round(x) + reach + 1]
+        part = light[top : round(y) + reach + 1, left : round(x) + reach + 1]
         away = np.hypot(np.arange(part.shape[1]) + left - x, np.arange(part.shape[0])[:, None] + top - y)
         inside = np.clip(radius + 0.5 - away, 0, 1)
         rim = part[np.abs(away - radius) < 0.8]
@@ -158,14 +165,14 @@ def _centroid(light: np.ndarray, x: float, y: float, size: float) -> tuple[float
     reach = math.ceil(3.5 * sigma)
     for _ in range(12):
         left, top = max(round(x) - reach, 0), max(round(y) - reach, 0)
-        part = light[top:round(y) + reach + 1, left:round(x) + reach + 1]
+        part = light[top : round(y) + reach + 1, left : round(x) + reach + 1]
         part = np.maximum(part - np.quantile(part, 0.1), 0)
         u, v = np.arange(part.shape[1]) + left - x, np.arange(part.shape[0])[:, None] + top - y
-        weight = part * np.exp(-(u ** 2 + v ** 2) / (2 * sigma ** 2))
+        weight = part * np.exp(-(u**2 + v**2) / (2 * sigma**2))
         total = float(weight.sum()) + 1e-12
         dx, dy = float((weight * u).sum()) / total, float((weight * v).sum()) / total
-        spread = float((weight * (u ** 2 + v ** 2)).sum()) / total / 2
-        width = math.sqrt(1 / max(1 / max(spread, 1e-3) - 1 / sigma ** 2, 1 / (9 * sigma ** 2)))
+        spread = float((weight * (u**2 + v**2)).sum()) / total / 2
+        width = math.sqrt(1 / max(1 / max(spread, 1e-3) - 1 / sigma**2, 1 / (9 * sigma**2)))
         # the window pulls the moments towards its own centre: the step is lengthened by what it takes away
         stretch = 1 + (width / sigma) ** 2
         step = min(1.0, reach / (2 * stretch * math.hypot(dx, dy) + 1e-9))
@@ -182,8 +189,11 @@ def _markers(points: np.ndarray, light: np.ndarray) -> list[tuple[int, int]]:
     order = [int(i) for i in np.argsort(-light)[:6] if light[i] > LIGHT[1]]
     tree = cKDTree(points)
     step = float(np.median(tree.query(points, k=2)[0][:, 1]))
-    pairs = [(float(light[a] + light[b]), a, b) for a, b in itertools.permutations(order, 2)
-             if light[a] > max(light[b], LIGHT[0]) and np.hypot(*(points[a] - points[b])) < 1.6 * step]
+    pairs = [
+        (float(light[a] + light[b]), a, b)
+        for a, b in itertools.permutations(order, 2)
+        if light[a] > max(light[b], LIGHT[0]) and np.hypot(*(points[a] - points[b])) < 1.6 * step
+    ]
     return [(a, b) for _, a, b in sorted(pairs, reverse=True)[:4]]
 
 

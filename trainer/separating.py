@@ -29,7 +29,8 @@ def captures_that_separate(parts: Parts, one: tuple[str, Model], other: tuple[st
     here = _difference(one[1], other[1], batch)
     channels = [c.name for c in parts.captures.bench.channels]
     proposals = [
-        (f"the same patterns at {row.plane_mm * f:.3g} mm", replace(batch, plane_mm=row.plane_mm * f)) for f in PLANES
+        (f"the same patterns at {row.plane_mm * f:.3g} mm", replace(batch, plane_mm=row.plane_mm * f))
+        for f in PLANES
     ]
     unused = [c for c in channels if c not in parts.captures.channels]
     proposals += [(f"the same patterns in {c}", replace(batch, channel=c)) for c in unused]

@@ -19,9 +19,9 @@ import pytest
 import torch
 
 from tests.trainer.hidden import bench_file
-from trainer.captures import read_captures
 from trainer.candidates import evaluate_captures, screen_batches
 from trainer.capture import capture_from
+from trainer.captures import read_captures
 from trainer.diagnose import parts_of, with_gains
 from trainer.effects import catalogue
 from trainer.evidence import load

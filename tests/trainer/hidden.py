@@ -38,7 +38,9 @@ read_noise_e = 5
 """
 
 
-def bench_file(folder: Path, *defects: str, width: int = 160, height: int = 128, distance_mm: float = 15) -> Path:
+def bench_file(
+    folder: Path, *defects: str, width: int = 160, height: int = 128, distance_mm: float = 15
+) -> Path:
     """A virtual bench's TOML file with defects given as TOML lines after [[defect]]."""
     path = folder / "bench-with-secrets.toml"
     text = BENCH.format(width=width, height=height, distance_mm=distance_mm)
@@ -55,7 +57,9 @@ def ran(capsys: pytest.CaptureFixture[str], *argv: object) -> dict[str, Any]:
     return json.loads(out)
 
 
-def captured(capsys: pytest.CaptureFixture[str], folder: Path, *defects: str, options: tuple[object, ...] = ()) -> Path:
+def captured(
+    capsys: pytest.CaptureFixture[str], folder: Path, *defects: str, options: tuple[object, ...] = ()
+) -> Path:
     """A capture set taken from a bench with these defects."""
     where = folder / "captures"
     ran(capsys, "capture", "--bench", bench_file(folder, *defects), "--out", where, *options)

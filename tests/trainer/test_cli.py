@@ -352,7 +352,7 @@ def test_explain_shows_the_ladder_and_writes_the_model(
     arguments = ["explain", str(captures), "--out", str(out), "--workers", "1"]
     assert cli.main(arguments) == 0
     page = capsys.readouterr().out
-    assert page.startswith("distance (offset 0.2 mm) took the excess from 0.04 to 1e-05. Done.")
+    assert page.startswith("distance (offset 0.200 mm) took the excess from 0.04 to 1e-05. Done.")
     assert "panel_wavefront" in page
     assert f"hololoop-trainer export --out bundle --model {out}" in page
     about = out.read_text(encoding="utf-8")

@@ -18,8 +18,8 @@ from firmware_iface.errors import InputError
 from trainer.bench_file import read_bench
 from trainer.effects import catalogue
 from trainer.model import Model, absent
+from trainer.numbers import measured, number, parameters, percent
 from trainer.report import write_report
-from trainer.report.numbers import measured, number, parameters, percent
 from trainer.report.pictures import blocks, draw, place
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}

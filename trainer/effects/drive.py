@@ -110,4 +110,3 @@ def _taps(width: Tensor, asymmetry: Tensor) -> Tensor:
     distance = centre[:, None] - pixel[None, :]
     taps = below(distance + 0.5) - below(distance - 0.5)
     return taps / taps.sum(dim=1, keepdim=True)
-

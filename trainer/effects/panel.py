@@ -19,9 +19,16 @@ from trainer.starts import wavefront_starts
     orders=(0, 2, 4),
     parameters=[
         Parameter(
-            "leak_real", "1", scale=0.02, low=-1, high=1, about="in phase with gray level 0, of the modulated amplitude"
+            "leak_real",
+            "1",
+            scale=0.02,
+            low=-1,
+            high=1,
+            about="in phase with gray level 0, of the modulated amplitude",
         ),
-        Parameter("leak_imaginary", "1", scale=0.02, low=-1, high=1, about="a quarter wave ahead of gray level 0"),
+        Parameter(
+            "leak_imaginary", "1", scale=0.02, low=-1, high=1, about="a quarter wave ahead of gray level 0"
+        ),
         Parameter(
             "fill_factor",
             "1",
@@ -96,4 +103,3 @@ def panel_wavefront(panel: Panel, wavefront: Tensor) -> Panel:
     """The beam or the panel is not flat."""
     phase = legendre_surface(wavefront, panel.y, panel.x) * (panel.reference_wavelength / panel.wavelength)
     return panel.multiplied(torch.polar(torch.ones_like(phase), phase))
-

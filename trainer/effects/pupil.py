@@ -93,7 +93,9 @@ def iris(pupil: Pupil, half_width: Tensor, centre_y: Tensor, centre_x: Tensor) -
 def temporal_coherence(pupil: Pupil, line_width: Tensor) -> Pupil:
     """The laser has a line width (full width at half maximum of a Gaussian line)."""
     rule = np.polynomial.hermite_e.hermegauss(LINES)
-    nodes, weights = (torch.as_tensor(a / s, dtype=line_width.dtype) for a, s in zip(rule, (1, rule[1].sum()), strict=True))
+    nodes, weights = (
+        torch.as_tensor(a / s, dtype=line_width.dtype) for a, s in zip(rule, (1, rule[1].sum()), strict=True)
+    )
     return replace(pupil, lines=(nodes * line_width * 1e-9 / FWHM, weights))
 
 
@@ -101,11 +103,33 @@ def temporal_coherence(pupil: Pupil, line_width: Tensor) -> Pupil:
     stage="pupil",
     told_to="display",
     parameters=[
-        Parameter("extent_y", "mrad", scale=0.3, low=0, high=50, even=True, starts=(0.1, 0.3, 1.0), about="rms angle"),
-        Parameter("extent_x", "mrad", scale=0.3, low=0, high=50, even=True, starts=(0.1, 0.3, 1.0), about="rms angle"),
+        Parameter(
+            "extent_y",
+            "mrad",
+            scale=0.3,
+            low=0,
+            high=50,
+            even=True,
+            starts=(0.1, 0.3, 1.0),
+            about="rms angle",
+        ),
+        Parameter(
+            "extent_x",
+            "mrad",
+            scale=0.3,
+            low=0,
+            high=50,
+            even=True,
+            starts=(0.1, 0.3, 1.0),
+            about="rms angle",
+        ),
         Parameter("kurtosis", "1", scale=0.5, low=-1.5, high=1.5, about="shape: 0 Gaussian, -1 uniform disc"),
-        Parameter("halo", "1", scale=0.05, low=0, high=0.9, about="share of the light in a wider, round part"),
-        Parameter("halo_extent", "mrad", scale=0.3, absent=1.0, low=0.01, high=100, about="rms angle of that part"),
+        Parameter(
+            "halo", "1", scale=0.05, low=0, high=0.9, about="share of the light in a wider, round part"
+        ),
+        Parameter(
+            "halo_extent", "mrad", scale=0.3, absent=1.0, low=0.01, high=100, about="rms angle of that part"
+        ),
     ],
 )
 def spatial_coherence(

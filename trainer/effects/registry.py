@@ -86,7 +86,9 @@ def load_effects(path: Path) -> list[Effect]:
     found = [value for value in vars(module).values() if isinstance(value, Effect)]
     own = [e for e in found if e not in BUILT_IN]
     if not own:
-        raise InputError(f"effects file {path} defines no effect: decorate a function with trainer.effects.effect")
+        raise InputError(
+            f"effects file {path} defines no effect: decorate a function with trainer.effects.effect"
+        )
     return own
 
 
@@ -95,5 +97,7 @@ def _add(known: Catalogue, effects: list[Effect], where: str) -> None:
         if not isinstance(one, Effect):
             raise InputError(f"{where} gives {type(one).__name__}, not an effect: use trainer.effects.effect")
         if one.name in known:
-            raise InputError(f"{where} defines '{one.name}', which is already the name of an effect: rename it")
+            raise InputError(
+                f"{where} defines '{one.name}', which is already the name of an effect: rename it"
+            )
         known[one.name] = one

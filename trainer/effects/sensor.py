@@ -19,10 +19,16 @@ from trainer.starts import gain_spread, ghost_starts, registration_starts
     stage="sensor",
     told_to="camera",
     parameters=[
-        Parameter("width_y", "pixels", scale=0.15, low=0, high=20, even=True, starts=(0.3, 0.6, 1.2), about="rms"),
-        Parameter("width_x", "pixels", scale=0.15, low=0, high=20, even=True, starts=(0.3, 0.6, 1.2), about="rms"),
+        Parameter(
+            "width_y", "pixels", scale=0.15, low=0, high=20, even=True, starts=(0.3, 0.6, 1.2), about="rms"
+        ),
+        Parameter(
+            "width_x", "pixels", scale=0.15, low=0, high=20, even=True, starts=(0.3, 0.6, 1.2), about="rms"
+        ),
         Parameter("kurtosis", "1", scale=0.5, low=-1.5, high=1.5, about="shape: 0 Gaussian, -1 uniform disc"),
-        Parameter("halo", "1", scale=0.05, low=0, high=0.9, about="share of the light in a wider, round part"),
+        Parameter(
+            "halo", "1", scale=0.05, low=0, high=0.9, about="share of the light in a wider, round part"
+        ),
         Parameter("halo_width", "pixels", scale=0.3, absent=2.0, low=0.1, high=60, about="rms of that part"),
     ],
 )
@@ -43,7 +49,14 @@ def sensor_blur(
         Parameter("shift_y", "pixels", scale=0.05, low=-60, high=60),
         Parameter("shift_x", "pixels", scale=0.05, low=-60, high=60),
         Parameter("rotation", "mrad", scale=0.5, low=-300, high=300),
-        Parameter("magnification", "%", scale=0.05, low=-20, high=20, about="size of the picture in excess of nominal"),
+        Parameter(
+            "magnification",
+            "%",
+            scale=0.05,
+            low=-20,
+            high=20,
+            about="size of the picture in excess of nominal",
+        ),
         Parameter(
             "distortion",
             "pixels",
@@ -83,7 +96,13 @@ def misregistration(
     orders=(2, 4, 6),
     parameters=[
         Parameter(
-            "log_gain", "1", scale=0.03, low=-4, high=4, count=legendre_count, about="Legendre terms over the picture"
+            "log_gain",
+            "1",
+            scale=0.03,
+            low=-4,
+            high=4,
+            count=legendre_count,
+            about="Legendre terms over the picture",
         )
     ],
 )
@@ -160,10 +179,25 @@ def laser_drift(sensor: Sensor, spread: Tensor) -> Sensor:
     told_to="display",
     starts=ghost_starts,
     parameters=[
-        Parameter("amplitude", "1", scale=0.01, low=0, high=1, about="irradiance of the copy over that of the picture"),
+        Parameter(
+            "amplitude",
+            "1",
+            scale=0.01,
+            low=0,
+            high=1,
+            about="irradiance of the copy over that of the picture",
+        ),
         Parameter("shift_y", "pixels", scale=0.3, low=-200, high=200),
         Parameter("shift_x", "pixels", scale=0.3, low=-200, high=200),
-        Parameter("blur", "pixels", scale=0.3, low=0, high=20, even=True, about="rms of the copy's own blur along an axis"),
+        Parameter(
+            "blur",
+            "pixels",
+            scale=0.3,
+            low=0,
+            high=20,
+            even=True,
+            about="rms of the copy's own blur along an axis",
+        ),
     ],
 )
 def ghost(sensor: Sensor, amplitude: Tensor, shift_y: Tensor, shift_x: Tensor, blur: Tensor) -> Sensor:

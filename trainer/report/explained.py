@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from trainer.model import Model
+from trainer.numbers import listed, number, parameters, percent, plain
 from trainer.parameters import json_values
 from trainer.report import charts
-from trainer.report.numbers import listed, number, parameters, percent, plain
 from trainer.report.pictures import DIFFERENCE, IRRADIANCE, Map, draw, from_zero, place, symmetric
 from trainer.verdict import Thresholds
 

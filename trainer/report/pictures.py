@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
-from trainer.report.numbers import number
+from trainer.numbers import number
 
 IRRADIANCE = "viridis"
 ERROR = "cividis"

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from trainer.numbers import number, percent
 from trainer.report import charts
-from trainer.report.numbers import number, percent
 from trainer.report.pictures import (
     DIFFERENCE,
     ERROR,

@@ -11,8 +11,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from runtime.files import whole_file
 from trainer.model import Model
+from trainer.numbers import listed, number, percent, sentence
 from trainer.report import explained, seen
-from trainer.report.numbers import listed, number, percent, sentence
 
 METHOD = (
     "Every number comes from captures that no fit has seen: excess is the mean squared error beyond the "
