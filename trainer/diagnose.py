@@ -80,8 +80,9 @@ class Diagnosis:
 
     @property
     def probe_pictures(self) -> list[tuple[str, str, np.ndarray, str]]:
-        """(stage, title, array, unit) of everything that the free-form probes found."""
-        return [(p.stage, *picture) for p in self.probes for picture in p.pictures]
+        """(stage, title, array, unit) of what the free-form probes found, where they found anything."""
+        found = [p for p in self.probes if p.gone.value > 0.01 * self.held_out.excess]
+        return [(p.stage, *picture) for p in found for picture in p.pictures]
 
     @property
     def sentence(self) -> str:
