@@ -96,7 +96,8 @@ class LightPath:
     None: light the pattern does not modulate. aperture: side of a pixel's active area as a share of the
     pitch (rows, columns). transfers [M, 2 band + 1, 2 band + 1] complex and weights [M]: the pupil's modes.
     irradiance_filter: None, or a transfer function of irradiance over `rfft2` frequencies of the fine grid,
-    for what the eye sees too.
+    for what the eye sees too. far_field: None, or the matrices (rows, columns) that take the band to the fine
+    image grid where the image lies in the far field (`propagation.far_field_matrix`).
     """
 
     grid: Grid
@@ -109,6 +110,7 @@ class LightPath:
     leak: Array | None = None
     aperture: tuple[Array, Array] | tuple[float, float] = (1.0, 1.0)
     irradiance_filter: Array | None = None
+    far_field: tuple[Array, Array] | None = None
 
 
 def panel_phase(path: LightPath, gray: Array) -> Array:
@@ -137,6 +139,10 @@ def panel_spectrum(path: LightPath, phase: Array) -> Array:
 
 def image_field(path: LightPath, spectrum: Array, mode: int) -> Array:
     """Field of one pupil mode on the fine image grid, up to a linear phase that changes no irradiance."""
+    if path.far_field is not None:
+        onto_rows, onto_columns = path.far_field
+        xp = array_namespace(spectrum)
+        return onto_rows @ (spectrum * path.transfers[mode, ...]) @ xp.matrix_transpose(onto_columns)
     grid = path.grid
     rows, columns = _image_window(grid)
     z = ifft(spectrum * path.transfers[mode, ...], axis=-1, n=FINE * grid.padded[1])
@@ -301,6 +307,10 @@ def _column_spectrum_adjoint(grid: Grid, spectrum: Array) -> Array:
 
 def _image_field_adjoint(path: LightPath, z: Array, mode: int) -> Array:
     xp = array_namespace(z)
+    if path.far_field is not None:
+        onto_rows, onto_columns = path.far_field
+        back = xp.conj(xp.matrix_transpose(onto_rows)) @ z @ xp.conj(onto_columns)
+        return xp.conj(path.transfers[mode, ...]) * back
     grid = path.grid
     rows, columns = _image_window(grid)
     height, width = (FINE * n for n in grid.padded)

@@ -80,14 +80,37 @@ def far_field(u: Array, pitch: float, y: Array, x: Array, wavelength: Array, dis
     """
     xp = array_namespace(u)
     height, width = u.shape[-2:]
+    rows = _far_kernel(y, height, pitch, wavelength, distance)
+    columns = _far_kernel(x, width, pitch, wavelength, distance)
+    return rows @ u @ xp.matrix_transpose(columns)
 
-    def kernel(positions: Array, count: int) -> Array:
-        samples = (xp.arange(count, dtype=positions.dtype) - (count - 1) / 2) * pitch
-        angle = -2 * math.pi / (wavelength * distance) * positions[:, None] * samples[None, :]
-        return xp.cos(angle) + 1j * xp.sin(angle)
 
-    scale = pitch**2 / (wavelength * distance)
-    return scale * (kernel(y, height) @ u @ xp.matrix_transpose(kernel(x, width)))
+def far_field_matrix(
+    band: list[int],
+    padded: int,
+    count: int,
+    pitch: float,
+    position: Array,
+    wavelength: Array,
+    distance: Array,
+) -> Array:
+    """Fraunhofer field at `position` [n] (m) from the spectrum along one axis: [n, len(band)] complex.
+
+    The spectrum is the DFT over `padded` samples, at the frequency indices `band`, of a field on the first `count`
+    samples: an inverse DFT onto the panel, then `far_field` along this axis.
+    """
+    xp = array_namespace(position)
+    sample = xp.arange(count, dtype=position.dtype)
+    angle = (2 * math.pi / padded) * sample[:, None] * xp.asarray(band, dtype=position.dtype)[None, :]
+    inverse = (xp.cos(angle) + 1j * xp.sin(angle)) / padded
+    return _far_kernel(position, count, pitch, wavelength, distance) @ inverse
+
+
+def _far_kernel(position: Array, count: int, pitch: float, wavelength: Array, distance: Array) -> Array:
+    xp = array_namespace(position)
+    samples = (xp.arange(count, dtype=position.dtype) - (count - 1) / 2) * pitch
+    angle = -2 * math.pi / (wavelength * distance) * position[:, None] * samples[None, :]
+    return (pitch / (wavelength * distance) ** 0.5) * (xp.cos(angle) + 1j * xp.sin(angle))
 
 
 def check_sampling(

@@ -15,6 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from firmware_iface.errors import InputError
 from runtime.bundle import write_bundle
 from runtime.calibrated import pack_light_paths
 from runtime.lightpath import Grid, LightPath
@@ -35,6 +36,11 @@ def export_bundle(
     for every colour. Raises InputError where the folder is not empty (unless `replace_folder`) or where a
     plane cannot be computed.
     """
+    if model.method == "fraunhofer":
+        raise InputError(
+            "a far-field model cannot be exported: the headset's light path is angular_spectrum or fresnel; change "
+            "method under [propagation] in the model file"
+        )
     shown, left_out = (
         told_to_display(model),
         [p.effect for p in model.present if p.effect.told_to != "display"],

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from runtime.fft import irfft2, rfft2
 from runtime.lightpath import (
+    FINE,
     Grid,
     LightPath,
     at_pixels,
@@ -27,7 +28,13 @@ from runtime.lightpath import (
     panel_phase,
     panel_spectrum,
 )
-from runtime.propagation import Aperture, band_limit, check_sampling, transfer_function
+from runtime.propagation import (
+    Aperture,
+    band_limit,
+    check_sampling,
+    far_field_matrix,
+    transfer_function,
+)
 from trainer.bench_file import Bench
 from trainer.effects.definition import STAGES, Effect
 from trainer.model import Model, Present
@@ -71,7 +78,9 @@ def _scene(
     panel = bench.panel
     half_width = min(bench.iris.half_width * opened, 1.95)
     distance = plane_mm * 1e-3
-    grid = grid_for(panel.shape, panel.pitch, wavelength, distance, half_width)
+    # In the far field nothing walks out of the grid: the image has its own, and the panel needs no room.
+    spread = 0.0 if method == "fraunhofer" else distance
+    grid = grid_for(panel.shape, panel.pitch, wavelength, spread, half_width)
     check_sampling(
         method,
         Aperture(panel.shape, grid.padded, panel.pitch),
@@ -191,7 +200,25 @@ def light_path(scene: Scene, stages: Stages) -> LightPath:
         leak=stages.panel.leak,
         aperture=(stages.panel.aperture[0], stages.panel.aperture[1]),
         irradiance_filter=display_filter(stages),
+        far_field=_far_field(scene, stages.pupil) if scene.method == "fraunhofer" else None,
     )
+
+
+def _far_field(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
+    """Matrices from the band to the fine image grid, about the panel's axis. A laser's line is its centre here."""
+    grid = scene.grid
+    matrices = []
+    for axis in (0, 1):
+        count = grid.shape[axis]
+        sample = torch.arange(grid.image_shape[axis], dtype=scene.dtype) / FINE - grid.margin
+        position = (sample - (count - 1) / 2) * grid.pitch
+        band = grid.frequency_index(axis)
+        matrices.append(
+            far_field_matrix(
+                band, grid.padded[axis], count, grid.pitch, position, scene.wavelength, pupil.distance
+            )
+        )
+    return matrices[0], matrices[1]
 
 
 def display_filter(stages: Stages) -> Tensor | None:
@@ -225,9 +252,11 @@ def _modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
     modes = []
     for offset in offsets:
         wavelength = scene.wavelength + offset
-        mode = opening * transfer_function(
-            pupil.fy, pupil.fx, wavelength, pupil.distance, (limits[0], limits[1]), scene.method
-        )
+        mode = opening
+        if scene.method != "fraunhofer":
+            mode = opening * transfer_function(
+                pupil.fy, pupil.fx, wavelength, pupil.distance, (limits[0], limits[1]), scene.method
+            )
         if pupil.path_difference is not None:
             angle = 2 * math.pi / wavelength * pupil.path_difference
             mode = mode * torch.polar(torch.ones_like(angle), angle)
