@@ -23,6 +23,7 @@ from trainer.effects.definition import Effect
 from trainer.evidence import Batch, load, load_batch
 from trainer.excess import Errors, errors_of, join
 from trainer.fit import (
+    Fitted,
     Predictor,
     fit,
     keys_of,
@@ -128,15 +129,14 @@ def _start(effect: Effect, model: Model, predictors: list[Predictor], points: li
             evidence.append(Evidence(predictor.scene, predictor.batch, prediction))
         starts += [placed(effect, model.bench, values) for values in effect.starts(evidence)]
     if len(starts) == 1:
-        best = starts[0]
-    else:
-        few, there = predictors[:3], points[:3]
-        costs = [start_cost(model, few, there, start) for start in starts]
-        if max(costs) - min(costs) < 1e-9 * max(costs):
-            # A period or a place says nothing while the amplitude is zero: look one step ahead.
-            costs = [_one_step_ahead(model, few, there, start) for start in starts]
-        best = starts[costs.index(min(costs))]
-    return pattern_search(model, predictors[:3], points[:3], best) if effect.rugged else best
+        return starts[0]
+    # A start need only be near: one colour and plane tell.
+    few, there = predictors[:1], points[:1]
+    costs = [start_cost(model, few, there, start) for start in starts]
+    if max(costs) - min(costs) < 1e-9 * max(costs):
+        # A period or a place says nothing while the amplitude is zero: look one step ahead.
+        costs = [_one_step_ahead(model, few, there, start) for start in starts]
+    return starts[costs.index(min(costs))]
 
 
 def placed(effect: Effect, bench: Bench, values: dict[str, Any]) -> Present:
@@ -191,11 +191,21 @@ def try_effect(
     captures = opened(folder)
     batches = load(captures, chosen(captures, ids))
     name = start.effect.name
-    fitted = fit(model.having(start), [name], batches, iterations)
+    fitted = fit_from(model, start, batches, iterations)
     if raising:
         fitted = raise_order(fitted, name, batches, least_for_order)
     held_out = evaluate_captures(captures, chosen(captures, held_ids), fitted.model)
     return Tried(name, fitted.model, fitted.errors.excess, held_out)
+
+
+def fit_from(model: Model, start: Present, batches: Sequence[Batch], iterations: int = 12) -> Fitted:
+    """Fit one effect from a start; where derivatives do not reach far, after a pattern search."""
+    if start.effect.rugged:
+        with torch.no_grad():
+            predictors = [Predictor(model.having(start), b) for b in batches[:3]]
+            points = [p.trace(model) for p in predictors]
+            start = pattern_search(model, predictors, points, start)
+    return fit(model.having(start), [start.effect.name], batches, iterations)
 
 
 def least_for_order(excess: float) -> float:

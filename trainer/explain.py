@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from trainer.candidates import Screened, evaluate_captures, least_for_order, screen_batches
+from trainer.candidates import Screened, evaluate_captures, fit_from, least_for_order, screen_batches
 from trainer.captures import CaptureSet
 from trainer.diagnose import (
     Diagnosis,
@@ -126,7 +126,7 @@ def add_from(parts: Parts, model: Model, start: Present) -> Model:
     """The model with an effect fitted from a start, its order raised, and everything present refitted together."""
     batches = load(parts.captures, parts.fitted)
     name = start.effect.name
-    fitted = fit(model.having(start), [name], batches)
+    fitted = fit_from(model, start, batches)
     fitted = raise_order(fitted, name, batches, least_for_order)
     return settled(fitted.model, batches).model if len(fitted.model.names) > 1 else fitted.model
 
