@@ -197,7 +197,9 @@ def diagnose(
     candidates = [e for e in known.values() if e.name not in model.names]
     screened = screen_all(parts, model, candidates, pool, say)
     order = sorted(screened, key=lambda s: -s.removed)
-    promising = [s for s in order[:FIRST_TRIED] if s.removed > 0.05 * max(order[0].removed, 1e-12)] or order[:1]
+    promising = [s for s in order[:FIRST_TRIED] if s.removed > 0.05 * max(order[0].removed, 1e-12)] or order[
+        :1
+    ]
     # A screen by derivatives says little of an effect whose derivatives do not reach: such are always fitted.
     first = promising + [s for s in order if known[s.effect].rugged and s not in promising]
     tried = try_all(parts, model, before, first[:2] if complete else first, pool, say, 0.3, 0.6)

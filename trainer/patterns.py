@@ -23,6 +23,7 @@ from firmware_iface.errors import InputError
 from runtime.lightpath import grid_for
 from runtime.propagation import band_limit, transfer_function
 from trainer.bench_file import Bench
+from trainer.registration import dot_pattern
 
 Gray = NDArray[np.uint8]
 Array = NDArray[np.floating]
@@ -87,17 +88,29 @@ def choose_patterns(bench: Bench, channel: str, plane_mm: float, count: int, see
     return patterns
 
 
+def dots_to_show(bench: Bench, channel: str, plane_mm: float, spacing: float) -> Gray:
+    """Gray levels that show the dot pattern of `trainer.registration` in a plane, for finding the camera.
+
+    Raises InputError as `dot_pattern` does, and where the plane is out of reach.
+    """
+    setting = _Setting(bench, channel, plane_mm, np.random.default_rng(0), 0)
+    picture = np.maximum(dot_pattern(bench.panel.shape, spacing).astype(float), 1e-3)
+    return setting.gray(_hologram(setting, picture, _bent(setting, 0.1)))
+
+
+def _bent(s: _Setting, edge: float) -> Array:
+    """A quadratic phase over the picture, as behind a lens; `edge` is its slope at the border, cycles a pixel."""
+    height, width = s.shape
+    y, x = _centred(height) / height, _centred(width) / width
+    return math.pi * edge * (height * y[:, None] ** 2 + width * x[None, :] ** 2)
+
+
 def _smooth_picture(s: _Setting) -> Gray:
     """A picture whose light starts with a quadratic phase, as behind a lens: smooth, and spread over the
     pupil.
     """
-    height, width = s.shape
-    y, x = _centred(height) / height, _centred(width) / width
-    edge = (0.35, 0.1)[
-        s.turn % 2
-    ]  # cycles a pixel at the border: inside the band, with room for the picture's own
-    bend = math.pi * edge * (height * y[:, None] ** 2 + width * x[None, :] ** 2)
-    return s.gray(_hologram(s, _picture(s.shape, 2 * s.turn), bend))
+    edge = (0.35, 0.1)[s.turn % 2]  # inside the band, with room for the picture's own
+    return s.gray(_hologram(s, _picture(s.shape, 2 * s.turn), _bent(s, edge)))
 
 
 def _rough_picture(s: _Setting) -> Gray:

@@ -74,9 +74,9 @@ def effects_option(parser: ArgumentParser) -> None:
     )
 
 
-def out_option(parser: ArgumentParser, metavar: str, what: str) -> None:
-    """--out, required."""
-    parser.add_argument("--out", metavar=metavar, type=Path, required=True, help=what)
+def out_option(parser: ArgumentParser, metavar: str, what: str, required: bool = True) -> None:
+    """--out."""
+    parser.add_argument("--out", metavar=metavar, type=Path, required=required, help=what)
 
 
 def report_option(parser: ArgumentParser) -> None:

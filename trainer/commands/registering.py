@@ -1,0 +1,117 @@
+"""register: the homography of a camera that does not look at the panel's own pixels, from a dot pattern."""
+
+from __future__ import annotations
+
+import copy
+import tomllib
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from firmware_iface.errors import InputError
+from trainer.commands.command import Command, Result, out_option
+from trainer.commands.screen import Screen
+
+SAME = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+
+
+def run_register(args: Namespace, screen: Screen) -> Result:
+    """Writes the pattern to show, or reads its picture and writes the homography into bench.toml."""
+    from trainer.bench_file import read_bench
+
+    path: Path = args.bench
+    tables = _tables(path)
+    camera = tables.get("camera")
+    if isinstance(camera, dict):
+        camera.setdefault("homography", SAME)
+        camera["registered"] = False
+    bench = read_bench(tables)
+    channel = args.channel or bench.channels[0].name
+    bench.channel(channel)
+    if args.image is None:
+        if args.out is None:
+            raise InputError(
+                "say where the dot pattern goes (--out DOTS.png), or give its picture as IMAGE.png"
+            )
+        from runtime.cli import write_gray
+        from trainer.patterns import dots_to_show
+
+        write_gray(args.out, dots_to_show(bench, channel, args.plane or bench.distance_mm, args.spacing))
+        return {"pattern": str(args.out), "spacing_px": args.spacing, "channel": channel}
+    from trainer.captures import read_picture
+    from trainer.registration import dots_of, find_homography
+
+    depth = 16 if bench.camera.bit_depth > 8 else 8
+    image = read_picture(args.image, bench.camera.shape, depth, f"the dot picture {args.image}")
+    found = find_homography(image.astype(float), dots_of(bench.panel.shape, args.spacing))
+    _write(path, found)
+    return {"homography": found.tolist(), "bench": str(path), "spacing_px": args.spacing, "channel": channel}
+
+
+def _tables(path: Path) -> dict[str, Any]:
+    try:
+        return copy.deepcopy(tomllib.loads(path.read_text(encoding="utf-8")))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read ({error}): name the bench.toml of a capture set") from error
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path} is not TOML: {error}") from error
+
+
+def _write(path: Path, homography: np.ndarray) -> None:
+    """Puts the homography into the bench file; all else, comments too, stays."""
+    import tomlkit
+
+    from runtime.files import whole_file
+
+    document: Any = tomlkit.parse(path.read_text(encoding="utf-8"))
+    document["camera"]["registered"] = False
+    document["camera"]["homography"] = [[float(f"{v:.9g}") for v in row] for row in homography]
+    with whole_file(path, "w") as stream:
+        stream.write(tomlkit.dumps(document))
+
+
+def show_register(result: Result, args: Namespace, screen: Screen) -> None:
+    """Says what was written, and what comes next."""
+    if "pattern" in result:
+        screen.out.write(
+            f"{result['pattern']} shows dots {result['spacing_px']:g} panel pixels apart in {result['channel']}.\n\n"
+            "Show it, take a picture that is not saturated, and say:\n"
+            f"  hololoop-trainer register {args.bench} picture.png --spacing {result['spacing_px']:g}\n"
+        )
+    else:
+        screen.out.write(
+            f"{result['bench']} now has the homography from camera pixels to panel pixels.\n\n"
+            f"Next:\n  hololoop-trainer check {args.bench.parent}\n"
+        )
+
+
+def _options(parser: ArgumentParser) -> None:
+    parser.add_argument("bench", metavar="BENCH.toml", type=Path, help="the bench file of a capture set")
+    parser.add_argument(
+        "image", metavar="IMAGE.png", type=Path, nargs="?", help="the camera's picture of the dot pattern"
+    )
+    parser.add_argument(
+        "--spacing", type=float, default=32.0, metavar="PX", help="panel pixels between dots (default 32)"
+    )
+    parser.add_argument("--channel", metavar="NAME", help="colour to show the dots in (default: the first)")
+    parser.add_argument(
+        "--plane", type=float, metavar="MM", help="image plane (default: the bench's distance)"
+    )
+    out_option(parser, "DOTS.png", "where the pattern to show goes", required=False)
+
+
+def commands() -> list[Command]:
+    """The commands of this file."""
+    return [
+        Command(
+            "register",
+            "Find where an unregistered camera looks, from a dot pattern.",
+            "register captures/bench.toml --spacing 32 --out dots.png",
+            "Show dots.png, take a picture of it, and give that: register captures/bench.toml picture.png",
+            _options,
+            run_register,
+            show_register,
+        )
+    ]
