@@ -334,7 +334,7 @@ def _inseparable(
     if not thresholds.worth_adding(removed(before, other.held_out), ideal_excess, candidates):
         return False
     worse, better = (one, other) if one.held_out.excess > other.held_out.excess else (other, one)
-    return thresholds.inseparable(removed(worse.held_out, better.held_out))
+    return thresholds.inseparable(removed(worse.held_out, better.held_out), better.held_out.excess)
 
 
 def probe_all(parts: Parts, model: Model, before: Errors, pool: Pool, say: Progress) -> list[Probed]:

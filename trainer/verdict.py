@@ -45,7 +45,11 @@ class Thresholds:
         """Is what remains too little to explain?"""
         return excess < max(self.complete_share * ideal_excess, self.complete_excess)
 
-    def inseparable(self, difference: Removed) -> bool:
-        """Can the data not tell two explanations apart: the interval of their difference holds zero, or it is tiny?"""
+    def inseparable(self, difference: Removed, unexplained: float) -> bool:
+        """Can the data not tell two explanations apart?
+
+        So it is when the interval of their difference holds zero, or when the difference is small: below `excess`, or
+        below a fifth of what the better one leaves `unexplained`, which is how wrong its own shape may be.
+        """
         low, _ = difference.interval(1 - self.level)
-        return low <= 0 or difference.value < self.excess
+        return low <= 0 or difference.value < max(self.excess, 0.2 * unexplained)
