@@ -22,7 +22,7 @@ from trainer.fit import Predictor, fit, with_gain
 from trainer.localise import BrightnessSums, FieldSums, FrequencySums, Seen
 from trainer.model import Model
 from trainer.photon_transfer import compare_repeats
-from trainer.prediction import scene_for, stages_for
+from trainer.scene import scene_for, stages_for
 
 PICTURES = 3  # held-out captures whose pictures are kept for the report
 PAIRS = 12  # pairs of repeats that the noise is checked on

@@ -24,7 +24,8 @@ from trainer.effects.definition import Effect
 from trainer.evidence import scenes
 from trainer.model import Model
 from trainer.parameters import json_values
-from trainer.prediction import light_path, scene_for, stages_for
+from trainer.prediction import light_path
+from trainer.scene import scene_for, stages_for
 
 
 def export_bundle(

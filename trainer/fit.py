@@ -20,7 +20,8 @@ from trainer.effects.definition import STAGES, Effect
 from trainer.evidence import Batch
 from trainer.excess import Errors, errors_of, join
 from trainer.model import Model, Present, Values, absent, raised
-from trainer.prediction import Scene, Stages, Trace, counts, light_on_camera, scene_for, stages_for, trace
+from trainer.prediction import Trace, counts, light_on_camera, trace
+from trainer.scene import Scene, Stages, scene_for, stages_for
 from trainer.starts import Evidence
 
 STEP = 0.1  # of a parameter's scale: large against single precision's rounding, small against curvature

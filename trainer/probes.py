@@ -26,7 +26,8 @@ from trainer.evidence import Batch, load, load_batch, scenes
 from trainer.excess import Errors, Removed, errors_of, join, removed
 from trainer.fit import Predictor
 from trainer.model import Model
-from trainer.prediction import Stages, Trace, counts, light_on_camera, light_path, trace
+from trainer.prediction import Trace, counts, light_on_camera, light_path, trace
+from trainer.scene import Stages
 
 Picture = tuple[str, np.ndarray, str]
 Tensors = dict[str, Tensor]

@@ -15,7 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from trainer.prediction import light_on_camera, stages_for, trace
+from trainer.prediction import light_on_camera, trace
+from trainer.scene import stages_for
 from trainer.starts import Evidence
 
 MOST_CAPTURES = 3

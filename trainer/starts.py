@@ -17,7 +17,7 @@ from torch import Tensor
 
 if TYPE_CHECKING:  # effects name these starts, and the light path's trainer side names effects
     from trainer.evidence import Batch
-    from trainer.prediction import Scene
+    from trainer.scene import Scene
 
 Starts = list[dict[str, Any]]
 TILE = 64

@@ -27,7 +27,8 @@ from trainer.effects import catalogue
 from trainer.evidence import load
 from trainer.fit import fit
 from trainer.model import Model, absent
-from trainer.prediction import light_on_camera, scene_for, stages_for, trace
+from trainer.prediction import light_on_camera, trace
+from trainer.scene import scene_for, stages_for
 
 HOLOLOOP = Path(sys.executable).with_name("hololoop-trainer")
 ROWS: list[tuple[str, str]] = []

@@ -18,16 +18,8 @@ from trainer.bases import legendre_maps, zernike_maps
 from trainer.bench_file import Bench, read_bench
 from trainer.effects import catalogue
 from trainer.model import Model, Present, absent
-from trainer.prediction import (
-    Scene,
-    Stages,
-    counts,
-    light_on_camera,
-    light_path,
-    scene_for,
-    stages_for,
-    trace,
-)
+from trainer.prediction import counts, light_on_camera, light_path, trace
+from trainer.scene import Scene, Stages, scene_for, stages_for
 
 TABLE = {
     "phase_response": ("drive", "display"),

@@ -21,7 +21,8 @@ from trainer.captures import read_captures, write_captures
 from trainer.effects import catalogue
 from trainer.export import export_bundle
 from trainer.model import Model, Present, absent
-from trainer.prediction import light_path, scene_for, stages_for
+from trainer.prediction import light_path
+from trainer.scene import scene_for, stages_for
 
 CAMERA = ("sensor_blur", "misregistration", "vignetting", "stray_light", "sensor_response", "laser_drift")
 

@@ -14,7 +14,8 @@ from tests.trainer.hidden import BENCH
 from trainer.bench_file import Bench, read_bench
 from trainer.export import export_bundle
 from trainer.model import Model
-from trainer.prediction import light_on_camera, light_path, scene_for, stages_for, trace
+from trainer.prediction import light_on_camera, light_path, trace
+from trainer.scene import scene_for, stages_for
 
 
 def bench(side: int, distance_mm: float) -> Bench:

@@ -16,7 +16,8 @@ from trainer.captures import CaptureSet, read_captures
 from trainer.effects.definition import Effect
 from trainer.model import Model, Present, absent
 from trainer.patterns import choose_patterns
-from trainer.prediction import counts, light_on_camera, scene_for, stages_for, trace
+from trainer.prediction import counts, light_on_camera, trace
+from trainer.scene import scene_for, stages_for
 
 BRIGHTNESS = 0.13  # mean signal, share of full scale
 

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from trainer.effects import Parameter, effect
-from trainer.prediction import stages_for
 from trainer.pull import pull
+from trainer.scene import stages_for
 from trainer.stages import Pupil
 
 
