@@ -2,18 +2,39 @@
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
+import pickle
+import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import (
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    as_completed,
+)
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from firmware_iface.errors import InputError
 
+if TYPE_CHECKING:
+    from distributed import Client
+
 T = TypeVar("T")
+
+ANSWER_S = 5.0  # a Dask scheduler that has not answered by then is not there
+LOST = (
+    "a process that was fitting has gone, as when memory runs out: "
+    "use fewer --workers or smaller captures, and try again"
+)
 
 
 @dataclass(frozen=True)
@@ -29,13 +50,18 @@ class Pool:
         tasks: Iterable[tuple[Any, ...]],
         progress: Callable[[int], None] | None = None,
     ) -> list[T]:
-        """Results of `function(*task)` in the order of the tasks; `progress` is told how many are done."""
+        """Results of `function(*task)` in the order of the tasks; `progress` is told how many are done.
+
+        Raises what the function raises, and InputError when a process that works on tasks is lost.
+        """
         futures = [self.executor.submit(function, *task) for task in tasks]
         try:
             for done, _ in enumerate(as_completed(futures), 1):
                 if progress:
                     progress(done)
             return [f.result() for f in futures]
+        except (BrokenExecutor, CancelledError) as error:
+            raise InputError(LOST) from error
         except BaseException:
             for f in futures:
                 f.cancel()
@@ -51,42 +77,96 @@ def cores() -> int:
 
 @contextmanager
 def open_pool(workers: int | None = None, cluster: str | None = None) -> Iterator[Pool]:
-    """A pool of `workers` processes (default: one a processor; 1: this process), or of a Dask cluster's workers.
+    """A pool of `workers` processes (default: one a processor; 1: this process), or of a Dask cluster.
 
     Cluster workers need hololoop installed, and the capture set and effect files at the same paths. Raises
-    InputError when the cluster does not answer.
+    InputError when the cluster does not answer, has no workers, or its workers have no hololoop.
     """
     if cluster is not None:
-        try:
-            from distributed import Client
-        except ImportError as error:
-            raise InputError("--cluster needs Dask: pip install 'hololoop[cluster]'") from error
-        try:
-            client = Client(cluster, timeout="10s", set_as_default=False)
-        except (OSError, ValueError, TimeoutError) as error:
-            raise InputError(
-                f"no Dask scheduler answers at {cluster} ({error}): start one, or leave --cluster out"
-            ) from error
-        try:
-            threads = sum(client.nthreads().values())
-            yield Pool(client.get_executor(pure=False), max(1, threads))
-        finally:
-            client.close()
+        with _cluster(cluster) as pool:
+            yield pool
         return
     count = workers or cores()
     if count < 1:
         raise InputError(f"--workers {workers}: give a number of processes from 1 on")
     if count == 1:
-        executor: Executor = _Here()
-    else:
-        executor = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _single_threaded)
+        yield Pool(_Here(), 1)
+        return
+    executor = _Processes(count, multiprocessing.get_context("spawn"), _single_threaded)
     try:
         yield Pool(executor, count)
     except BaseException:
+        busy = list((executor._processes or {}).values())  # which `shutdown` forgets
         executor.shutdown(wait=False, cancel_futures=True)
-        _stop(executor)
+        for process in busy:
+            process.terminate()
         raise
     executor.shutdown()
+
+
+@contextmanager
+def _cluster(address: str) -> Iterator[Pool]:
+    try:
+        from distributed import Client
+        from distributed.scheduler import KilledWorker
+    except ImportError as error:
+        raise InputError("--cluster needs Dask: pip install 'hololoop[cluster]'") from error
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # one sentence says it, below
+    try:
+        _greet(address)
+        client = Client(address, timeout=ANSWER_S, set_as_default=False)
+    except Exception as error:  # whatever a stranger at that address may have said
+        known = str(error) if isinstance(error, OSError | ValueError) else ""
+        raise InputError(
+            f"no Dask scheduler answers at {address!r} ({known or 'what is there does not speak Dask'}): "
+            "start one, or leave --cluster out"
+        ) from error
+    try:
+        _prepare(client, address)
+        yield Pool(_Packed(client.get_executor(pure=False)), max(1, sum(client.nthreads().values())))
+    except KilledWorker as error:
+        raise InputError(LOST) from error
+    finally:
+        client.close(timeout=ANSWER_S)
+
+
+def _greet(address: str) -> None:
+    """Waits for a scheduler's first words; by itself a client waits for them for ever."""
+    import asyncio
+
+    from distributed.comm import connect
+
+    async def greeted() -> None:
+        comm = await connect(address, timeout=ANSWER_S)
+        comm.abort()
+
+    with ThreadPoolExecutor(1) as thread:  # a notebook's own thread runs a loop already
+        thread.submit(lambda: asyncio.run(asyncio.wait_for(greeted(), ANSWER_S))).result()
+
+
+def _prepare(client: Client, address: str) -> None:
+    """Sees that there are workers, that they have hololoop, and that they look at the disk afresh."""
+    if not client.nthreads():
+        raise InputError(
+            f"the Dask scheduler at {address} has no workers: start one with: dask worker {address}"
+        )
+    try:
+        client.run(import_module, __name__)
+        client.run(_forget)
+    except ImportError as error:
+        raise InputError(
+            f"a Dask worker of {address} cannot use hololoop ({error}): "
+            "install it there, with the extra 'trainer'"
+        ) from error
+
+
+def _forget() -> None:
+    """Drops what an earlier run has left in a worker: captures and effect files may have changed since."""
+    from trainer.candidates import opened
+    from trainer.effects import definition
+
+    opened.cache_clear()
+    definition._loaded.clear()
 
 
 class _Here(Executor):
@@ -102,21 +182,43 @@ class _Here(Executor):
         return future
 
 
-def _stop(executor: Executor) -> None:
-    """End worker processes that are still busy: their results are no longer wanted."""
-    for process in list((getattr(executor, "_processes", None) or {}).values()):
-        process.terminate()
+class _Processes(ProcessPoolExecutor):
+    """Processes that Ctrl-C does not reach, from their very start: it is their parent's to handle."""
+
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        """The future of a call; starts a process where one is wanting."""
+        if not hasattr(signal, "pthread_sigmask"):  # Windows
+            return super().submit(fn, *args, **kwargs)
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # processes inherit it
+        try:
+            return super().submit(fn, *args, **kwargs)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+class _Packed(Executor):
+    """Hands tasks to a cluster as bytes: a Dask worker that cannot unpack a task itself never answers."""
+
+    def __init__(self, executor: Executor) -> None:
+        self.executor = executor
+
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        """The future of a call."""
+        return self.executor.submit(_unpacked, pickle.dumps((fn, args, kwargs)))
+
+
+def _unpacked(packed: bytes) -> Any:
+    function, args, kwargs = pickle.loads(packed)
+    return function(*args, **kwargs)
 
 
 def _single_threaded() -> None:
-    import signal
-
     import torch
 
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
     torch.set_num_threads(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # where there are no masks
 
 
 def _end_with_parent() -> None:

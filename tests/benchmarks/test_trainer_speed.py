@@ -10,6 +10,7 @@ import resource
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -121,8 +122,7 @@ def read_captures_bench(folder: Path):
 
 def test_growth(tmp_path):
     def seconds(side: int, count: int) -> float:
-        path = tmp_path / f"{side}-{count}"
-        path.mkdir()
+        path = Path(tempfile.mkdtemp(dir=tmp_path))
         spec = bench_file(path, 'kind = "zero_order"', width=side, height=side, distance_mm=10)
         capture_from(str(spec), path / "captures", patterns=count - 1)
         rows = read_captures(path / "captures")

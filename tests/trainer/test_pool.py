@@ -1,0 +1,281 @@
+"""The same numbers wherever fits run, and one sentence where they cannot."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from firmware_iface.errors import InputError
+from trainer.captures import CaptureSet, read_captures
+from trainer.cli import main
+from trainer.diagnose import diagnose
+from trainer.effects import testing
+from trainer.effects.registry import Catalogue, catalogue, load_effects
+from trainer.model import Model
+from trainer.pool import open_pool
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+
+OWN = '''
+"""A sensor that is more sensitive at the bottom, and at the corners."""
+from trainer.effects import Parameter, effect
+
+@effect(stage="sensor", told_to="camera", parameters=[Parameter("tilt", "1", scale=0.03, low=-1, high=1)])
+def row_tilt(sensor, tilt):
+    """Rows differ in sensitivity."""
+    return sensor.multiplied(1 + tilt * sensor.y)
+
+@effect(stage="sensor", told_to="camera", parameters=[Parameter("twist", "1", scale=0.03, low=-1, high=1)])
+def corner_twist(sensor, twist):
+    """Corners differ in sensitivity."""
+    return sensor.multiplied(1 + twist * sensor.y * sensor.x)
+'''
+
+
+@pytest.fixture(scope="module")
+def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A user's file of effects."""
+    path = tmp_path_factory.mktemp("own") / "own.py"
+    path.write_text(OWN)
+    return path
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory: pytest.TempPathFactory, own: Path) -> CaptureSet:
+    """A small capture set with a user's effect hidden in it."""
+    effect = next(e for e in load_effects(own) if e.name == "row_tilt")
+    return testing.captures_with(tmp_path_factory.mktemp("pool") / "set", effect, {"tilt": 0.2}, patterns=4)
+
+
+def few(known: Catalogue, own: Path) -> Catalogue:
+    """Effects that are quick to try, and those of the user's file."""
+    return {n: e for n, e in known.items() if e.source == str(own) or n in ("vignetting", "sensor_blur")}
+
+
+def test_one_process_and_two_give_the_same_numbers(captures: CaptureSet, own: Path) -> None:
+    known = few(catalogue([own]), own)
+    assert len(known) == 4
+    told: list[float] = []
+    found = []
+    for workers in (1, 2):
+        with open_pool(workers) as pool:
+            assert pool.workers == workers
+            one = diagnose(captures, Model(captures.bench), known, pool, progress=lambda s, _: told.append(s))
+            found.append(one)
+    assert found[0].best is not None
+    assert found[0].best.effect.name in ("row_tilt", "vignetting")
+    alone, together = (numbers(f.as_json()) for f in found)
+    assert list(alone) == list(together)
+    assert list(alone.values()) == pytest.approx(list(together.values()), rel=1e-3, abs=1e-7)
+    assert told[-1] == 1
+    assert all(0 <= share <= 1 for share in told)
+
+
+def numbers(found: Any, where: str = "") -> dict[str, float]:
+    """Every number of a JSON object by its place; words are part of the place."""
+    if isinstance(found, dict):
+        parts = [numbers(v, f"{where}.{k}") for k, v in found.items() if k != "sentence"]
+    elif isinstance(found, list | tuple):
+        parts = [numbers(v, f"{where}[{k}]") for k, v in enumerate(found)]
+    else:
+        number = isinstance(found, int | float) and not isinstance(found, bool)
+        return {where: found} if number else {f"{where} = {found}": 0.0}
+    return {place: value for part in parts for place, value in part.items()}
+
+
+def test_results_come_in_the_order_of_the_tasks_and_errors_come_out() -> None:
+    told: list[int] = []
+    with open_pool(1) as pool:
+        assert pool.map(pow, [(2, k) for k in range(5)], told.append) == [1, 2, 4, 8, 16]
+        assert told == [1, 2, 3, 4, 5]
+        assert pool.map(pow, []) == []
+        with pytest.raises(ZeroDivisionError):
+            pool.map(divmod, [(1, 1), (1, 0)])
+    with pytest.raises(InputError, match="--workers -1"), open_pool(-1):
+        pass
+
+
+def test_a_process_that_is_lost_is_one_sentence() -> None:
+    with pytest.raises(InputError, match="memory"), open_pool(2) as pool:
+        pool.map(os._exit, [(3,)])
+
+
+# --- in processes of their own: what a signal does to workers that are in the middle of a task ---
+
+SCRIPT = """
+import sys, time
+from trainer.pool import open_pool
+if __name__ == "__main__":
+    try:
+        with open_pool(2) as pool:
+            if sys.argv[1] == "ready":
+                pool.map(time.sleep, [(0.5,)] * 2)
+            print("go", flush=True)
+            pool.map(time.sleep, [(60,)] * 4)
+    except KeyboardInterrupt:
+        sys.exit(130)
+"""
+
+
+@pytest.mark.parametrize(
+    ("when", "delay", "which"),
+    [
+        ("starting", 0.3, "SIGINT"),
+        ("starting", 0.8, "SIGINT"),
+        ("ready", 0.5, "SIGINT"),
+        ("ready", 0.5, "SIGKILL"),
+    ],
+)
+def test_workers_stop_at_once_and_without_a_word(when: str, delay: float, which: str, tmp_path: Path) -> None:
+    psutil = pytest.importorskip("psutil")
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    process = subprocess.Popen(
+        [sys.executable, str(script), when],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "go\n"
+    time.sleep(delay)
+    family = psutil.Process(process.pid).children(recursive=True)
+    assert len(family) >= 2
+    if which == "SIGINT":
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all of them
+    else:
+        process.kill()
+    start = time.monotonic()
+    try:
+        _, err = process.communicate(timeout=40)
+    finally:
+        _, alive = psutil.wait_procs(family, timeout=10)
+        for one in alive:
+            one.kill()
+    assert time.monotonic() - start < 20
+    assert not alive
+    if which == "SIGINT":
+        assert (process.returncode, err) == (130, "")
+
+
+# --- on a Dask cluster ---
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[str]:
+    """Address of a scheduler with one worker, a process of its own."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, dashboard_address=None, processes=True
+    ) as started:
+        yield started.scheduler_address
+
+
+Run = Callable[..., dict[str, Any]]
+
+
+@pytest.fixture
+def diagnosed(captures: CaptureSet, own: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> Run:
+    """`diagnose --json` of the set with a user's effects; only a few of the others are tried, to be quick."""
+    monkeypatch.setattr("trainer.pool.cores", lambda: 1)
+    monkeypatch.setattr("trainer.effects.registry.catalogue", lambda files=(): few(catalogue(files), own))
+
+    def run(*options: str) -> dict[str, Any]:
+        capsys.readouterr()
+        code = main(["diagnose", str(captures.folder), "--effects", str(own), "--json", *options])
+        out, err = capsys.readouterr()
+        assert code == 0, err
+        found: dict[str, Any] = json.loads(out)
+        return found
+
+    return run
+
+
+def test_a_cluster_gives_the_ranking_that_this_process_gives(cluster: str, diagnosed: Run) -> None:
+    here = diagnosed("--workers", "1")
+    there = diagnosed("--cluster", cluster)
+    assert "row_tilt" in [r["effect"] for r in here["ranking"]]
+    assert "corner_twist" in [s["effect"] for s in here["screen"]]
+    alone, together = numbers(here), numbers(there)
+    assert list(alone) == list(together)
+    assert list(alone.values()) == pytest.approx(list(together.values()), rel=1e-3, abs=1e-7)
+
+
+def test_a_cluster_sees_captures_and_effects_as_they_are_now(
+    cluster: str, captures: CaptureSet, own: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "mine.py"
+    sizes = []
+    for sign in ("+", "-"):
+        path.write_text(OWN.replace("1 + tilt", f"1 {sign} tilt"))
+        known = few(catalogue([path]), path)
+        with open_pool(cluster=cluster) as pool:
+            found = diagnose(captures, Model(captures.bench), known, pool, with_probes=False)
+        best = next(r for r in found.ranking if r.effect.name == "row_tilt")
+        sizes.append(float(best.model.present[0].values["tilt"]))
+    assert sizes == pytest.approx([0.2, -0.2], abs=0.01)
+
+    folder = tmp_path / "set"
+    for tilt in (0.2, 0.1):
+        if folder.exists():
+            folder.rename(tmp_path / "before")
+        testing.captures_with(folder, catalogue([own])["row_tilt"], {"tilt": tilt}, patterns=3)
+        with open_pool(cluster=cluster) as pool:
+            set_now = read_captures(folder)
+            found = diagnose(
+                set_now, Model(set_now.bench), few(catalogue([own]), own), pool, with_probes=False
+            )
+        best = next(r for r in found.ranking if r.effect.name == "row_tilt")
+        assert float(best.model.present[0].values["tilt"]) == pytest.approx(tilt, abs=0.01)
+
+
+def test_a_task_that_a_cluster_cannot_read_comes_back_as_an_error(
+    cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "only_here.py").write_text("def double(x):\n    return 2 * x\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    from only_here import double  # type: ignore[import-not-found]
+
+    with pytest.raises(ModuleNotFoundError, match="only_here"), open_pool(cluster=cluster) as pool:
+        pool.map(double, [(1,)])
+
+
+def one_line_of_error(capsys: pytest.CaptureFixture[str]) -> str:
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1, err
+    assert "Traceback" not in err
+    return err
+
+
+def test_no_scheduler_is_one_sentence_and_soon(captures: CaptureSet, capsys: Any) -> None:
+    pytest.importorskip("distributed")
+    with socket.socket() as free, socket.socket() as silent:
+        free.bind(("127.0.0.1", 0))  # taken, so that nobody else listens there
+        silent.bind(("127.0.0.1", 0))
+        silent.listen()
+        addresses = [f"tcp://127.0.0.1:{s.getsockname()[1]}" for s in (free, silent)]
+        for address in [*addresses, "nonsense", "ftp://127.0.0.1:1"]:
+            start = time.monotonic()
+            assert main(["diagnose", str(captures.folder), "--cluster", address, "--json"]) == 2
+            assert f"no Dask scheduler answers at '{address}'" in one_line_of_error(capsys)
+            assert time.monotonic() - start < 12
+
+
+def test_a_scheduler_without_workers_is_one_sentence(captures: CaptureSet, capsys: Any) -> None:
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=0, dashboard_address=None, processes=False) as empty:
+        assert main(["diagnose", str(captures.folder), "--cluster", empty.scheduler_address]) == 2
+    assert "has no workers: start one" in one_line_of_error(capsys)
