@@ -65,9 +65,13 @@ class Tried:
     held_out: Errors
 
 
-@lru_cache(maxsize=4)
 def opened(folder: Path) -> CaptureSet:
-    """The capture set of a folder, read once a process."""
+    """The capture set of a folder, read once a process, and again when its tables have changed."""
+    return _opened(folder, *((folder / name).stat().st_mtime_ns for name in ("bench.toml", "captures.csv")))
+
+
+@lru_cache(maxsize=4)
+def _opened(folder: Path, *changed: int) -> CaptureSet:
     return read_captures(folder)
 
 

@@ -39,10 +39,11 @@ LOST = (
 
 @dataclass(frozen=True)
 class Pool:
-    """A `concurrent.futures` executor and how many tasks it runs at once."""
+    """A `concurrent.futures` executor, how many tasks it runs at once, and whether in other processes."""
 
     executor: Executor
     workers: int
+    elsewhere: bool = True
 
     def map(
         self,
@@ -54,12 +55,17 @@ class Pool:
 
         Raises what the function raises, and InputError when a process that works on tasks is lost.
         """
-        futures = [self.executor.submit(function, *task) for task in tasks]
+        if self.elsewhere:
+            packed = [pickle.dumps((function, task)) for task in tasks]
+            futures: list[Future[Any]] = [self.executor.submit(_packed, p) for p in packed]
+        else:
+            futures = [self.executor.submit(function, *task) for task in tasks]
         try:
             for done, _ in enumerate(as_completed(futures), 1):
                 if progress:
                     progress(done)
-            return [f.result() for f in futures]
+            results = [f.result() for f in futures]
+            return [pickle.loads(r) for r in results] if self.elsewhere else results
         except (BrokenExecutor, CancelledError) as error:
             raise InputError(LOST) from error
         except BaseException:
@@ -90,7 +96,7 @@ def open_pool(workers: int | None = None, cluster: str | None = None) -> Iterato
     if count < 1:
         raise InputError(f"--workers {workers}: give a number of processes from 1 on")
     if count == 1:
-        yield Pool(_Here(), 1)
+        yield Pool(_Here(), 1, elsewhere=False)
         return
     executor = _Processes(count, multiprocessing.get_context("spawn"), _single_threaded)
     try:
@@ -123,7 +129,7 @@ def _cluster(address: str) -> Iterator[Pool]:
         ) from error
     try:
         _prepare(client, address)
-        yield Pool(_Packed(client.get_executor(pure=False)), max(1, sum(client.nthreads().values())))
+        yield Pool(client.get_executor(pure=False), max(1, sum(client.nthreads().values())))
     except KilledWorker as error:
         raise InputError(LOST) from error
     finally:
@@ -145,7 +151,7 @@ def _greet(address: str) -> None:
 
 
 def _prepare(client: Client, address: str) -> None:
-    """Sees that there are workers, that they have hololoop, and that they look at the disk afresh."""
+    """Sees that there are workers, that they have hololoop, and that they read effect files again."""
     if not client.nthreads():
         raise InputError(
             f"the Dask scheduler at {address} has no workers: start one with: dask worker {address}"
@@ -161,11 +167,10 @@ def _prepare(client: Client, address: str) -> None:
 
 
 def _forget() -> None:
-    """Drops what an earlier run has left in a worker: captures and effect files may have changed since."""
-    from trainer.candidates import opened
+    """Drops the effect files that an earlier run has left in a worker: they may have changed since."""
+    import trainer.candidates  # noqa: F401 - says early what a worker lacks
     from trainer.effects import definition
 
-    opened.cache_clear()
     definition._loaded.clear()
 
 
@@ -196,20 +201,13 @@ class _Processes(ProcessPoolExecutor):
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-class _Packed(Executor):
-    """Hands tasks to a cluster as bytes: a Dask worker that cannot unpack a task itself never answers."""
+def _packed(task: bytes) -> bytes:
+    """Runs a task; a worker that cannot read it gives the error back, where Dask's own would never answer.
 
-    def __init__(self, executor: Executor) -> None:
-        self.executor = executor
-
-    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
-        """The future of a call."""
-        return self.executor.submit(_unpacked, pickle.dumps((fn, args, kwargs)))
-
-
-def _unpacked(packed: bytes) -> Any:
-    function, args, kwargs = pickle.loads(packed)
-    return function(*args, **kwargs)
+    Results are bytes for torch's sake, which otherwise passes tensors through sockets and shared memory.
+    """
+    function, arguments = pickle.loads(task)
+    return pickle.dumps(function(*arguments))
 
 
 def _single_threaded() -> None:

@@ -140,6 +140,7 @@ def test_ctrl_c_while_the_workers_start_is_one_line_too(
 ) -> None:
     explaining = explain(2)
     explaining.until(lambda: explaining.model() is not None and len(explaining.family()) >= 2)
+    time.sleep(0.4)  # they import by now, and have not been told yet what to do about signals
     family = explaining.family()
     os.killpg(explaining.process.pid, signal.SIGINT)
     code, out, err, took = explaining.ended()
@@ -150,14 +151,3 @@ def test_ctrl_c_while_the_workers_start_is_one_line_too(
     assert took < 10
     assert gone(family)
     assert_clean(explaining, tmp_path)
-
-
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL here")
-def test_workers_do_not_outlive_a_command_that_is_killed(explain: Callable[[int], Explaining]) -> None:
-    explaining = explain(2)
-    explaining.until(lambda: explaining.model() is not None and len(explaining.family()) >= 3)
-    family = explaining.family()
-    time.sleep(1)
-    explaining.process.kill()
-    explaining.process.communicate(timeout=PATIENCE_S)
-    assert gone(family)

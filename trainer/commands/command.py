@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 import shlex
+import signal
+import threading
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -42,6 +45,22 @@ class Command:
 
 class Interrupted(KeyboardInterrupt):
     """Ctrl-C, with a sentence on what is left of the work."""
+
+
+@contextmanager
+def ctrl_c_waits() -> Iterator[None]:
+    """Ctrl-C within the block takes effect at its end: what is done there is done whole, and known to be done."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, frame: came.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if came:
+        raise KeyboardInterrupt
 
 
 def captures_argument(parser: ArgumentParser) -> None:

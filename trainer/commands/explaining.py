@@ -13,6 +13,7 @@ from trainer.commands.command import (
     Result,
     captures_argument,
     command_line,
+    ctrl_c_waits,
     inputs_of,
     model_options,
     origin,
@@ -128,27 +129,28 @@ def run_explain(args: Namespace, screen: Screen) -> Result:
     saved: list[tuple[str, ...]] = []
 
     def save(better: Model) -> None:
-        write_model(args.out, better, source)
-        saved.append(better.names)
+        with ctrl_c_waits():
+            write_model(args.out, better, source)
+            saved.append(better.names)
 
     try:
         with screen.progress("explaining") as told, open_pool(workers_of(args), args.cluster) as pool:
             found = explain(captures, model, known, pool, thresholds, save, told)
+        save(found.model)
+        if args.report:
+            from trainer.compare import compare
+            from trainer.report import write_report
+
+            write_report(
+                args.report,
+                f"Explanation: {captures.folder.name}",
+                comparison=compare(captures, found.model),
+                diagnosis=found.diagnosis,
+                ladder=found.as_json(args.out),
+                model=found.model,
+            )
     except KeyboardInterrupt:
         raise Interrupted(_interrupted(saved, model.names, args.out)) from None
-    write_model(args.out, found.model, source)
-    if args.report:
-        from trainer.compare import compare
-        from trainer.report import write_report
-
-        write_report(
-            args.report,
-            f"Explanation: {captures.folder.name}",
-            comparison=compare(captures, found.model),
-            diagnosis=found.diagnosis,
-            ladder=found.as_json(args.out),
-            model=found.model,
-        )
     return {**found.as_json(args.out), "effects": _sizes(found.model)}
 
 
