@@ -7,14 +7,19 @@ both sides.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from firmware_iface.errors import InputError
+from trainer.bench_file import Bench
 from trainer.captures import Capture, CaptureSet
+from trainer.scene import looks_at
 
+PAST = 16  # panel pixels beyond the panel's border; the light path is computed for 24
 FIT_PIXELS = 4 * 240 * 320  # about four small pictures hold a few dozen parameters to far below the noise
 
 
@@ -102,13 +107,40 @@ def load(captures: CaptureSet, chosen: Iterable[Capture], dtype: torch.dtype = t
     ]
 
 
+@lru_cache(maxsize=4)
+def in_view(bench: Bench) -> np.ndarray | None:
+    """Which camera pixels look at the panel, or not far past it, bool [h, w]; None where all of them do.
+
+    Farther out nothing is predicted: most cameras see more than the panel's picture. Raises InputError where the
+    homography puts no pixel there.
+    """
+    if bench.camera.registered:
+        return None
+    y, x = looks_at(bench.camera)
+    height, width = bench.panel.shape
+    seen = (y >= -PAST) & (y <= height - 1 + PAST) & (x >= -PAST) & (x <= width - 1 + PAST)
+    if not seen.any():
+        raise InputError(
+            "camera.homography puts no pixel of the camera on the panel: give the matrix from camera pixels "
+            "(x, y, 1) to panel pixels, not its inverse, or find it with: hololoop-trainer register bench.toml"
+        )
+    return seen
+
+
+def first_of(batch: Batch) -> Batch:
+    """The batch with its first capture alone."""
+    tensors = {n: getattr(batch, n)[:1] for n in ("gray", "signal", "weight", "noise", "exposure")}
+    return replace(batch, ids=batch.ids[:1], **tensors)
+
+
 def load_batch(captures: CaptureSet, chosen: list[Capture], dtype: torch.dtype = torch.float32) -> Batch:
     """Captures of one colour and plane as a batch."""
+    view = in_view(captures.bench)
     signals, weights, grays = [], [], []
     for c in chosen:
         signal, valid = captures.signal(c)
         signals.append(signal)
-        weights.append(valid)
+        weights.append(valid if view is None else valid & view)
         grays.append(captures.gray(c).astype(np.int32))
     signal = np.stack(signals)
     return Batch(
