@@ -30,8 +30,12 @@ from runtime.propagation import (
 )
 from trainer.bench_file import Bench
 from trainer.model import Model
-from trainer.scene import Scene, Stages, bare_stages, scene_for, stages_for
+from trainer.scene import Scene, Stages, bare_stages, looks_at, scene_for, stages_for
 from trainer.stages import Pupil, Sensor
+
+FINER = (
+    2  # times as many samples for a spline to run through: it is exact up to half of the band that they hold
+)
 
 
 def light_path(scene: Scene, stages: Stages) -> LightPath:
@@ -162,16 +166,15 @@ def light_on_camera(scene: Scene, stages: Stages, image: Tensor) -> Tensor:
     for extra in (stages.pupil.irradiance_filter, sensor.irradiance_filter, sensor.blur):
         if extra is not None:
             transfer = transfer * extra
-    moved = sensor.displacement is not None or not camera.registered
-    if moved:
-        transfer = transfer / (_spline_transfer(sensor.iy / 2) * _spline_transfer(sensor.ix / 2))
-    filtered = irfft2(rfft2(image) * transfer, grid.image_shape)
-    if not moved:
-        return at_pixels(grid, filtered)
+    if sensor.displacement is None and camera.registered:
+        return at_pixels(grid, irfft2(rfft2(image) * transfer, grid.image_shape))
     y, x = camera_positions(scene)
     if sensor.displacement is not None:
         y, x = y + sensor.displacement[0], x + sensor.displacement[1]
-    return _spline_samples(filtered, 2 * (y + grid.margin), 2 * (x + grid.margin))
+    samples = FINER * FINE
+    transfer = transfer / (_spline_transfer(sensor.iy / samples) * _spline_transfer(sensor.ix / samples))
+    finer = _finer(rfft2(image) * transfer, grid.image_shape)
+    return _spline_samples(finer, samples * (y + grid.margin), samples * (x + grid.margin))
 
 
 def counts(
@@ -201,13 +204,7 @@ def counts(
 @lru_cache(maxsize=32)
 def camera_positions(scene: Scene) -> tuple[Tensor, Tensor]:
     """Where each camera pixel's centre looks, in panel pixels: (y, x), each [h, w]."""
-    height, width = scene.bench.camera.shape
-    y, x = np.meshgrid(np.arange(height, dtype=float), np.arange(width, dtype=float), indexing="ij")
-    matrix = scene.bench.camera.homography
-    if matrix is not None:
-        h = np.asarray(matrix, dtype=float).reshape(3, 3)
-        w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
-        y, x = (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w, (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w
+    y, x = looks_at(scene.bench.camera)
     return torch.as_tensor(y, dtype=scene.dtype), torch.as_tensor(x, dtype=scene.dtype)
 
 
@@ -224,6 +221,17 @@ def _pixel_area(scene: Scene, sensor: Sensor) -> Tensor:
         rows = sensor.iy * (y[i + 1, j] - y[i, j]) + sensor.ix * (x[i + 1, j] - x[i, j])
         columns = sensor.iy * (y[i, j + 1] - y[i, j]) + sensor.ix * (x[i, j + 1] - x[i, j])
     return torch.sinc(rows) * torch.sinc(columns)
+
+
+def _finer(spectrum: Tensor, shape: tuple[int, int]) -> Tensor:
+    """The picture of a spectrum as from `rfft2` of `shape`, on a grid that is FINER times as fine."""
+    height, width = (FINER * n for n in shape)
+    half = shape[0] // 2
+    between = spectrum.new_zeros((*spectrum.shape[:-2], height - shape[0], spectrum.shape[-1]))
+    rows = torch.cat((spectrum[..., :half, :], between, spectrum[..., half:, :]), dim=-2)
+    return FINER**2 * irfft2(
+        torch.nn.functional.pad(rows, (0, width // 2 + 1 - rows.shape[-1])), (height, width)
+    )
 
 
 def _spline_transfer(cycles_per_sample: Tensor) -> Tensor:
