@@ -20,7 +20,7 @@ from torch import Tensor
 from trainer.bench_file import Bench
 from trainer.captures import Capture, CaptureSet, read_captures
 from trainer.effects.definition import Effect
-from trainer.evidence import Batch, first_of, load, load_batch
+from trainer.evidence import Batch, load, load_batch
 from trainer.excess import Errors, errors_of, join
 from trainer.fit import (
     Fitted,
@@ -134,9 +134,8 @@ def _start(effect: Effect, model: Model, predictors: list[Predictor], points: li
         starts += [placed(effect, model.bench, values) for values in effect.starts(evidence)]
     if len(starts) == 1:
         return starts[0]
-    # A start need only be near: one capture tells.
-    few = [Predictor(model.having(starts[0]), first_of(predictors[0].batch))]
-    there = [Trace(points[0].spectrum[:1], points[0].image[:1])]
+    # A start need only be near: one colour and plane tell.
+    few, there = predictors[:1], points[:1]
     costs = [start_cost(model, few, there, start) for start in starts]
     if max(costs) - min(costs) < 1e-9 * max(costs):
         # A period or a place says nothing while the amplitude is zero: look one step ahead.

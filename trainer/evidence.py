@@ -7,7 +7,7 @@ both sides.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -125,12 +125,6 @@ def in_view(bench: Bench) -> np.ndarray | None:
             "(x, y, 1) to panel pixels, not its inverse, or find it with: hololoop-trainer register bench.toml"
         )
     return seen
-
-
-def first_of(batch: Batch) -> Batch:
-    """The batch with its first capture alone."""
-    tensors = {n: getattr(batch, n)[:1] for n in ("gray", "signal", "weight", "noise", "exposure")}
-    return replace(batch, ids=batch.ids[:1], **tensors)
 
 
 def load_batch(captures: CaptureSet, chosen: list[Capture], dtype: torch.dtype = torch.float32) -> Batch:
