@@ -35,7 +35,7 @@ $(STAMP): pyproject.toml constraints.txt
 	    exit 1; \
 	fi
 	$(BIN)/python -m pip install -c constraints.txt torch==2.13.0
-	$(BIN)/python -m pip install -c constraints.txt -e '.[trainer,cluster,dev]'
+	$(BIN)/python -m pip install -c constraints.txt -e '.[trainer,cluster,camera,dev]'
 	@touch $@
 
 test: install
