@@ -30,7 +30,7 @@ from runtime.propagation import (
 )
 from trainer.bench_file import Bench
 from trainer.model import Model
-from trainer.scene import Scene, Stages, bare_stages, looks_at, scene_for, stages_for
+from trainer.scene import Scene, Stages, bare_stages, looks_at, on_panel, scene_for, stages_for
 from trainer.stages import Pupil, Sensor
 
 FINER = (
@@ -168,9 +168,12 @@ def light_on_camera(scene: Scene, stages: Stages, image: Tensor) -> Tensor:
             transfer = transfer * extra
     if sensor.displacement is None and camera.registered:
         return at_pixels(grid, irfft2(rfft2(image) * transfer, grid.image_shape))
-    y, x = camera_positions(scene)
-    if sensor.displacement is not None:
-        y, x = y + sensor.displacement[0], x + sensor.displacement[1]
+    if sensor.displacement is None:
+        y, x = camera_positions(scene)
+    else:
+        dy, dx = sensor.displacement
+        rows = torch.arange(dy.shape[-2], dtype=dy.dtype)[:, None]
+        y, x = on_panel(camera, rows + dy, torch.arange(dy.shape[-1], dtype=dy.dtype) + dx)
     samples = FINER * FINE
     transfer = transfer / (_spline_transfer(sensor.iy / samples) * _spline_transfer(sensor.ix / samples))
     finer = _finer(rfft2(image) * transfer, grid.image_shape)

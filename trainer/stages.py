@@ -112,7 +112,7 @@ class Sensor:
 
     y, x [h, w]: -1 .. 1 over the picture. iy [n, 1], ix [1, m]: image frequencies, cycles/pixel of the panel.
     irradiance_filter: transfer function of irradiance that the eye sees too (ghost). blur: the camera's own.
-    displacement: None, or (dy, dx) [h, w], panel pixels. gain, offset [h, w]: offset in counts.
+    displacement: None, or (dy, dx) [h, w], camera pixels. gain, offset [h, w]: offset in counts.
     response: None, or a function of the signal as a share of full scale. full_scale: counts.
     free_capture_gain: each capture has its own gain.
     """
@@ -141,7 +141,7 @@ class Sensor:
         return replace(self, irradiance_filter=transfer if before is None else before * transfer)
 
     def displaced(self, dy: Tensor, dx: Tensor) -> Sensor:
-        """With each camera pixel seeing a place (dy, dx) panel pixels further on."""
+        """With each camera pixel seeing what one (dy, dx) camera pixels further on should see."""
         if self.displacement is not None:
             dy, dx = dy + self.displacement[0], dx + self.displacement[1]
         return replace(self, displacement=torch.broadcast_tensors(dy, dx))

@@ -15,7 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from trainer.scene import on_panel
+
 if TYPE_CHECKING:  # effects name these starts, and the light path's trainer side names effects
+    from trainer.bench_file import Bench
     from trainer.evidence import Batch
     from trainer.scene import Scene
 
@@ -33,8 +36,8 @@ class Evidence:
 
 
 def displacements(evidence: Evidence) -> tuple[NDArray, NDArray, NDArray]:
-    """How far the picture lies from the prediction, tile by tile: centres [n, 2] (-1 .. 1), shifts [n, 2] (pixels),
-    weights [n]. Rows first; a positive shift moves the picture's content down or right.
+    """How far the picture lies from the prediction, tile by tile: centres [n, 2] and shifts [n, 2] (camera pixels),
+    weights [n]. Rows first; centres from the picture's; a positive shift moves the picture's content down or right.
     """
     batch = evidence.batch
     seen = (batch.signal * batch.weight).double().numpy()
@@ -47,7 +50,7 @@ def displacements(evidence: Evidence) -> tuple[NDArray, NDArray, NDArray]:
         for left in _tops(width, size):
             place = (slice(None), slice(top, top + size), slice(left, left + size))
             peak = _peak(_correlation(seen[place], expected[place], taper))
-            centres.append(((2 * top + size - height) / height, (2 * left + size - width) / width))
+            centres.append((top + (size - height) / 2, left + (size - width) / 2))
             shifts.append(peak[:2])
             weights.append(max(peak[2], 0.0) ** 2)
     return np.array(centres), np.array(shifts), np.array(weights)
@@ -56,8 +59,7 @@ def displacements(evidence: Evidence) -> tuple[NDArray, NDArray, NDArray]:
 def registration_starts(evidence: Sequence[Evidence]) -> Starts:
     """Shift, rotation and magnification that bring the prediction onto the picture."""
     centres, shifts, weights = displacements(evidence[0])
-    half = np.array(evidence[0].batch.signal.shape[-2:]) / 2
-    y, x = (centres * half).T
+    y, x = centres.T
     zero, one = np.zeros_like(y), np.ones_like(y)
     # A camera pixel sees a place that much further on: the opposite of where the content went.
     rows = np.concatenate([np.stack([one, zero, x, y], 1), np.stack([zero, one, -y, x], 1)])
@@ -80,11 +82,11 @@ def wavefront_starts(evidence: Sequence[Evidence]) -> Starts:
     A phase slope k (rad/m) at the panel moves light by lambda z k / (2 pi).
     """
     one = evidence[0]
-    centres, shifts, weights = displacements(one)
     bench = one.scene.bench
+    centres, shifts, weights = _on_panel(bench, *displacements(one))
     half = np.array(bench.panel.shape) / 2
     to_pixels = one.scene.wavelength * one.scene.plane_mm * 1e-3 / (2 * math.pi * bench.panel.pitch**2)
-    y, x = centres.T
+    y, x = (centres / half).T
     zero, unit = np.zeros_like(y), np.ones_like(y)
     # Slopes of P1(y), P1(x), P2(y), P1(y) P1(x), P2(x) in the order of `legendre_maps`: (0,1),(1,0) then n = 2.
     slope_y = np.stack([unit, zero, 3 * y, x, zero], 1) / half[0]
@@ -96,7 +98,7 @@ def wavefront_starts(evidence: Sequence[Evidence]) -> Starts:
 
 
 def ghost_starts(evidence: Sequence[Evidence], most: int = 3) -> Starts:
-    """Displacements at which the residual looks most like the prediction."""
+    """Displacements, panel pixels, at which the residual looks most like the prediction."""
     one = evidence[0]
     batch = one.batch
     residual = ((batch.signal - one.prediction) * batch.weight).double().numpy()
@@ -109,7 +111,8 @@ def ghost_starts(evidence: Sequence[Evidence], most: int = 3) -> Starts:
     for _ in range(most):
         i, j = np.unravel_index(int(correlation.argmax()), correlation.shape)
         dy, dx = (int(k) - n if k > n / 2 else int(k) for k, n in ((i, height), (j, width)))
-        starts.append({"amplitude": 0.02, "shift_y": float(dy), "shift_x": float(dx)})
+        _, shift, _ = _on_panel(one.scene.bench, np.zeros((1, 2)), np.array([[dy, dx]], float), np.ones(1))
+        starts.append({"amplitude": 0.02, "shift_y": shift[0, 0], "shift_x": shift[0, 1]})
         for a in range(-2, 3):
             for b in range(-2, 3):
                 correlation[(i + a) % height, (j + b) % width] = 0
@@ -125,6 +128,17 @@ def gain_spread(evidence: Sequence[Evidence]) -> dict[str, Any]:
         own.setdefault(one.batch.channel, []).extend(gains.tolist())
     deviations = np.concatenate([np.array(g) / np.mean(g) - 1 for g in own.values()])
     return {"spread": max(0.01, 100 * float(np.std(deviations)))}
+
+
+def _on_panel(
+    bench: Bench, centres: NDArray, shifts: NDArray, weights: NDArray
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Displacements as `displacements` gives them, in panel pixels; centres from the panel's."""
+    camera = bench.camera
+    middle = (np.array(camera.shape) - 1) / 2
+    there = np.stack(on_panel(camera, *(centres + middle).T), 1)
+    moved = np.stack(on_panel(camera, *(centres + middle + shifts).T), 1)
+    return there - (np.array(bench.panel.shape) - 1) / 2, moved - there, weights
 
 
 def _tops(length: int, size: int) -> list[int]:
