@@ -14,6 +14,8 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from firmware_iface.errors import InputError
 
 Matrix = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
@@ -88,6 +90,19 @@ class Camera:
     def shape(self) -> tuple[int, int]:
         """(height, width), pixels."""
         return self.height, self.width
+
+    def on_panel(self, y: Any, x: Any) -> tuple[Any, Any]:
+        """Places on the camera (pixels; arrays or tensors of one shape) as places on the panel (y, x), panel pixels."""
+        if self.homography is None:
+            return y, x
+        h = self.homography
+        w = h[2][0] * x + h[2][1] * y + h[2][2]
+        return (h[1][0] * x + h[1][1] * y + h[1][2]) / w, (h[0][0] * x + h[0][1] * y + h[0][2]) / w
+
+    def looks_at(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where each pixel's centre looks, in panel pixels: (y, x), each float64 [h, w]."""
+        y, x = np.indices(self.shape, dtype=float)
+        return self.on_panel(y, x)
 
     @property
     def saturation(self) -> int:

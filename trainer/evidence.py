@@ -17,7 +17,6 @@ from torch import Tensor
 from firmware_iface.errors import InputError
 from trainer.bench_file import Bench
 from trainer.captures import Capture, CaptureSet
-from trainer.scene import looks_at
 
 PAST = 16  # panel pixels beyond the panel's border; the light path is computed for 24
 FIT_PIXELS = 4 * 240 * 320  # about four small pictures hold a few dozen parameters to far below the noise
@@ -116,7 +115,7 @@ def in_view(bench: Bench) -> np.ndarray | None:
     """
     if bench.camera.registered:
         return None
-    y, x = looks_at(bench.camera)
+    y, x = bench.camera.looks_at()
     height, width = bench.panel.shape
     seen = (y >= -PAST) & (y <= height - 1 + PAST) & (x >= -PAST) & (x <= width - 1 + PAST)
     if not seen.any():

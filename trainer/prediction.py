@@ -30,7 +30,7 @@ from runtime.propagation import (
 )
 from trainer.bench_file import Bench
 from trainer.model import Model
-from trainer.scene import Scene, Stages, bare_stages, looks_at, on_panel, scene_for, stages_for
+from trainer.scene import Scene, Stages, bare_stages, scene_for, stages_for
 from trainer.stages import Pupil, Sensor
 
 FINER = (
@@ -173,7 +173,7 @@ def light_on_camera(scene: Scene, stages: Stages, image: Tensor) -> Tensor:
     else:
         dy, dx = sensor.displacement
         rows = torch.arange(dy.shape[-2], dtype=dy.dtype)[:, None]
-        y, x = on_panel(camera, rows + dy, torch.arange(dy.shape[-1], dtype=dy.dtype) + dx)
+        y, x = camera.on_panel(rows + dy, torch.arange(dy.shape[-1], dtype=dy.dtype) + dx)
     samples = FINER * FINE
     transfer = transfer / (_spline_transfer(sensor.iy / samples) * _spline_transfer(sensor.ix / samples))
     finer = _finer(rfft2(image) * transfer, grid.image_shape)
@@ -207,7 +207,7 @@ def counts(
 @lru_cache(maxsize=32)
 def camera_positions(scene: Scene) -> tuple[Tensor, Tensor]:
     """Where each camera pixel's centre looks, in panel pixels: (y, x), each [h, w]."""
-    y, x = looks_at(scene.bench.camera)
+    y, x = scene.bench.camera.looks_at()
     return torch.as_tensor(y, dtype=scene.dtype), torch.as_tensor(x, dtype=scene.dtype)
 
 

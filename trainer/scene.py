@@ -11,13 +11,12 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from runtime.lightpath import Grid, band_frequencies, grid_for, image_frequencies
 from runtime.propagation import Aperture, check_sampling
-from trainer.bench_file import Bench, Camera
+from trainer.bench_file import Bench
 from trainer.model import Model, Present
 from trainer.stages import Drive, Panel, Pupil, Sensor
 
@@ -70,22 +69,6 @@ def _scene(
         half_width / (2 * panel.pitch),
     )
     return Scene(bench, channel, plane_mm, method, grid, dtype)
-
-
-def looks_at(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Where each camera pixel's centre looks, in panel pixels: (y, x), each float64 [h, w]."""
-    height, width = camera.shape
-    y, x = np.meshgrid(np.arange(height, dtype=float), np.arange(width, dtype=float), indexing="ij")
-    return on_panel(camera, y, x)
-
-
-def on_panel(camera: Camera, y: Any, x: Any) -> tuple[Any, Any]:
-    """Places on the camera (pixels; arrays or tensors of one shape) as places on the panel: (y, x), panel pixels."""
-    if camera.homography is None:
-        return y, x
-    h = np.asarray(camera.homography, dtype=float).reshape(3, 3).tolist()
-    w = h[2][0] * x + h[2][1] * y + h[2][2]
-    return (h[1][0] * x + h[1][1] * y + h[1][2]) / w, (h[0][0] * x + h[0][1] * y + h[0][2]) / w
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from trainer.scene import on_panel
-
 if TYPE_CHECKING:  # effects name these starts, and the light path's trainer side names effects
     from trainer.bench_file import Bench
     from trainer.evidence import Batch
@@ -136,8 +134,8 @@ def _on_panel(
     """Displacements as `displacements` gives them, in panel pixels; centres from the panel's."""
     camera = bench.camera
     middle = (np.array(camera.shape) - 1) / 2
-    there = np.stack(on_panel(camera, *(centres + middle).T), 1)
-    moved = np.stack(on_panel(camera, *(centres + middle + shifts).T), 1)
+    there = np.stack(camera.on_panel(*(centres + middle).T), 1)
+    moved = np.stack(camera.on_panel(*(centres + middle + shifts).T), 1)
     return there - (np.array(bench.panel.shape) - 1) / 2, moved - there, weights
 
 

@@ -79,38 +79,43 @@ def test_content_hash_follows_every_file(made: CaptureSet, copy: Path) -> None:
 
 
 def test_defaults_of_optional_columns(made: CaptureSet, copy: Path) -> None:
-    (copy / "captures.csv").write_text("capture,channel,phase,image,note\n"
-                                       "a,green,phase/0000.png,image/0000.png,\"x, y\"\n"
-                                       "\n"
-                                       "b,red,phase\\0001.png,image/0001.png,\n")
+    (copy / "captures.csv").write_text(
+        "capture,channel,phase,image,note\n"
+        'a,green,phase/0000.png,image/0000.png,"x, y"\n'
+        "\n"
+        "b,red,phase\\0001.png,image/0001.png,\n"
+    )
     a, b = read_captures(copy).captures
     assert (a.plane_mm, a.pattern, b.pattern, a.extra) == (5.0, "a", "b", {"note": "x, y"})
     assert b.phase == copy / "phase" / "0001.png" and b.time_s == 1.0
 
 
-@pytest.mark.parametrize(("old", "new", "named"), [
-    ("schema = 1", "schema = 2", "schema"),
-    ("pitch_um", "pich_um", "panel.pich_um is not known in bench.toml: did you mean 'pitch_um'"),
-    ("pitch_um = 8.0", "pitch_um = nan", "panel.pitch_um"),
-    ("pitch_um = 8.0", "pitch_um = \"8\"", "panel.pitch_um"),
-    ("pitch_um = 8.0", "pitch_um = true", "panel.pitch_um"),
-    ("pitch_um = 8.0", "pitch_um = 8e-6", "panel.pitch_um"),
-    ("levels = 256", "levels = 256.0", "panel.levels"),
-    ("fill_factor = 1.0", "fill_factor = 0.0", "panel.fill_factor"),
-    ("fill_factor = 1.0", "phase_sign = 2", "panel.phase_sign"),
-    ("wavelength_nm = 520", "wavelength_nm = 0.52", "channel.wavelength_nm"),
-    ("name = \"red\"", "name = \"green\"", "channel.name 'green' is given twice"),
-    ("distance_mm = 5.0", "distance_mm = inf", "propagation.distance_mm"),
-    ("shape = \"square\"", "shape = \"round\"", "iris.shape"),
-    ("black_level = 64", "black_level = 5000", "camera.black_level"),
-    ("registered = true", "registered = false", "camera.homography is missing"),
-    ("registered = true", "registered = 1", "camera.registered"),
-    ("read_noise_e = 5", "", "camera.read_noise_e is missing"),
-    ("[iris]", "[irsi]", "did you mean 'iris'"),
-    ("[camera]\nwidth = 80", "[camera]\nwidth = 64", "registered = true"),
-    ("bit_depth = 12", "bit_depth = " + "9" * 5000, "bench.toml"),
-    ("name = \"made\"", "name = ", "is not TOML"),
-])
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ("schema = 1", "schema = 2", "schema"),
+        ("pitch_um", "pich_um", "panel.pich_um is not known in bench.toml: did you mean 'pitch_um'"),
+        ("pitch_um = 8.0", "pitch_um = nan", "panel.pitch_um"),
+        ("pitch_um = 8.0", 'pitch_um = "8"', "panel.pitch_um"),
+        ("pitch_um = 8.0", "pitch_um = true", "panel.pitch_um"),
+        ("pitch_um = 8.0", "pitch_um = 8e-6", "panel.pitch_um"),
+        ("levels = 256", "levels = 256.0", "panel.levels"),
+        ("fill_factor = 1.0", "fill_factor = 0.0", "panel.fill_factor"),
+        ("fill_factor = 1.0", "phase_sign = 2", "panel.phase_sign"),
+        ("wavelength_nm = 520", "wavelength_nm = 0.52", "channel.wavelength_nm"),
+        ('name = "red"', 'name = "green"', "channel.name 'green' is given twice"),
+        ("distance_mm = 5.0", "distance_mm = inf", "propagation.distance_mm"),
+        ('shape = "square"', 'shape = "round"', "iris.shape"),
+        ("black_level = 64", "black_level = 5000", "camera.black_level"),
+        ("registered = true", "registered = false", "camera.homography is missing"),
+        ("registered = true", "registered = 1", "camera.registered"),
+        ("read_noise_e = 5", "", "camera.read_noise_e is missing"),
+        ("[iris]", "[irsi]", "did you mean 'iris'"),
+        ("[camera]\nwidth = 80", "[camera]\nwidth = 64", "registered = true"),
+        ("bit_depth = 12", "bit_depth = " + "9" * 5000, "bench.toml"),
+        ('name = "made"', "name = ", "is not TOML"),
+    ],
+)
 def test_bench_faults_are_named(copy: Path, old: str, new: str, named: str) -> None:
     edit(copy / "bench.toml", old, new)
     with pytest.raises(InputError) as error:
@@ -124,24 +129,31 @@ def test_homography_is_read_as_rows_or_flat() -> None:
     benches = [read_bench(bench_tables(width=120, registered=False, homography=h)) for h in (rows, flat)]
     assert benches[0] == benches[1] and benches[0].camera.homography[1] == (0.0, 0.5, 2.0)
     assert read_bench(tables_of(benches[0])) == benches[0]
-    for wrong in ([[1, 0, 0], [2, 0, 0], [0, 0, 1]], [1, 2, 3], "one",
-                  [[1, 0, 0], [0, float("nan"), 0], [0, 0, 1]]):
+    for wrong in (
+        [[1, 0, 0], [2, 0, 0], [0, 0, 1]],
+        [1, 2, 3],
+        "one",
+        [[1, 0, 0], [0, float("nan"), 0], [0, 0, 1]],
+    ):
         with pytest.raises(InputError, match="camera.homography"):
             read_bench(bench_tables(registered=False, homography=wrong))
 
 
-@pytest.mark.parametrize(("old", "new", "named"), [
-    ("capture,channel", "captur,channel", "no column 'capture'"),
-    ("0001,green", "0000,green", "repeats the id"),
-    ("0001,green", "0001,gren", "did you mean 'green'"),
-    ("0001,green,5.0", "0001,green,nan", "plane_mm"),
-    ("0001,green,5.0", "0001,green,far", "plane_mm"),
-    ("0001,green,5.0", "0001,green,5.0,6.0", "cells"),
-    ("image/0001.png", "image/none.png", "is not there"),
-    ("image/0001.png", "../image/0001.png", "not inside the set"),
-    ("image/0001.png,10.0", "image/0001.png,0", "exposure_ms"),
-    ("image/0001.png", "", "image is empty"),
-])
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ("capture,channel", "captur,channel", "no column 'capture'"),
+        ("0001,green", "0000,green", "repeats the id"),
+        ("0001,green", "0001,gren", "did you mean 'green'"),
+        ("0001,green,5.0", "0001,green,nan", "plane_mm"),
+        ("0001,green,5.0", "0001,green,far", "plane_mm"),
+        ("0001,green,5.0", "0001,green,5.0,6.0", "cells"),
+        ("image/0001.png", "image/none.png", "is not there"),
+        ("image/0001.png", "../image/0001.png", "not inside the set"),
+        ("image/0001.png,10.0", "image/0001.png,0", "exposure_ms"),
+        ("image/0001.png", "", "image is empty"),
+    ],
+)
 def test_row_faults_name_the_capture(copy: Path, old: str, new: str, named: str) -> None:
     edit(copy / "captures.csv", old, new)
     with pytest.raises(InputError) as error:
@@ -188,11 +200,11 @@ def test_a_damaged_picture_is_never_read_in_part(made: CaptureSet, copy: Path, d
     for which, read in (("image", CaptureSet.counts), ("phase", CaptureSet.gray)):
         whole = (made.folder / which / "0000.png").read_bytes()
         if data.draw(st.booleans()):
-            damaged = whole[:data.draw(st.integers(0, len(whole) - 1))]
+            damaged = whole[: data.draw(st.integers(0, len(whole) - 1))]
         else:
             place = data.draw(st.integers(0, len(whole) - 1))
             other = whole[place] ^ data.draw(st.integers(1, 255))
-            damaged = whole[:place] + bytes([other]) + whole[place + 1:]
+            damaged = whole[:place] + bytes([other]) + whole[place + 1 :]
         (copy / which / "0000.png").write_bytes(damaged)
         broken = read_captures(copy)
         with pytest.raises(InputError, match="capture 0000"):
@@ -201,8 +213,9 @@ def test_a_damaged_picture_is_never_read_in_part(made: CaptureSet, copy: Path, d
 
 @FUZZ
 @given(data=st.data())
-def test_damaged_tables_raise_nothing_but_input_errors(made: CaptureSet, copy: Path,
-                                                       data: st.DataObject) -> None:
+def test_damaged_tables_raise_nothing_but_input_errors(
+    made: CaptureSet, copy: Path, data: st.DataObject
+) -> None:
     for name in ("bench.toml", "captures.csv"):
         text = (made.folder / name).read_text()
         start = data.draw(st.integers(0, len(text)))
@@ -217,9 +230,18 @@ def test_damaged_tables_raise_nothing_but_input_errors(made: CaptureSet, copy: P
 
 
 def test_writer_keeps_everything_and_names_files_in_order(made: CaptureSet, tmp_path: Path) -> None:
-    rows = ({"gray": made.gray(c), "counts": made.counts(c), "channel": c.channel, "pattern": c.pattern,
-             "capture": f"c{n}", "time_s": n / 3, "temperature_c": 21.5 + n}
-            for n, c in enumerate(made.captures))
+    rows = (
+        {
+            "gray": made.gray(c),
+            "counts": made.counts(c),
+            "channel": c.channel,
+            "pattern": c.pattern,
+            "capture": f"c{n}",
+            "time_s": n / 3,
+            "temperature_c": 21.5 + n,
+        }
+        for n, c in enumerate(made.captures)
+    )
     folder = write_captures(tmp_path / "deep" / "set", made.bench, rows)
     written = read_captures(folder)
     assert written.bench == made.bench
@@ -251,9 +273,15 @@ def test_writer_refuses_to_overwrite_and_to_write_nonsense(made: CaptureSet, tmp
     with CaptureWriter(tmp_path / "empty", made.bench) as writer:
         writer.add(gray, counts, "green")
         writer.attach("truth.json", "{}")
-        for wrong in ({"gray": gray[1:]}, {"counts": counts.astype(float)}, {"counts": counts + 4096},
-                      {"channel": "violet"}, {"capture": "0000"}, {"plane_mm": float("nan")},
-                      {"capture": " "}):
+        for wrong in (
+            {"gray": gray[1:]},
+            {"counts": counts.astype(float)},
+            {"counts": counts + 4096},
+            {"channel": "violet"},
+            {"capture": "0000"},
+            {"plane_mm": float("nan")},
+            {"capture": " "},
+        ):
             with pytest.raises(InputError):
                 writer.add(**({"gray": gray, "counts": counts, "channel": "green"} | wrong))
     assert len(read_captures(tmp_path / "empty")) == 1

@@ -57,12 +57,15 @@ def test_a_sound_set_has_no_problems(made: CaptureSet) -> None:
     assert steps == [(n, 6) for n in range(1, 7)]
 
 
-@pytest.mark.parametrize("camera", [
-    {"bit_depth": 8, "black_level": 4, "full_well_e": 9000, "read_noise_e": 20},
-    {"bit_depth": 10, "black_level": 16, "full_well_e": 8000, "read_noise_e": 3},
-    {"bit_depth": 16, "black_level": 500, "full_well_e": 30000, "read_noise_e": 2},
-    {"black_level": 0, "read_noise_e": 2},
-])
+@pytest.mark.parametrize(
+    "camera",
+    [
+        {"bit_depth": 8, "black_level": 4, "full_well_e": 9000, "read_noise_e": 20},
+        {"bit_depth": 10, "black_level": 16, "full_well_e": 8000, "read_noise_e": 3},
+        {"bit_depth": 16, "black_level": 500, "full_well_e": 30000, "read_noise_e": 2},
+        {"black_level": 0, "read_noise_e": 2},
+    ],
+)
 def test_sound_sets_of_other_cameras(tmp_path: Path, camera: dict[str, float]) -> None:
     make_set(tmp_path / "set", bench_tables(**camera))
     assert found(tmp_path / "set") == []
@@ -87,8 +90,12 @@ def test_missing_and_broken_files(copy: Path, made: CaptureSet) -> None:
     repaint(copy, lambda a: (a >> 4).astype(np.uint8), "0004")
     Image.new("RGB", (80, 64)).save(copy / "image/0005.png")
     assert found(copy)[:5] == [
-        ("error", "missing_file", "0001"), ("error", "unreadable", "0002"), ("error", "wrong_size", "0003"),
-        ("error", "bit_depth", "0004"), ("error", "unreadable", "0005")]
+        ("error", "missing_file", "0001"),
+        ("error", "unreadable", "0002"),
+        ("error", "wrong_size", "0003"),
+        ("error", "bit_depth", "0004"),
+        ("error", "unreadable", "0005"),
+    ]
 
 
 def test_wrong_rows(copy: Path) -> None:
@@ -96,8 +103,11 @@ def test_wrong_rows(copy: Path) -> None:
     edit(copy / "captures.csv", "0003,green", "0003,violet")
     edit(copy / "captures.csv", "0004,green,5.0", "0004,green,NaN")
     assert found(copy) == [
-        ("error", "duplicate", "0000"), ("error", "unknown_channel", "0003"),
-        ("error", "not_a_number", "0004"), ("warning", "too_few", "")]
+        ("error", "duplicate", "0000"),
+        ("error", "unknown_channel", "0003"),
+        ("error", "not_a_number", "0004"),
+        ("warning", "too_few", ""),
+    ]
 
 
 def test_unreadable_tables_are_one_problem(copy: Path) -> None:
@@ -138,9 +148,15 @@ def test_counts_above_the_stated_depth_and_steps_below_it(copy: Path) -> None:
     assert found(copy) == [("error", "bit_depth", "0002"), ("warning", "bit_depth", "0003")]
 
 
-@pytest.mark.parametrize(("stated", "says"), [
-    (0, "too low"), (32, "too low"), (96, "too high"), (200, "too high"),
-])
+@pytest.mark.parametrize(
+    ("stated", "says"),
+    [
+        (0, "too low"),
+        (32, "too low"),
+        (96, "too high"),
+        (200, "too high"),
+    ],
+)
 def test_wrong_black_level(copy: Path, stated: int, says: str) -> None:
     edit(copy / "bench.toml", "black_level = 64", f"black_level = {stated}")
     problems = check_captures(copy, predict=unknowing)
@@ -189,9 +205,13 @@ def test_a_dark_picture_is_noticed(copy: Path) -> None:
     assert found(copy) == [("warning", "no_signal", "0003")]
 
 
-@pytest.mark.parametrize(("edits", "says"), [
-    ("mirror", "mirror the images left-right"), ("sign", "phase_sign = -1"),
-])
+@pytest.mark.parametrize(
+    ("edits", "says"),
+    [
+        ("mirror", "mirror the images left-right"),
+        ("sign", "phase_sign = -1"),
+    ],
+)
 def test_conventions_are_looked_for(copy: Path, edits: str, says: str) -> None:
     if edits == "mirror":
         repaint(copy, lambda a: a[:, ::-1])

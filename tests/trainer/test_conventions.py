@@ -14,7 +14,7 @@ from tests.trainer.made_sets import bench_tables, counted, irradiance, make_set
 from trainer.bench_file import Bench, read_bench
 from trainer.conventions import TURNS, Sample, compare_conventions, find_convention, turned
 
-BACK = {"turn_90_left": "turn_90_right", "turn_90_right": "turn_90_left"}   # all others undo themselves
+BACK = {"turn_90_left": "turn_90_right", "turn_90_right": "turn_90_left"}  # all others undo themselves
 TABLES = bench_tables((96, 96))
 
 
@@ -46,8 +46,9 @@ def lights(grays: list[np.ndarray]) -> dict[int, list[np.ndarray]]:
 
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("turn", TURNS)
-def test_all_sixteen(bench: Bench, grays: list[np.ndarray], lights: dict[int, list[np.ndarray]],
-                     turn: str, sign: int) -> None:
+def test_all_sixteen(
+    bench: Bench, grays: list[np.ndarray], lights: dict[int, list[np.ndarray]], turn: str, sign: int
+) -> None:
     seen = [np.roll(turned(light, BACK.get(turn, turn)), (2, -3), (0, 1)) for light in lights[sign]]
     result = compare_conventions(bench, samples(bench, grays, seen))
     assert (result.best.turn, result.best.phase_sign) == (turn, sign) and len(result.scores) == 16
@@ -56,8 +57,9 @@ def test_all_sixteen(bench: Bench, grays: list[np.ndarray], lights: dict[int, li
     assert ("phase_sign = -1" in result.change) == (sign == -1)
 
 
-def test_the_change_is_right(bench: Bench, grays: list[np.ndarray],
-                             lights: dict[int, list[np.ndarray]]) -> None:
+def test_the_change_is_right(
+    bench: Bench, grays: list[np.ndarray], lights: dict[int, list[np.ndarray]]
+) -> None:
     """Turning the images as told makes the stated convention the best."""
     first = samples(bench, grays, [np.rot90(light) for light in lights[1]])
     result = compare_conventions(bench, first)
@@ -67,11 +69,12 @@ def test_the_change_is_right(bench: Bench, grays: list[np.ndarray],
     assert not compare_conventions(bench, put_right).decisive
 
 
-def test_a_poor_bench_is_no_convention(bench: Bench, grays: list[np.ndarray],
-                                       lights: dict[int, list[np.ndarray]]) -> None:
+def test_a_poor_bench_is_no_convention(
+    bench: Bench, grays: list[np.ndarray], lights: dict[int, list[np.ndarray]]
+) -> None:
     """Blur, a narrow beam, saturation and noise lower the correlation, and nothing else is said to fit."""
     y, x = np.mgrid[-1:1:96j, -1:1:96j]
-    beam = np.exp(-((x - 0.3) ** 2 + y ** 2))
+    beam = np.exp(-((x - 0.3) ** 2 + y**2))
     poor = [gaussian_filter(s, 1.5) * beam * 8 + 0.5 for s in lights[1]]
     result = compare_conventions(bench, samples(bench, grays, poor))
     assert result.best is result.stated and not result.decisive and result.change == ""
@@ -98,8 +101,7 @@ def test_what_cannot_be_told_apart_is_said(bench: Bench) -> None:
     assert "cannot tell" in mirrored.change
 
 
-def test_a_stated_sign_is_the_start(grays: list[np.ndarray],
-                                    lights: dict[int, list[np.ndarray]]) -> None:
+def test_a_stated_sign_is_the_start(grays: list[np.ndarray], lights: dict[int, list[np.ndarray]]) -> None:
     tables = bench_tables((96, 96))
     tables["panel"]["phase_sign"] = -1
     bench = read_bench(tables)
@@ -111,8 +113,11 @@ def test_a_stated_sign_is_the_start(grays: list[np.ndarray],
 def test_oblong_cameras_cannot_be_transposed(tmp_path: Path) -> None:
     made = make_set(tmp_path / "set")
     result = find_convention(made)
-    quick = compare_conventions(made.bench, [sample(made.bench, made.gray(c), made.signal(c)[0] / 300, 0)
-                                             for c in made.captures[:1]], quick=True)
+    quick = compare_conventions(
+        made.bench,
+        [sample(made.bench, made.gray(c), made.signal(c)[0] / 300, 0) for c in made.captures[:1]],
+        quick=True,
+    )
     assert quick.best is quick.stated and len(quick.scores) == 4
     assert len(result.scores) == 8 and not result.decisive and result.stated.correlation > 0.8
     assert result.stated.shift == ((0, 0),) * 3

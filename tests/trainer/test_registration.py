@@ -20,8 +20,9 @@ from trainer.registration import (
 SHAPE = (200, 280)
 
 
-def camera_to_panel(scale: float, degrees: float, mirrored: bool,
-                    tilt: float) -> tuple[np.ndarray, tuple[int, int]]:
+def camera_to_panel(
+    scale: float, degrees: float, mirrored: bool, tilt: float
+) -> tuple[np.ndarray, tuple[int, int]]:
     """A homography, and the shape (height, width) of a camera that sees the whole panel."""
     height, width = int(SHAPE[0] * scale * 1.35) + 16, int(SHAPE[1] * scale * 1.35) + 16
     a = np.deg2rad(degrees)
@@ -44,12 +45,14 @@ def picture(dots: Dots, matrix: np.ndarray, shape: tuple[int, int], noise: float
         sigma = SPREAD * dots.spacing * (BROAD[number] if number < 2 else 1)
         edge = panel_points(np.linalg.inv(matrix), dot[None] + (6 * sigma, 0))[0]
         reach = float(np.hypot(*(edge - centre)))
-        rows, columns = (slice(max(int((c - reach) * fine), 0), max(int((c + reach) * fine) + 1, 0))
-                         for c in (centre[1], centre[0]))
+        rows, columns = (
+            slice(max(int((c - reach) * fine), 0), max(int((c + reach) * fine) + 1, 0))
+            for c in (centre[1], centre[0])
+        )
         y, x = np.meshgrid(np.arange(light.shape[0])[rows], np.arange(light.shape[1])[columns], indexing="ij")
         camera = np.stack([x.ravel() + 0.5, y.ravel() + 0.5], 1) / fine - 0.5
         square = ((panel_points(matrix, camera) - dot) ** 2).sum(1).reshape(x.shape)
-        light[rows, columns] = np.maximum(light[rows, columns], np.exp(-square / (2 * sigma ** 2)))
+        light[rows, columns] = np.maximum(light[rows, columns], np.exp(-square / (2 * sigma**2)))
     light = light.reshape(shape[0], fine, shape[1], fine).mean((1, 3))
     rng = np.random.default_rng(0)
     counts = 64 + 1500 * light * np.linspace(0.6, 1, shape[1]) + 40 * np.linspace(0, 1, shape[0])[:, None]
@@ -62,10 +65,19 @@ def worst(found: np.ndarray, truth: np.ndarray, dots: Dots) -> float:
     return float(np.hypot(*(panel_points(found, camera) - dots.xy).T).max())
 
 
-@pytest.mark.parametrize(("scale", "degrees", "mirrored", "tilt"), [
-    (1.0, 0.0, False, 0.0), (1.0, 5.0, True, 1e-4), (0.5, -7.0, False, 1e-4), (0.3, 3.0, True, 0.0),
-    (0.3, -4.0, False, 1e-4), (2.0, 8.0, True, 1e-4), (3.0, -3.0, False, 1e-4), (0.7, 180.0, False, 0.0),
-])
+@pytest.mark.parametrize(
+    ("scale", "degrees", "mirrored", "tilt"),
+    [
+        (1.0, 0.0, False, 0.0),
+        (1.0, 5.0, True, 1e-4),
+        (0.5, -7.0, False, 1e-4),
+        (0.3, 3.0, True, 0.0),
+        (0.3, -4.0, False, 1e-4),
+        (2.0, 8.0, True, 1e-4),
+        (3.0, -3.0, False, 1e-4),
+        (0.7, 180.0, False, 0.0),
+    ],
+)
 def test_homography_is_found(scale: float, degrees: float, mirrored: bool, tilt: float) -> None:
     dots = dots_of(SHAPE, 30)
     truth, shape = camera_to_panel(scale, degrees, mirrored, tilt)
@@ -80,7 +92,7 @@ def test_noise_hot_pixels_and_lost_dots_do_no_harm() -> None:
     rng = np.random.default_rng(1)
     seen[rng.integers(0, shape[0], 60), rng.integers(0, shape[1], 60)] = 4095
     x, y = panel_points(np.linalg.inv(truth), dots.xy[40:41])[0].astype(int)
-    seen[y - 14:y + 14, x - 14:x + 14] = 64
+    seen[y - 14 : y + 14, x - 14 : x + 14] = 64
     assert worst(find_homography(seen, dots), truth, dots) < 0.15
 
 
@@ -103,11 +115,11 @@ def test_pictures_without_the_pattern_are_refused() -> None:
     truth, shape = camera_to_panel(1.0, 0, False, 0)
     dark = np.random.default_rng(0).poisson(64, shape).astype(np.uint16)
     seen = picture(dots, truth, shape)
-    for wrong in (dark, np.zeros(shape), seen[:, shape[1] // 2:], np.full(shape, np.nan)):
+    for wrong in (dark, np.zeros(shape), seen[:, shape[1] // 2 :], np.full(shape, np.nan)):
         with pytest.raises(InputError, match="dots"):
             find_homography(wrong, dots)
     x, y = panel_points(np.linalg.inv(truth), dots.xy[:1])[0].astype(int)
-    seen[y - 15:y + 16, x - 15:x + 16] = 64
+    seen[y - 15 : y + 16, x - 15 : x + 16] = 64
     with pytest.raises(InputError, match="marker"):
         find_homography(seen, dots)
     with pytest.raises(InputError, match="16 x 16"):
