@@ -198,8 +198,28 @@ def try_effect(
     fitted = fit_from(model, start, batches, iterations)
     if raising:
         fitted = raise_order(fitted, name, batches, least_for_order)
+    return _judged(name, fitted, captures, held_ids)
+
+
+def try_together(
+    folder: Path, ids: tuple[str, ...], held_ids: tuple[str, ...], model: Model, name: str
+) -> Tried:
+    """Fit all effects of a model together, and judge it on held-out captures as an explanation by effect `name`."""
+    captures = opened(folder)
+    return _judged(name, settled(model, load(captures, chosen(captures, ids))), captures, held_ids)
+
+
+def _judged(name: str, fitted: Fitted, captures: CaptureSet, held_ids: tuple[str, ...]) -> Tried:
     held_out = evaluate_captures(captures, chosen(captures, held_ids), fitted.model)
     return Tried(name, fitted.model, fitted.errors.excess, held_out)
+
+
+def settled(model: Model, batches: Sequence[Batch]) -> Fitted:
+    """The model with all of its effects fitted together, and their orders raised as far as that helps."""
+    fitted = fit(model, model.names, batches)
+    for name in model.names:
+        fitted = raise_order(fitted, name, batches, least_for_order, model.names)
+    return fitted
 
 
 def fit_from(model: Model, start: Present, batches: Sequence[Batch], iterations: int = 12) -> Fitted:

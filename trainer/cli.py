@@ -17,6 +17,7 @@ from trainer.commands import explaining, making, registering
 from trainer.commands.command import PROGRAM, Command, Interrupted, release
 from trainer.commands.screen import Screen, one_line
 
+OWN = ("trainer", "runtime", "firmware_iface")
 DONE, BAD_INPUT, INTERRUPTED, NO_READER = 0, 2, 130, 141
 
 ABOUT = """Learn how a holographic display's bench differs from its model, from camera captures.
@@ -83,6 +84,12 @@ def main(argv: list[str] | None = None) -> int:
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         return _stopped(f"{where}{error.strerror or error}", BAD_INPUT)
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.split(".")[0] in OWN:
+            raise
+        return _stopped(
+            f"{error.name} is not installed; get it with: pip install 'hololoop[trainer]'", BAD_INPUT
+        )
     except MemoryError:
         return _stopped("there is not enough memory: use fewer --workers, or smaller captures", BAD_INPUT)
 

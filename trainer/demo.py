@@ -27,6 +27,7 @@ from trainer.bench_file import Bench, read_bench
 from trainer.effects.registry import catalogue
 from trainer.export import export_bundle
 from trainer.model import Model
+from trainer.numbers import listed
 from trainer.shown import Shown, with_display
 
 Progress = Callable[[float, str], None]
@@ -34,7 +35,7 @@ Progress = Callable[[float, str], None]
 BENCH = "virtual:demo"
 QUICK_SHAPE, QUICK_DISTANCE_MM = (144, 192), 18.0
 PICTURES = ("astronaut", "coffee")  # not among those that are captured
-ITERATIONS, ORACLE_ITERATIONS = 100, 40
+ITERATIONS, ORACLE_ITERATIONS = 100, 60
 SHOTS = 4  # pictures of the camera that are averaged
 SATURATED = 0.001  # share of pixels
 
@@ -98,7 +99,7 @@ def run_demo(
     say(0.94, "writing the report")
     display = {name: _mean([p.qualities[name] for p in shown]) for name in ("before", "after", "oracle")}
     sentence = (
-        f"Explained by {_listed(found.model.names)}: the picture shown goes from "
+        f"Explained by {listed(found.model.names) or 'nothing'}: the picture shown goes from "
         f"{display['before']['psnr_db']:.1f} to {display['after']['psnr_db']:.1f} dB (amplitude PSNR, seen "
         "by the camera); with the true bench known it is "
         f"{display['oracle']['psnr_db']:.1f} dB."
@@ -252,9 +253,3 @@ def _numbers(q: Quality) -> dict[str, float]:
 def _mean(qualities: list[Quality]) -> dict[str, float]:
     psnr = float(np.mean([q.psnr_db for q in qualities]))
     return {"psnr_db": round(psnr, 3), "nrmse": round(float(np.mean([q.nrmse for q in qualities])), 5)}
-
-
-def _listed(names: tuple[str, ...]) -> str:
-    if len(names) < 2:
-        return names[0] if names else "nothing"
-    return f"{', '.join(names[:-1])} and {names[-1]}"

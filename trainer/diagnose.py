@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from trainer.candidates import Screened, Tried, evaluate_captures, screen, try_effect
+from trainer.candidates import Screened, Tried, evaluate_captures, screen, try_effect, try_together
 from trainer.captures import Capture, CaptureSet
 from trainer.effects.definition import STAGES, Effect
 from trainer.effects.registry import Catalogue
@@ -27,6 +27,7 @@ from trainer.verdict import Thresholds
 Progress = Callable[[float, str], None]
 
 FIRST_TRIED = 5  # candidates fitted after the screen; all of them when none of these explains anything
+TRIED_TOGETHER = 3  # candidates fitted with the present effects free, when none explains anything beside them
 FIT_CAPTURES = 4
 PROBE_CAPTURES = 9
 HELD_PIXELS = 24 * 480 * 640  # held-out pixels a candidate is judged on
@@ -42,6 +43,13 @@ class Ranked:
     gone: Removed
     worth: bool
     indistinguishable_from: tuple[str, ...] = ()
+
+    @property
+    def base(self) -> Model:
+        """The model without the candidate; other effects as they are beside it."""
+        return replace(
+            self.model, present=tuple(p for p in self.model.present if p.effect.name != self.effect.name)
+        )
 
     def as_json(self) -> dict[str, Any]:
         """The contract's keys."""
@@ -91,7 +99,11 @@ class Diagnosis:
         if self.verdict == "complete":
             return f"Nothing is missing: what remains above the camera's noise is {left} of the signal's variance."
         if self.best is None:
-            where = f" The {self.stage} stage is where it sits." if self.stage else ""
+            where = (
+                f" The {self.stage} stage is where it sits."
+                if self.stage
+                else " No stage's probe shows where."
+            )
             return f"Something is missing that the catalogue does not name (excess {left}).{where}"
         best = self.best
         size = describe(present_named(best.model, best.effect.name), best.model.bench)
@@ -146,7 +158,7 @@ def parts_of(captures: CaptureSet) -> Parts:
     pixels = height * width
     count = len(scenes(divided.fitted))
     fitted = sample(divided.fitted, pixels, max(FIT_CAPTURES, count))
-    screened = sample(divided.fitted, pixels, max(2, count))
+    screened = sample(divided.fitted, pixels, count)
     probed = sample(divided.fitted, pixels // 2, max(PROBE_CAPTURES, count))
     most = max(2 * count, HELD_PIXELS // pixels)
     held_out = list(divided.held_out)
@@ -200,14 +212,20 @@ def diagnose(
     promising = [s for s in order[:FIRST_TRIED] if s.removed > 0.05 * max(order[0].removed, 1e-12)] or order[
         :1
     ]
-    # A screen by derivatives says little of an effect whose derivatives do not reach: such are always fitted.
-    first = promising + [s for s in order if known[s.effect].rugged and s not in promising]
+    # The screen says little of an effect whose derivatives do not reach, or that shows from capture to capture only.
+    blind = [s for s in order if known[s.effect].rugged or known[s.effect].measure]
+    first = promising + [s for s in blind if s not in promising]
     tried = try_all(parts, model, before, first[:2] if complete else first, pool, say, 0.3, 0.6)
     ranking = rank(before, tried, known, thresholds, ideal_excess, len(candidates))
     if not complete and not any(r.worth for r in ranking):
         rest = [s for s in order if s.effect not in {t.effect for t in tried}]
         tried += try_all(parts, model, before, rest, pool, say, 0.5, 0.7)
         ranking = rank(before, tried, known, thresholds, ideal_excess, len(candidates))
+        if model.present and not any(r.worth for r in ranking):
+            say(0.7, "fitting candidates and present effects together")
+            settled, together = try_together_with_present(parts, model, tried, pool)
+            jointly = rank(settled, together, known, thresholds, ideal_excess, len(candidates))
+            ranking = jointly + [r for r in ranking if r.effect.name not in {t.effect for t in together}]
     found = not complete and bool(ranking) and ranking[0].worth
     verdict = "complete" if complete else "missing" if found else "outside_catalogue"
 
@@ -217,8 +235,10 @@ def diagnose(
     stage = None
     if verdict == "missing":
         stage = ranking[0].effect.stage
-    elif verdict == "outside_catalogue" and probes:
-        stage = max(probes, key=lambda p: p.gone.value).stage
+    elif verdict == "outside_catalogue":
+        # A probe of a few thousand numbers that removes nothing on held-out captures points nowhere.
+        telling = [p for p in probes if thresholds.worth_adding(p.gone, ideal_excess, len(probes))]
+        stage = max(telling, key=lambda p: p.gone.value).stage if telling else None
     suggestions = suggest(parts, verdict, ranking)
     say(1.0, "done")
     return Diagnosis(
@@ -295,10 +315,24 @@ def try_all(
     return tried
 
 
+def try_together_with_present(
+    parts: Parts, model: Model, tried: Sequence[Tried], pool: Pool
+) -> tuple[Errors, list[Tried]]:
+    """The candidates that came closest, with the present effects fitted beside them, and the errors without any.
+
+    An effect that was added alone may have taken up a part of one that is still missing, and stands in its way.
+    """
+    ids = tuple(c.capture for c in parts.fitted)
+    held = tuple(c.capture for c in parts.held_out)
+    nearest = sorted(tried, key=lambda t: t.held_out.excess)[:TRIED_TOGETHER]
+    tasks = [(parts.folder, ids, held, model, "")]
+    tasks += [(parts.folder, ids, held, t.model, t.effect) for t in nearest]
+    without, *together = pool.map(try_together, tasks)
+    return without.held_out, together
+
+
 def _without_gain_of(fitted: Model, model: Model) -> Model:
     """The model before the candidate, with the gains that went with it."""
-    from dataclasses import replace
-
     return replace(model, gain=fitted.gain)
 
 

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from trainer.candidates import Screened, evaluate_captures, fit_from, least_for_order, screen_batches
+from trainer.candidates import (
+    Screened,
+    evaluate_captures,
+    fit_from,
+    least_for_order,
+    screen_batches,
+    settled,
+)
 from trainer.captures import CaptureSet
 from trainer.diagnose import (
     Diagnosis,
@@ -22,9 +29,9 @@ from trainer.diagnose import (
 )
 from trainer.effects.definition import Effect
 from trainer.effects.registry import Catalogue
-from trainer.evidence import Batch, load
+from trainer.evidence import load
 from trainer.excess import Errors, removed
-from trainer.fit import Fitted, fit, raise_order
+from trainer.fit import fit, raise_order
 from trainer.model import Model, Present
 from trainer.parameters import json_values, present_named
 from trainer.pool import Pool
@@ -131,14 +138,6 @@ def add_from(parts: Parts, model: Model, start: Present) -> Model:
     return settled(fitted.model, batches).model if len(fitted.model.names) > 1 else fitted.model
 
 
-def settled(model: Model, batches: Sequence[Batch]) -> Fitted:
-    """The model with all of its effects fitted together, and their orders raised as far as that helps."""
-    fitted = fit(model, model.names, batches)
-    for name in model.names:
-        fitted = raise_order(fitted, name, batches, least_for_order, model.names)
-    return fitted
-
-
 def recorded(model: Model, name: str | None, errors: Errors, dropped: str | None = None) -> Model:
     """The model with one more record in its history."""
     record: dict[str, Any] = {
@@ -188,7 +187,7 @@ def explain(
         if best is None or len(model.names) >= MOST_EFFECTS:
             break
         told(0.9, f"adding {best.effect.name}")
-        candidate = add_from(parts, model, present_named(best.model, best.effect.name))
+        candidate = add_from(parts, best.base, present_named(best.model, best.effect.name))
         after = evaluate_captures(captures, parts.held_out, candidate)
         if not thresholds.worth_adding(removed(errors, after), ideal.excess, 1):
             break

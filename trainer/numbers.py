@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from trainer.effects.definition import UNIT_SUFFIX
-
 TERMS = 4  # parameters with more numbers than this are summed up, and listed on demand
 UNITLESS = ("1", "")
+# Units at the end of a name in files; others stand there as they are.
+UNIT_SUFFIX = {"1": "", "%": "percent", "pixels": "px", "share of band": "share", "waves": "waves"}
 
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 

@@ -63,19 +63,20 @@ def descend(
     plane_mm: float,
     iterations: int,
     start: Array | None = None,
-    step_rad: float = 0.4,
     seed: int = 0,
     progress: Callable[[int, float], None] | None = None,
 ) -> NDArray[np.uint8]:
     """Gray levels [H, W] whose irradiance on panel pixels is nearest to `target` in amplitude, up to scale.
 
     target : irradiance wanted, [H, W], any unit
-    step_rad : size of a first step; it falls to a tenth along a half cosine
+    start : gray levels to better, in small steps; none: a smooth random phase at the image, in long ones
     progress : called with the iteration and the loss
     """
     drive = optics.drive(channel)
     gray = ideal_start(optics, target, channel, plane_mm, seed) if start is None else start.astype(np.float64)
     mean, square = np.zeros_like(gray), np.zeros_like(gray)
+    # The first step; it falls to a tenth along a half cosine.
+    step_rad = 0.4 if start is None else 0.03
     step_gray = step_rad * drive.levels / (2 * np.pi)
     for i in range(iterations):
         samples, pullback = optics.irradiance_and_pullback(gray, channel, plane_mm)

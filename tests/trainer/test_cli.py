@@ -81,6 +81,18 @@ def test_help_does_not_wait_for_torch() -> None:
     assert done.stdout.splitlines()[-1] == "False"
 
 
+def test_the_base_install_says_what_to_install() -> None:
+    script = (
+        "import sys; sys.modules['torch'] = None; from trainer.cli import main; sys.exit(main(['effects']))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 2
+    said = "hololoop-trainer: torch is not installed; get it with: pip install 'hololoop[trainer]'"
+    assert done.stderr.splitlines() == [said]
+
+
 def test_nothing_prints_the_help_and_the_version_is_known(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([]) == 0
     assert "usual way" in capsys.readouterr().out

@@ -11,6 +11,7 @@ from PIL import Image
 from firmware_iface.errors import InputError
 from runtime.solver import quality
 from trainer.captures import read_captures
+from trainer.commands.making import first_free
 from trainer.demo import run_demo
 from trainer.shown import Shown, display_section, with_display
 
@@ -51,3 +52,11 @@ def test_the_quick_demo(tmp_path: Path) -> None:
     assert "What the display shows" in page
     with Image.open(tmp_path / "demo" / "patterns" / "astronaut-after.png") as pattern:
         assert pattern.mode == "L"
+
+
+def test_a_demo_after_a_demo_gets_a_folder_of_its_own(tmp_path: Path) -> None:
+    wanted = tmp_path / "hololoop-demo"
+    for name in ("hololoop-demo", "hololoop-demo-2", "hololoop-demo-3"):
+        folder = first_free(wanted)
+        assert folder == tmp_path / name
+        folder.mkdir()

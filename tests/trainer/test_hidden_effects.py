@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.trainer.hidden import captured, ran
+from trainer.cli import main
 from trainer.effects import catalogue
 
 ALONE = {name: f'kind = "{name}"' for name in catalogue()}
@@ -98,6 +99,25 @@ def test_what_the_catalogue_does_not_name_is_placed_and_then_explained_by_a_user
     assert [s["added"] for s in better["steps"]] == [None, "cover_glass_fringes"]
     assert better["verdict"] == "complete"
     assert better["steps"][-1]["excess"] < 3e-4
+
+
+def test_a_ghost_beside_a_blur_is_found_by_fitting_both_together(tmp_path, capsys):
+    # Fitted alone, each takes up a part of the other, and then stands in its way.
+    blur = 'kind = "sensor_blur"\nsigma_x_px = 0.5'
+    ghost = 'kind = "ghost"\nshare = 0.1\nshift_x_px = 6.5\nshift_y_px = -3'
+    found = explained(capsys, captured(capsys, tmp_path, ghost, blur), tmp_path)
+    assert found["verdict"] == "complete"
+    names = {frozenset((s["added"], *s["indistinguishable_from"])) for s in found["steps"][1:]}
+    assert names == {frozenset({"ghost"}), frozenset({"sensor_blur", "spatial_coherence"})}
+
+
+def test_a_misread_set_is_refused_and_not_explained(tmp_path, capsys):
+    captures = captured(capsys, tmp_path, 'kind = "convention"')
+    for command in (["diagnose", captures], ["explain", captures, "--out", tmp_path / "model.toml"]):
+        assert main([*map(str, command), "--json"]) == 2
+        out, err = capsys.readouterr()
+        assert out == "" and "mirror the images left-right" in err
+    assert not (tmp_path / "model.toml").exists()
 
 
 def test_specks_sit_on_the_panel(tmp_path, capsys):

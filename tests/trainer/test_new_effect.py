@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 
 from firmware_iface.errors import InputError
-from trainer.effects import testing
+from trainer.effects import registry, testing
 from trainer.effects.definition import Effect
 from trainer.effects.registry import catalogue, load_effects
 from trainer.explain import add
@@ -102,3 +103,28 @@ def test_a_bad_name_gets_a_sentence(tmp_path: Path, name: str, message: str) -> 
 def test_an_unknown_stage_gets_a_hint(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="did you mean 'pupil'"):
         write_new_effect("thread", "pupill", tmp_path)
+
+
+@pytest.mark.parametrize("value", ["own_effects", "own_effects:ripple", "own_effects:both"])
+def test_an_installed_package_offers_effects(
+    value: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_new_effect("ripple", "sensor", tmp_path, catalogue())
+    (tmp_path / "ripple.py").rename(tmp_path / "own_effects.py")
+    with (tmp_path / "own_effects.py").open("a") as file:
+        file.write("\nboth = [ripple]\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "own_effects", raising=False)
+    points = [EntryPoint("mine", value, "hololoop.effects")]
+    monkeypatch.setattr(registry, "entry_points", lambda group: points)
+    assert list(catalogue())[-1] == "ripple"
+
+
+@pytest.mark.parametrize(
+    ("value", "says"), [("no_such_package", "cannot be loaded"), ("math:pi", "gives no effect")]
+)
+def test_a_broken_entry_point_is_named(value: str, says: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    points = [EntryPoint("mine", value, "hololoop.effects")]
+    monkeypatch.setattr(registry, "entry_points", lambda group: points)
+    with pytest.raises(InputError, match=says):
+        catalogue()

@@ -38,6 +38,8 @@ from trainer.commands.showing import (
 if TYPE_CHECKING:
     from trainer.model import Model
 
+MISREAD = ("convention", "left_justified", "bit_depth")  # problems after which every number is wrong
+
 
 def run_check(args: Namespace, screen: Screen) -> Result:
     """Everything that is wrong with a capture set."""
@@ -78,7 +80,7 @@ def run_diagnose(args: Namespace, screen: Screen) -> Result:
     refuse_folder(args.report, "--report")
     thresholds = thresholds_of(args)
     captures, known, model = inputs_of(args)
-    warn_of_problems(args.captures, screen)
+    refuse_misread(args.captures, screen)
     from trainer.diagnose import diagnose
     from trainer.pool import open_pool
 
@@ -120,7 +122,7 @@ def run_explain(args: Namespace, screen: Screen) -> Result:
     refuse_folder(args.report, "--report")
     thresholds = thresholds_of(args)
     captures, known, model = inputs_of(args)
-    warn_of_problems(args.captures, screen)
+    refuse_misread(args.captures, screen)
     from trainer.explain import explain
     from trainer.model_file import write_model
     from trainer.pool import open_pool
@@ -178,13 +180,16 @@ def _interrupted(saved: list[tuple[str, ...]], before: tuple[str, ...], out: Pat
     return "interrupted before anything was added; nothing was written"
 
 
-def warn_of_problems(folder: Path, screen: Screen) -> None:
-    """A line on stderr where the capture set has errors: an explanation of a broken set explains the
-    breakage.
+def refuse_misread(folder: Path, screen: Screen) -> None:
+    """Raises InputError where the captures are not what bench.toml says, so that every number would be wrong; a
+    line on stderr for other errors of the set, which may be what is to be explained.
     """
     from trainer.check import check_captures
 
     errors = [p for p in check_captures(folder) if p.severity == "error"]
+    for problem in errors:
+        if problem.kind in MISREAD:
+            raise InputError(problem.message)
     if errors:
         more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
         screen.note(f"warning: {errors[0].message}{more}; see: {command_line('check', folder)}")

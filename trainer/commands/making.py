@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shlex
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
@@ -20,7 +21,7 @@ from trainer.commands.command import (
     whole,
     worker_options,
 )
-from trainer.commands.screen import Screen, plain, sized
+from trainer.commands.screen import Screen, plain
 
 if TYPE_CHECKING:
     from trainer.effects.definition import Effect
@@ -154,18 +155,25 @@ def run_demo(args: Namespace, screen: Screen) -> Result:
     """The whole way on a virtual bench."""
     from trainer.demo import run_demo as demo
 
+    folder = args.out or first_free(Path("hololoop-demo"))
     with screen.progress("demo") as told:
-        return dict(demo(args.out, quick=args.quick, workers=args.workers, progress=told))
+        return dict(demo(folder, quick=args.quick, workers=args.workers, progress=told))
+
+
+def first_free(folder: Path) -> Path:
+    """The folder, or the first of FOLDER-2, FOLDER-3 ... that is not there yet."""
+    names = itertools.chain([folder], (folder.with_name(f"{folder.name}-{k}") for k in itertools.count(2)))
+    return next(name for name in names if not name.exists())
 
 
 def show_demo(result: Result, args: Namespace, screen: Screen) -> None:
     """What came out."""
-    screen.say(str(result.get("sentence") or f"The demo's files are in {args.out}."), style="bold")
+    screen.say(str(result["sentence"]), style="bold")
     _facts({k: v for k, v in result.items() if k != "sentence"}, screen)
 
 
 def _facts(result: Result, screen: Screen) -> None:
-    rows = [(k.replace("_", " "), sized(v)) for k, v in result.items() if isinstance(v, (str, int, float))]
+    rows = [(k.replace("_", " "), v) for k, v in result.items() if isinstance(v, str | int | float)]
     screen.table(("", ""), rows)
 
 
@@ -245,8 +253,7 @@ def _demo_options(parser: ArgumentParser) -> None:
         "--out",
         metavar="DIR",
         type=Path,
-        default=Path("hololoop-demo"),
-        help="where the demo's files go (default: hololoop-demo)",
+        help="where the demo's files go (default: hololoop-demo, or if that is taken hololoop-demo-2 and so on)",
     )
     parser.add_argument("--quick", action="store_true", help="a smaller panel and fewer captures")
     worker_options(parser, cluster=False)

@@ -119,31 +119,6 @@ def shown(value: Any) -> str:
     return one_line(str(value))
 
 
-def sized(entry: Any) -> str:
-    """A parameter of a JSON object, {"value", "error", "unit"} or a bare value, with its error and unit."""
-    if not isinstance(entry, Mapping) or "value" not in entry:
-        return _number(entry, None)
-    unit = entry.get("unit") or "1"
-    return _number(entry["value"], entry.get("error")) + ("" if unit == "1" else f" {unit}")
-
-
-def _number(value: Any, error: Any) -> str:
-    if isinstance(value, Mapping):
-        parts = {
-            k: _number(v, error.get(k) if isinstance(error, Mapping) else None) for k, v in value.items()
-        }
-        return ", ".join(f"{k} {v}" for k, v in parts.items())
-    if isinstance(value, (list, tuple)):
-        inside = ", ".join(f"{v:.3g}" for v in value[:6])
-        return f"[{inside}{', ...' if len(value) > 6 else ''}]"
-    if not isinstance(value, (int, float)):
-        return str(value)
-    if not isinstance(error, (int, float)) or not 0 < error < math.inf:
-        return f"{value:.4g}"
-    digits = max(0, min(9, 1 - math.floor(math.log10(error))))
-    return f"{value:.{digits}f} ± {error:.{digits}f}"
-
-
 def plain(value: Any) -> Any:
     """A value as JSON can hold it: NumPy's scalars and arrays as Python's, numbers that are none as null."""
     if isinstance(value, Mapping):

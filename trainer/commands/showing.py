@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from trainer.commands.command import Result, command_line
-from trainer.commands.screen import Screen, sized
+from trainer.commands.screen import Screen
+from trainer.numbers import listed, parameters
 
 MOST_ROWS = 12
 
@@ -79,7 +80,7 @@ def show_diagnosis(result: Result, args: Namespace, screen: Screen) -> None:
                 r["excess_removed"],
                 "{:.2g} to {:.2g}".format(*r["ci95"]),
                 r["excess_after"],
-                "; ".join(f"{k} {sized(v)}" for k, v in list(r["parameters"].items())[:3]),
+                _sizes(r["parameters"], 3),
             )
             for r in ranking[:MOST_ROWS]
         ],
@@ -101,7 +102,7 @@ def show_diagnosis(result: Result, args: Namespace, screen: Screen) -> None:
 def show_addition(result: Result, args: Namespace, screen: Screen) -> None:
     """What was gained, and the effect's size."""
     before, after = result["before"], result["after"]
-    size = "; ".join(f"{name} = {sized(entry)}" for name, entry in result["parameters"].items())
+    size = _sizes(result["parameters"])
     worse = (
         after["excess"] is not None and before["excess"] is not None and after["excess"] >= before["excess"]
     )
@@ -122,12 +123,17 @@ def show_addition(result: Result, args: Namespace, screen: Screen) -> None:
     screen.next(command_line("diagnose", args.captures, args=args, model=args.model if worse else args.out))
 
 
+def _sizes(found: Result, most: int | None = None) -> str:
+    return "; ".join(f"{p.name} {p.text}" for p in parameters(found)[:most])
+
+
 def show_explanation(result: Result, args: Namespace, screen: Screen) -> None:
     """The ladder of effects, the verdict, and what comes next."""
     _verdict(result["verdict"], _explained(result), screen)
     rows = []
+    first = args.model.name if args.model else "ideal model"
     for step in result["steps"]:
-        what = step["added"] or (f"without {step['removed']}" if step.get("removed") else "(as it was)")
+        what = step["added"] or (f"without {step['removed']}" if step.get("removed") else first)
         also = ", ".join(step["indistinguishable_from"]) or ""
         rows.append((what, step["nrmse"], step["excess"], also))
     screen.table(("added", "nrmse", "excess", "not told apart from"), rows)
@@ -149,7 +155,7 @@ def _explained(result: Result) -> str:
     sizes = {e["effect"]: f" ({e['size']})" for e in result.get("effects") or []}
     kept = [name + sizes.get(name, "") for name in added if name not in gone]
     first, last = _small(steps[0]["excess"]), _small(steps[-1]["excess"])
-    told = f"{' and '.join(kept)} took the excess from {first} to {last}. " if kept else ""
+    told = f"{listed(kept)} took the excess from {first} to {last}. " if kept else ""
     return told + str(result.get("sentence", ""))
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from firmware_iface.errors import InputError
 from trainer.bench_file import Bench
+from trainer.numbers import UNIT_SUFFIX
 
 STAGES = ("drive", "panel", "pupil", "sensor")
 TOLD_TO = ("display", "camera")
@@ -61,9 +62,6 @@ class Parameter:
         """Name with its unit, as files and JSON have it."""
         unit = UNIT_SUFFIX.get(self.unit, self.unit)
         return f"{self.name}_{unit}" if unit else self.name
-
-
-UNIT_SUFFIX = {"1": "", "%": "percent", "pixels": "px", "share of band": "share", "waves": "waves"}
 
 
 @dataclass(frozen=True)

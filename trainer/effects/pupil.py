@@ -27,7 +27,7 @@ FWHM = 2 * math.sqrt(2 * math.log(2))
             scale=0.03,
             low=-100,
             high=100,
-            starts=tuple(float(s * d) for d in np.geomspace(0.1, 12, 26) for s in (-1, 1)),
+            starts=tuple(float(s * d) for d in np.geomspace(0.1, 12, 18) for s in (-1, 1)),
             about="how much farther from the panel the image plane is than asked for",
         )
     ],

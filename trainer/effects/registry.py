@@ -8,8 +8,9 @@ import importlib.util
 import sys
 import traceback
 from collections.abc import Iterable
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from types import ModuleType
 
 from firmware_iface.errors import InputError
 from trainer.effects import drive, panel, pupil, sensor
@@ -48,8 +49,7 @@ def catalogue(files: Iterable[Path] = ()) -> Catalogue:
     """
     known: Catalogue = {e.name: e for e in BUILT_IN}
     for point in entry_points(group=ENTRY_POINTS):
-        loaded = point.load()
-        _add(known, [loaded] if isinstance(loaded, Effect) else list(loaded), f"entry point '{point.name}'")
+        _add(known, _of_entry_point(point), f"entry point '{point.name}'")
     for path in files:
         _add(known, load_effects(path), str(path))
     return known
@@ -62,6 +62,28 @@ def find_effect(known: Catalogue, name: str) -> Effect:
     near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
     hint = f"did you mean '{near[0]}'?" if near else "see 'hololoop-trainer effects' for the list"
     raise InputError(f"unknown effect '{name}': {hint}")
+
+
+def _of_entry_point(point: EntryPoint) -> list[Effect]:
+    """The effects that an installed package offers: a module's, one effect, or a list of them."""
+    where = f"entry point '{point.name}' ({point.value})"
+    try:
+        loaded = point.load()
+    except Exception as error:
+        raise InputError(f"{where} cannot be loaded ({error}): mend or uninstall its package") from error
+    found = _defined_in(loaded) if isinstance(loaded, ModuleType) else loaded
+    if isinstance(found, Effect):
+        return [found]
+    if not isinstance(found, list | tuple) or not found:
+        raise InputError(
+            f"{where} gives no effect: let it name a module with effects, an effect, or a list of them"
+        )
+    return list(found)
+
+
+def _defined_in(module: ModuleType) -> list[Effect]:
+    """A module's own effects."""
+    return [v for v in vars(module).values() if isinstance(v, Effect) and v not in BUILT_IN]
 
 
 def load_effects(path: Path) -> list[Effect]:
@@ -83,8 +105,7 @@ def load_effects(path: Path) -> list[Effect]:
         line = f", line {inside[-1].lineno}" if inside else ""
         line = f", line {error.lineno}" if isinstance(error, SyntaxError) else line
         raise InputError(f"effects file {path}{line}: {type(error).__name__}: {error}") from error
-    found = [value for value in vars(module).values() if isinstance(value, Effect)]
-    own = [e for e in found if e not in BUILT_IN]
+    own = _defined_in(module)
     if not own:
         raise InputError(
             f"effects file {path} defines no effect: decorate a function with trainer.effects.effect"

@@ -30,9 +30,9 @@ def small_bench(rows: int = 72, columns: int = 96) -> Bench:
     return Bench("small", Panel(columns, rows, 8.0), (Channel("green", 520.0),), 6.0, Iris(), camera)
 
 
-def placed(effect: Effect, bench: Bench, values: Given) -> Present:
-    """The effect with these values; parameters that are not named stay absent."""
-    base = absent(effect, bench)
+def placed(effect: Effect, bench: Bench, values: Given, order: int | None = None) -> Present:
+    """The effect with these values, at its lowest order or a stated one; parameters not named stay absent."""
+    base = absent(effect, bench, order)
     given = {
         n: np.array(np.broadcast_to(values[n], v.shape), float) for n, v in base.values.items() if n in values
     }
@@ -65,11 +65,16 @@ def slopes(effect: Effect, values: Given) -> dict[str, float]:
 
 
 def captures_with(
-    folder: Path, effect: Effect, values: Given, patterns: int = 6, seed: int = 0
+    folder: Path,
+    effect: Effect,
+    values: Given,
+    patterns: int = 6,
+    seed: int = 0,
+    order: int | None = None,
 ) -> CaptureSet:
     """Writes and reads a capture set of the small bench with the effect hidden in it and camera noise."""
     bench = small_bench()
-    model = Model(bench).having(placed(effect, bench, values))
+    model = Model(bench).having(placed(effect, bench, values, order))
     rng = np.random.default_rng(seed)
     blank = CaptureSet(folder, bench, ())
     with CaptureWriter(folder, bench) as writer, torch.no_grad():

@@ -1,0 +1,72 @@
+"""The fit: true values within their stated errors, orders raised as far as the data ask, ranges kept."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from trainer.bases import legendre_count
+from trainer.candidates import least_for_order
+from trainer.captures import CaptureSet
+from trainer.effects import catalogue
+from trainer.effects.testing import captures_with, placed
+from trainer.evidence import Batch, load
+from trainer.fit import fit, raise_order
+from trainer.model import Model, Present, absent
+
+KNOWN = catalogue()
+
+
+def batches_of(captures: CaptureSet) -> list[Batch]:
+    return load(captures, captures.captures)
+
+
+def fitted(captures: CaptureSet, start: Present) -> Present:
+    model = Model(captures.bench).having(start)
+    return fit(model, [start.effect.name], batches_of(captures)).model.present[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "truth"),
+    [
+        ("distance", {"offset": 0.08}),
+        ("zero_order", {"leak_real": 0.06, "leak_imaginary": -0.03, "fill_factor": 0.95}),
+        ("misregistration", {"shift_y": 0.2, "shift_x": -0.1, "rotation": 0.8, "magnification": 0.05}),
+        ("ghost", {"amplitude": 0.05, "shift_y": -3.3, "shift_x": 6.4}),
+    ],
+)
+def test_true_values_lie_within_the_stated_errors(name: str, truth: dict[str, float], tmp_path: Path) -> None:
+    effect = KNOWN[name]
+    scores = []
+    for seed in range(4):
+        captures = captures_with(tmp_path / str(seed), effect, truth, patterns=3, seed=seed)
+        found = fitted(captures, placed(effect, captures.bench, {k: 0.9 * v for k, v in truth.items()}))
+        assert found.errors is not None
+        for key, value in truth.items():
+            true = float(np.asarray(value))
+            scores.append(float((found.values[key] - true).reshape(-1)[0] / found.errors[key].reshape(-1)[0]))
+    # The mean square of n normal scores lies in this range but for one case in some thousands.
+    assert max(map(abs, scores)) < 4
+    assert 0.15 < np.mean(np.square(scores)) < 3.5
+
+
+def test_an_order_is_raised_as_far_as_the_captures_ask_and_no_farther(tmp_path: Path) -> None:
+    effect = KNOWN["vignetting"]
+    terms = np.zeros(legendre_count(4))
+    terms[[0, 4, -1]] = 0.2, -0.15, 0.1
+    captures = captures_with(tmp_path, effect, {"log_gain": terms}, patterns=3, order=4)
+    batches = batches_of(captures)
+    lowest = fit(Model(captures.bench).having(absent(effect, captures.bench)), ["vignetting"], batches)
+    assert lowest.model.present[0].order == 2
+    best = raise_order(lowest, "vignetting", batches, least_for_order)
+    assert best.model.present[0].order == 4
+    assert best.model.present[0].values["log_gain"] == pytest.approx(terms, abs=3e-3)
+
+
+def test_a_value_stays_in_its_physical_range(tmp_path: Path) -> None:
+    effect = KNOWN["zero_order"]
+    captures = captures_with(tmp_path, effect, {"fill_factor": 1.0}, patterns=3)
+    found = fitted(captures, placed(effect, captures.bench, {"fill_factor": 0.99}))
+    assert 0.99 < float(found.values["fill_factor"]) <= 1.0
