@@ -3,6 +3,6 @@
 At most numpy is imported here; vendor libraries are imported when a device is opened.
 """
 
-from .errors import InputError
+from .errors import DeviceError, DeviceGoneError, InputError
 
-__all__ = ["InputError"]
+__all__ = ["DeviceError", "DeviceGoneError", "InputError"]

@@ -1,4 +1,4 @@
-"""The project's one error for bad input."""
+"""The project's errors: bad input, and devices that fail."""
 
 from __future__ import annotations
 
@@ -21,3 +21,11 @@ def nearest(word: str, known: Iterable[str]) -> str:
     if close:
         return f"did you mean '{close[0]}'?"
     return "known are " + ", ".join(names)
+
+
+class DeviceError(RuntimeError):
+    """A device did not do what it was asked: one sentence that says which, what happened, and what to do."""
+
+
+class DeviceGoneError(DeviceError):
+    """The device is not there (any more); it may come back."""
