@@ -4,7 +4,8 @@ faults = Faults()
 faults.arm("stall")                 # the next transfer
 faults.arm("garbage", count=3)      # the next three
 faults.arm("short_write", after=5)  # the sixth from now
-faults.arm("unplug", count=None)    # from now until clear("unplug"), which plugs the device in again
+faults.arm("hang", count=None)      # from now until clear("hang")
+faults.arm("unplug")                # always until clear("unplug"), which plugs the device in again
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ KINDS = {
     "short_write": "only the first part of what is written arrives",
     "nack": "the address is not acknowledged (I2C)",
     "unplug": "the device is gone; clearing plugs it in again, with the state of a fresh start",
-    "garbage": "what comes back is random bytes",
+    "garbage": "the bytes of the transfer arrive as random ones",
     "hang": "nothing is answered or done until it is cleared",
     "late": "what is due comes late, by `late_s`",
     "die": "the process that owns the device dies at once",
@@ -33,18 +34,22 @@ class Faults:
 
     seed : fixes the random bytes of "garbage"
 
-    Attributes: late_s (how late a late answer is, s), struck (Counter: how often each kind took effect).
+    Attributes: late_s (how late a late answer is, s), struck and ended (Counters: how often each kind took
+    effect, and how often it was over, by count or cleared, after it had been due).
     """
 
     def __init__(self, seed: int = 0) -> None:
         self.late_s = 0.25
         self.struck: Counter[str] = Counter()
-        self._armed: dict[str, tuple[int, int | None]] = {}  # kind: (transfers to spare, transfers to hit)
+        self.ended: Counter[str] = Counter()
+        self._script: dict[str, tuple[int, int | None]] = {}  # kind: (transfers to spare, transfers to hit)
         self._random = random.Random(seed)
         self._lock = threading.Lock()
 
     def arm(self, kind: str, count: int | None = 1, after: int = 0) -> None:
         """Let a fault strike the next `count` transfers, or every one until cleared where count is None.
+
+        "unplug" always lasts until it is cleared.
 
         after : transfers to spare first
         Raises InputError for an unknown kind or a number out of range.
@@ -57,38 +62,38 @@ class Faults:
                 "(or None) and after 0 or more."
             )
         with self._lock:
-            self._armed[kind] = (after, count)
+            self._script[kind] = (after, None if kind == "unplug" else count)
 
     def clear(self, kind: str | None = None) -> None:
         """Disarm one kind, or all."""
         with self._lock:
-            if kind is None:
-                self._armed.clear()
-            else:
-                self._armed.pop(kind, None)
+            for name in KINDS if kind is None else [kind]:
+                if self._script.pop(name, (1, None))[0] == 0:
+                    self.ended[name] += 1
 
     def standing(self, kind: str) -> bool:
         """Whether the next transfer would be struck; does not count as one."""
         with self._lock:
-            return self._armed.get(kind, (1, None))[0] == 0
+            return self._script.get(kind, (1, None))[0] == 0
 
     def take(self, *kinds: str) -> str | None:
         """Count one transfer that could suffer `kinds`; the first of them that strikes it, or None."""
         with self._lock:
             hit = None
             for kind in kinds:
-                if kind not in self._armed:
+                if kind not in self._script:
                     continue
-                spare, left = self._armed[kind]
+                spare, left = self._script[kind]
                 if spare:
-                    self._armed[kind] = (spare - 1, left)
+                    self._script[kind] = (spare - 1, left)
                 elif hit is None:
                     hit = kind
                     if left is not None:
                         if left == 1:
-                            del self._armed[kind]
+                            del self._script[kind]
+                            self.ended[kind] += 1
                         else:
-                            self._armed[kind] = (0, left - 1)
+                            self._script[kind] = (0, left - 1)
             if hit:
                 self.struck[hit] += 1
             return hit

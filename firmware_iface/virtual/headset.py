@@ -16,12 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..panel.panel import Gray, checked_gray
 from . import defects, oracle
 from .description import BenchDescription, load_bench
 from .optics import BenchOptics
 from .sensor import Drift, Integrator, Sensor
-
-Gray = NDArray[np.uint8]
 
 
 class VirtualPanel:
@@ -220,16 +219,6 @@ class VirtualHeadset:
             if len(self._integrators) > 4:
                 self._integrators.popitem(last=False)
         return self._integrators[key]
-
-
-def checked_gray(gray: NDArray[np.generic], shape: tuple[int, int]) -> Gray:
-    """`gray` if it is uint8 of this shape; raises InputError."""
-    if not isinstance(gray, np.ndarray) or gray.dtype != np.uint8:
-        found = gray.dtype if isinstance(gray, np.ndarray) else type(gray).__name__
-        raise InputError(f"the pattern is {found}; give the panel uint8 gray levels.")
-    if gray.shape != shape:
-        raise InputError(f"the pattern is {gray.shape}; the panel takes (rows, columns) = {shape}.")
-    return np.asarray(gray, np.uint8)
 
 
 def checked_plane(plane_mm: float) -> float:

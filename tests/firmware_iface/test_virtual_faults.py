@@ -21,7 +21,7 @@ def test_a_fault_strikes_as_often_as_armed_and_after_the_transfers_it_spares() -
 
 def test_without_a_count_it_stays_until_cleared() -> None:
     faults = Faults()
-    faults.arm("unplug", count=None)
+    faults.arm("unplug")
     assert strikes(faults, 50, "unplug") == ["unplug"] * 50 and faults.standing("unplug")
     faults.clear("unplug")
     assert not faults.standing("unplug") and faults.take("unplug") is None
@@ -61,3 +61,15 @@ def test_a_fault_that_cannot_be_is_refused(kind: str, count: int, after: int) ->
 
 def test_every_kind_is_explained() -> None:
     assert all(len(text) > 10 for text in KINDS.values())
+
+
+def test_an_end_counts_only_after_the_fault_was_due() -> None:
+    faults = Faults()
+    faults.arm("unplug", after=1)
+    faults.clear()
+    assert faults.ended["unplug"] == 0
+    faults.arm("unplug")
+    faults.clear()
+    faults.arm("hang", count=2)
+    strikes(faults, 2, "hang")
+    assert faults.ended == {"unplug": 1, "hang": 1} and faults.struck == {"hang": 2}
