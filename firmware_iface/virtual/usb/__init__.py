@@ -3,5 +3,6 @@
 from .backend import VirtualUsb
 from .board import BoardModel
 from .device import UsbModel
+from .dlpc900 import Dlpc900Model
 
-__all__ = ["BoardModel", "UsbModel", "VirtualUsb"]
+__all__ = ["BoardModel", "Dlpc900Model", "UsbModel", "VirtualUsb"]

@@ -1,0 +1,244 @@
+"""TI's phase light modulator on the DLPC900 controller (USB HID 0451:C900, DLPU018).
+
+Frames can be uploaded (pattern on the fly), which takes tens of seconds for a whole hologram because USB HID
+carries 64 KB/s: it is for calibration and tests. At video rate frames travel over the display link, see
+`mirrored`; this control part is the same.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import DeviceError, InputError
+from ..usb_link import UsbLink
+from . import erle
+from .panel import Frames, Gray, Panel
+from .plm import P47, Modulator, bit_plane
+
+VENDOR, PRODUCT = 0x0451, 0xC900
+OUT, IN, PACKET = 0x01, 0x81, 64
+LONGEST_DATA = 504  # bytes of an image in one command
+
+POWER, LAST_ERROR, FIRMWARE = 0x0200, 0x0100, 0x0206
+HARDWARE_STATUS, SYSTEM_STATUS, MAIN_STATUS = 0x1A0A, 0x1A0B, 0x1A0C
+DISPLAY_MODE, PATTERN, PATTERN_LUT, PATTERN_ENTRY = 0x1A1B, 0x1A24, 0x1A31, 0x1A34
+IMAGE_BEGIN, IMAGE_DATA = (0x1A2A, 0x1A2C), (0x1A2B, 0x1A2D)  # primary and secondary controller
+STOP, START = 0, 2
+POWERS = ("normal", "standby")
+MODES = ("video", "pre-stored", "video-pattern", "on-the-fly")
+ERRORS = {
+    1: "a batch file's checksum is wrong",
+    3: "it does not know the command",
+    5: "the command is not for this mode",
+    6: "a parameter is wrong",
+    9: "the image's compression is wrong",
+    14: "the exposure is out of range",
+    15: "the pattern's number is out of range",
+    255: "an internal error",
+}
+HARDWARE = {2: "DMD reset controller error", 3: "forced swap", 6: "sequence aborted", 7: "sequence error"}
+
+_READ, _REPLY, _FAILED = 0x80, 0x40, 0x20
+
+
+class Dlpc900Control:
+    """Commands of the controller: power, mode, status, errors."""
+
+    def __init__(self, link: UsbLink, mode: str) -> None:
+        self.name = link.name
+        self._link = link
+        self._mode = mode
+        self._sequence = 0
+        self._unsure = False  # whether the last command broke off
+        link.opened.append(self._set_up)
+        link.open()
+
+    def command(self, code: int, data: bytes = b"", read: bool = False) -> bytes:
+        """Send one command and return the data of its answer; DeviceError with the controller's reason."""
+        flags, answer = self._exchange(code, data, read)
+        if flags & _FAILED:
+            number = self._exchange(LAST_ERROR, b"", True)[1][:1]
+            reason = ERRORS.get(number[0], f"error {number[0]}") if number else "it does not say why"
+            raise DeviceError(f"{self.name} refused command 0x{code:04x}: {reason}.")
+        return answer
+
+    def set_power(self, power: str) -> None:
+        """ "normal" or "standby"."""
+        if power not in POWERS:
+            raise InputError(f"{self.name} has no power mode '{power}'; use one of {', '.join(POWERS)}.")
+        self.command(POWER, bytes([POWERS.index(power)]))
+
+    def set_mode(self, mode: str) -> None:
+        """One of MODES; patterns are stopped first, as the controller demands."""
+        if mode not in MODES:
+            raise InputError(f"{self.name} has no mode '{mode}'; use one of {', '.join(MODES)}.")
+        self.command(PATTERN, bytes([STOP]))
+        self.command(DISPLAY_MODE, bytes([MODES.index(mode)]))
+        end = time.monotonic() + 2
+        while self._byte(DISPLAY_MODE) != MODES.index(mode):
+            if time.monotonic() > end:
+                raise DeviceError(f"{self.name} does not go into mode {mode}; power it off and on.")
+            time.sleep(0.05)
+
+    def status(self) -> dict[str, Any]:
+        hardware, system, main = map(self._byte, (HARDWARE_STATUS, SYSTEM_STATUS, MAIN_STATUS))
+        mode, power = self._byte(DISPLAY_MODE), self._byte(POWER)
+        faults = [text for bit, text in HARDWARE.items() if hardware >> bit & 1]
+        faults += [] if hardware & 1 else ["not initialised"]
+        faults += [] if system & 1 else ["memory test failed"]
+        return {
+            "mode": MODES[mode] if mode < len(MODES) else f"mode {mode}",
+            "power": POWERS[power] if power < len(POWERS) else f"power {power}",
+            "parked": bool(main & 1),
+            "running": bool(main & 2),
+            "frozen": bool(main & 4),
+            "video_locked": bool(main & 8),
+            "faults": faults,
+            "firmware": self.command(FIRMWARE, read=True)[1:].split(b"\0")[0].decode("ascii", "replace"),
+        }
+
+    def close(self) -> None:
+        if self._link.is_open:
+            with suppress(DeviceError):  # a controller that is gone shows nothing
+                self.command(PATTERN, bytes([STOP]))
+                self.set_power("standby")
+        self._link.close()
+
+    def _set_up(self) -> None:
+        self.set_power("normal")
+        self.set_mode(self._mode)
+
+    def _byte(self, code: int) -> int:
+        answer = self.command(code, read=True)
+        if not answer:
+            raise DeviceError(f"{self.name} answered command 0x{code:04x} with nothing; power it off and on.")
+        return answer[0]
+
+    def _exchange(self, code: int, data: bytes, read: bool) -> tuple[int, bytes]:
+        """One command and its answer, (flags, data); answers to earlier commands that come late are dropped."""
+        self._link.open()  # before the number is drawn: setting up has commands of its own
+        if self._unsure:
+            self._recover()
+        self._sequence = sequence = (self._sequence + 1) % 256
+        flags = _REPLY | (_READ if read else 0)
+        packets = struct.pack("<BBHH", flags, sequence, len(data) + 2, code) + data
+        self._unsure = True
+        for at in range(0, len(packets), PACKET):
+            self._link.write(OUT, packets[at : at + PACKET].ljust(PACKET, b"\0"))
+        for _ in range(8):
+            try:
+                flags, answered, answer = parse_answer(self._link.read(IN, PACKET))
+            except ValueError as error:
+                raise DeviceError(f"{self.name}: {error}; check its cable.") from error
+            if answered == sequence:
+                self._unsure = False
+                return flags, answer
+        raise DeviceError(f"{self.name} answers other commands than were sent; power it off and on.")
+
+    def _recover(self) -> None:
+        """After a command that broke off: fill up what the controller may still wait for with empty commands.
+
+        They ask for no answer and do nothing. Not tried on hardware.
+        """
+        self._link.clear_halt(OUT)
+        self._link.clear_halt(IN)
+        for _ in range(LONGEST_DATA // PACKET + 2):
+            self._link.write(OUT, bytes(PACKET))
+        self._unsure = False
+
+
+def parse_answer(packet: bytes) -> tuple[int, int, bytes]:
+    """(flags, sequence, data) of an answer; ValueError where it is none."""
+    if len(packet) < 4:
+        raise ValueError(f"its answer has {len(packet)} bytes")
+    flags, sequence, length = struct.unpack_from("<BBH", packet)
+    if length > len(packet) - 4:
+        raise ValueError(f"its answer claims {length} bytes and has {len(packet) - 4}")
+    return flags, sequence, packet[4 : 4 + length]
+
+
+class PatternUpload:
+    """Frames as one-bit patterns over USB: up to 24 pictures shown in turn, one alone until the next.
+
+    exposure_us : of each picture, at least 105
+    """
+
+    def __init__(self, control: Dlpc900Control, modulator: Modulator = P47, exposure_us: int = 16667) -> None:
+        if not 105 <= exposure_us < 1 << 24:
+            raise InputError(f"exposure {exposure_us} µs is out of range; give 105 to {(1 << 24) - 1} µs.")
+        self.shape = modulator.shape
+        self._control, self._modulator, self._exposure_us = control, modulator, exposure_us
+        self._sent = 0
+
+    def send(self, gray: Gray) -> int:
+        self.upload([gray])
+        self._sent += 1
+        return self._sent
+
+    def upload(self, pictures: list[Gray]) -> None:
+        """Replace what is shown by 1 to 24 pictures, uint8 [H, W], in turn."""
+        if not 1 <= len(pictures) <= 24:
+            raise InputError(f"{len(pictures)} pictures do not fit one image; give 1 to 24.")
+        rows, columns = self._modulator.memory_shape
+        image = np.zeros((rows, columns), np.uint32)
+        for position, gray in enumerate(pictures):
+            image |= bit_plane(gray, self._modulator).astype(np.uint32) << position
+        control = self._control
+        control.command(PATTERN, bytes([STOP]))
+        for position in range(len(pictures)):
+            control.command(PATTERN_ENTRY, self._entry(position))
+        control.command(PATTERN_LUT, struct.pack("<HI", len(pictures), 0))
+        for index, half in enumerate(np.array_split(image, self._modulator.controllers, axis=1)):
+            self._load(index, half)
+        control.command(PATTERN, bytes([START]))
+
+    def wait(self, sequence: int) -> None:
+        if sequence != self._sent:
+            raise DeviceError(
+                f"{self._control.name} shows frame {self._sent}, not {sequence}; show it again."
+            )
+        if not self._control.status()["running"]:
+            raise DeviceError(f"{self._control.name} does not run its patterns; show the frame again.")
+
+    def close(self) -> None:
+        """The control part lets go of the link that both use."""
+
+    def _entry(self, position: int) -> bytes:
+        """A line of the pattern table: one bit, all colours, cleared afterwards, image 0, this bit position."""
+        exposure = self._exposure_us.to_bytes(3, "little")
+        return struct.pack("<H", position) + exposure + struct.pack("<B3xBH", 0x71, 0, position << 11)
+
+    def _load(self, index: int, image: NDArray[np.uint32]) -> None:
+        data = erle.encode(image)
+        self._control.command(IMAGE_BEGIN[index], struct.pack("<HI", 0, len(data)))
+        for at in range(0, len(data), LONGEST_DATA):
+            part = data[at : at + LONGEST_DATA]
+            self._control.command(IMAGE_DATA[index], struct.pack("<H", len(part)) + part)
+
+
+def open_dlpc900(
+    frames: Frames | None = None,
+    *,
+    modulator: Modulator = P47,
+    serial: str | None = None,
+    backend: Any = None,
+    exposure_us: int = 16667,
+    timeout_s: float = 1.0,
+) -> Panel:
+    """Open a phase light modulator.
+
+    frames : how frames travel, for example a MirroredDisplay; None uploads them over USB, slowly
+    backend : a pyusb backend; None is the system's libusb
+    exposure_us : of an uploaded picture
+    Raises DeviceGoneError where it is not attached, DeviceError where it does not answer as it should.
+    """
+    name = "the phase light modulator"
+    link = UsbLink(VENDOR, PRODUCT, name, serial=serial, backend=backend, timeout_s=timeout_s)
+    control = Dlpc900Control(link, "on-the-fly" if frames is None else "video-pattern")
+    return Panel(control, frames or PatternUpload(control, modulator, exposure_us))

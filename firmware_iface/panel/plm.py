@@ -1,0 +1,69 @@
+"""TI's phase light modulators: 16 mirror heights, and the four memory bits under each mirror that set them.
+
+Facts of TI's device tables as published with its open `ti-plm` package (1.1): how far each state moves the
+mirror, which bits hold it, and where these lie.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .panel import Gray
+
+# displacement of state 0..15 over that of state 15; state 15 is 15/16 of a wave
+_LOWER = (0, 0.0126, 0.0259, 0.0495, 0.071, 0.0878, 0.1382, 0.2153)
+_UPPER = (0.3274, 0.361, 0.4204, 0.5046, 0.5916, 0.673, 0.8254, 1)
+DISPLACEMENT = _LOWER + _UPPER
+# memory bits of each state
+MEMORY = (3, 2, 1, 7, 0, 6, 5, 4, 11, 10, 9, 8, 15, 14, 13, 12)
+
+
+@dataclass(frozen=True)
+class Modulator:
+    """One device.
+
+    shape : (H, W), mirrors
+    electrodes : which memory bit lies where under a mirror, 2 x 2
+    mirrored : whether the memory's columns run the other way
+    controllers : 1, or 2 where a second one has the right half
+    """
+
+    shape: tuple[int, int]
+    electrodes: tuple[tuple[int, int], tuple[int, int]]
+    mirrored: bool = False
+    controllers: int = 1
+
+    @property
+    def memory_shape(self) -> tuple[int, int]:
+        """(rows, columns) of bits."""
+        return 2 * self.shape[0], 2 * self.shape[1]
+
+
+P47 = Modulator((540, 960), ((2, 3), (0, 1)))
+P67 = Modulator((800, 1280), ((1, 3), (0, 2)), mirrored=True, controllers=2)
+
+
+def phase_waves() -> NDArray[np.float64]:
+    """Phase of each state, waves, [16]."""
+    return np.array(DISPLACEMENT) * 15 / 16
+
+
+def states(gray: Gray) -> NDArray[np.uint8]:
+    """The state, 0 to 15, whose phase is nearest on the circle to gray / 256 of a wave."""
+    asked = np.arange(256)[:, None] / 256
+    apart = np.abs(asked - phase_waves())
+    nearest = np.minimum(apart, 1 - apart).argmin(1).astype(np.uint8)
+    return nearest[gray]
+
+
+def bit_plane(gray: Gray, modulator: Modulator) -> NDArray[np.uint8]:
+    """The memory's bits, 0 or 1, [2 H, 2 W], that show gray levels [H, W]."""
+    memory = np.array(MEMORY, np.uint8)[states(gray)]
+    layout = np.array(modulator.electrodes, np.uint8)
+    height, width = gray.shape
+    bits = memory[:, None, :, None] >> layout[None, :, None, :] & 1
+    plane = bits.reshape(2 * height, 2 * width)
+    return np.ascontiguousarray(plane[:, ::-1] if modulator.mirrored else plane)

@@ -1,0 +1,299 @@
+"""A model of a DLPC900 with a phase light modulator, after TI's programmer's guide (DLPU018): bytes in, bytes out.
+
+It shares no code with the driver; third-party drivers upload into it as well (see the marked tests).
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..faults import Faults
+from .device import (
+    INTERRUPT,
+    Nak,
+    Stall,
+    UsbModel,
+    configuration_descriptor,
+    device_descriptor,
+    endpoint_descriptor,
+    interface_descriptor,
+)
+
+# vendor page, 64 bytes in and out
+_HID_REPORT = bytes.fromhex("0600ff0901a101150026ff007508954009018102954009019102c0")
+_HID = struct.pack("<BBHBBBH", 9, 0x21, 0x0111, 0, 1, 0x22, len(_HID_REPORT))
+
+# height of each value of a mirror's four memory bits, as share of the highest
+_HEIGHT = {3: 0.0, 2: 0.0126, 1: 0.0259, 7: 0.0495, 0: 0.071, 6: 0.0878, 5: 0.1382, 4: 0.2153}
+_HEIGHT |= {11: 0.3274, 10: 0.361, 9: 0.4204, 8: 0.5046, 15: 0.5916, 14: 0.673, 13: 0.8254, 12: 1.0}
+
+
+class _Refused(Exception):
+    """The command fails with this error number."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One line of the pattern table."""
+
+    exposure_us: int
+    bits: int
+    image: int
+    position: int
+
+
+class Dlpc900Model(UsbModel):
+    """The controller and its mirrors.
+
+    memory_shape : (rows, columns) of memory bits; four of them, 2 x 2, are one mirror
+    electrodes : which bit of a mirror's value lies top left, top right, bottom left, bottom right
+    controllers : 2 where a second one holds the right half
+
+    Attributes: gray, shape; power, mode, running, entries, images (as loaded), commands (their count).
+    """
+
+    def __init__(
+        self,
+        memory_shape: tuple[int, int] = (1080, 1920),
+        electrodes: tuple[int, int, int, int] = (2, 3, 0, 1),
+        mirrored: bool = False,
+        controllers: int = 1,
+        faults: Faults | None = None,
+    ) -> None:
+        self.memory_shape = memory_shape
+        self.shape = memory_shape[0] // 2, memory_shape[1] // 2
+        self._electrodes, self._mirrored, self._controllers = electrodes, mirrored, controllers
+        super().__init__(
+            device_descriptor(0x0451, 0xC900),
+            configuration_descriptor(
+                interface_descriptor(2, 3),
+                _HID,
+                endpoint_descriptor(0x81, INTERRUPT, 64, 1),
+                endpoint_descriptor(0x01, INTERRUPT, 64, 1),
+            ),
+            ("Texas Instruments", "DLPC900", "LCR"),
+            faults,
+        )
+        self.on_reset()
+
+    @property
+    def gray(self) -> NDArray[np.uint8]:
+        """The phase shown, as gray levels of 1/256 wave, uint8 [H, W]; flat while no pattern runs."""
+        with self._lock:
+            if not self.present or not self.running or self.power or not self.entries:
+                return np.zeros(self.shape, np.uint8)
+            bits = self.plane(0)
+        if self._mirrored:
+            bits = bits[:, ::-1]
+        corners = (bits[::2, ::2], bits[::2, 1::2], bits[1::2, ::2], bits[1::2, 1::2])
+        value = sum(c.astype(int) << bit for c, bit in zip(corners, self._electrodes, strict=True))
+        heights = np.array([_HEIGHT[v] for v in range(16)])
+        return np.rint(heights[value] * 15 / 16 * 256).astype(np.uint8)
+
+    def plane(self, number: int) -> NDArray[np.uint8]:
+        """The memory's bits of pattern `number` of the table, 0 or 1."""
+        entry = self.entries[number]
+        halves = [self.images[entry.image, side] for side in range(self._controllers)]
+        return (np.hstack(halves) >> entry.position & 1).astype(np.uint8)
+
+    def on_reset(self) -> None:
+        self.power = self.mode = self.error = self.commands = 0
+        self.running = False
+        self.entries: dict[int, Entry] = {}
+        self.images: dict[tuple[int, int], NDArray[np.uint32]] = {}
+        self._table = (0, 0)
+        self._loading: dict[int, tuple[int, int, bytearray]] = {}
+        self._answers: deque[bytes] = deque()
+        self._partial = b""
+
+    def on_control(self, kind: int, request: int, value: int, index: int, data: bytes | int) -> bytes:
+        if (kind, request) == (0x21, 0x0A):  # SET_IDLE
+            return b""
+        raise Stall
+
+    def on_read(self, endpoint: int, length: int) -> bytes:
+        if not self._answers:
+            raise Nak
+        return self._answers.popleft()
+
+    def on_write(self, endpoint: int, data: bytes) -> None:
+        for at in range(0, len(data), 64):
+            self._partial += data[at : at + 64].ljust(64, b"\0")
+            flags, sequence, length = struct.unpack_from("<BBH", self._partial)
+            if len(self._partial) >= 4 + length:
+                command, self._partial = self._partial[4 : 4 + length], b""
+                self._obey(flags, sequence, command)
+
+    def _obey(self, flags: int, sequence: int, command: bytes) -> None:
+        reply, failed = b"", 0
+        self.commands += 1
+        code = int.from_bytes(command[:2], "little")
+        try:
+            reply = self._answer(code) if flags & 0x80 else self._do(code, command[2:])
+        except _Refused as refused:
+            self.error, failed = refused.number, 0x20
+        except (struct.error, IndexError):
+            self.error, failed = 6, 0x20
+        else:
+            if code != 0x0100:
+                self.error = 0
+        if flags & 0x40:
+            head = struct.pack("<BBH", flags & 0x80 | failed, sequence, len(reply))
+            self._answers.append((head + reply).ljust(64, b"\0"))
+
+    def _answer(self, code: int) -> bytes:
+        main = (1 if self.power else 0) | (2 if self.running else 0) | 8
+        known = {
+            0x0100: bytes([self.error]),
+            0x0200: bytes([self.power]),
+            0x0205: struct.pack("<4I", 0x06000000, 0, 0, 0),
+            0x0206: b"\x02DLPC900 model\0",
+            0x1100: bytes(6),
+            0x1A0A: b"\x01",
+            0x1A0B: b"\x01",
+            0x1A0C: bytes([main]),
+            0x1A1B: bytes([self.mode]),
+        }
+        if code not in known:
+            raise _Refused(3)
+        return known[code]
+
+    def _do(self, code: int, data: bytes) -> bytes:
+        match code:
+            case 0x0200:
+                if data[0] == 2:
+                    self.on_reset()
+                else:
+                    self.power = _within(data[0], 1)
+            case 0x0201 | 0x1100 | 0x1A00 | 0x1A01 | 0x1A03:
+                pass
+            case 0x1A1B:
+                if self.running:
+                    raise _Refused(5)
+                self.mode = _within(data[0], 3)
+            case 0x1A24:
+                self._run(_within(data[0], 2))
+            case 0x1A31:
+                self._table = struct.unpack_from("<HI", data)
+            case 0x1A34:
+                self._define(data)
+            case 0x1A2A | 0x1A2C:
+                side, (image, length) = int(code == 0x1A2C), struct.unpack_from("<HI", data)
+                if self.mode != 3 or side >= self._controllers:
+                    raise _Refused(5)
+                self._loading[side] = (image, length, bytearray())
+            case 0x1A2B | 0x1A2D:
+                self._load(int(code == 0x1A2D), data)
+            case _:
+                raise _Refused(3)
+        return b""
+
+    def _define(self, data: bytes) -> None:
+        index, low, high, options = struct.unpack_from("<HHBB", data)
+        exposure_us, where = low | high << 16, struct.unpack_from("<H", data, 10)[0]
+        if index >= 400:
+            raise _Refused(15)
+        if exposure_us < 105:
+            raise _Refused(14)
+        self.entries[index] = Entry(exposure_us, (options >> 1 & 7) + 1, where & 0x7FF, where >> 11)
+
+    def _load(self, side: int, data: bytes) -> None:
+        if side not in self._loading:
+            raise _Refused(5)
+        image, length, got = self._loading[side]
+        (size,) = struct.unpack_from("<H", data)
+        if size > 504 or size > len(data) - 2:
+            raise _Refused(6)
+        got += data[2 : 2 + size]
+        if len(got) >= length:
+            del self._loading[side]
+            rows, columns = self.memory_shape
+            self.images[image, side] = decode_image(bytes(got), rows, columns // self._controllers)
+
+    def _run(self, what: int) -> None:
+        if what == 2:
+            used = [self.entries.get(k) for k in range(self._table[0])]
+            sides = range(self._controllers)
+            if self.mode == 3 and not (
+                used and all(e and all((e.image, side) in self.images for side in sides) for e in used)
+            ):
+                raise _Refused(5)
+        self.running = what == 2
+
+
+def _within(value: int, highest: int) -> int:
+    if value > highest:
+        raise _Refused(6)
+    return value
+
+
+def decode_image(data: bytes, height: int, width: int) -> NDArray[np.uint32]:
+    """The pixels of a compressed image with its header, uint32 [height, width]; refuses what is none."""
+    if len(data) < 48 or data[:4] != b"Spld" or struct.unpack_from("<HH", data, 4) != (width, height):
+        raise _Refused(6)
+    if data[25] != 2:
+        raise _Refused(9)
+    try:
+        return _decode_rows(data[48:], height, width)
+    except (IndexError, ValueError):
+        raise _Refused(9) from None
+
+
+def _decode_rows(data: bytes, height: int, width: int) -> NDArray[np.uint32]:
+    out = np.zeros(height * width, np.uint32)
+    at = done = 0
+
+    def count() -> int:
+        nonlocal at
+        number = data[at]
+        at += 1
+        if number >= 128:
+            number = number & 0x7F | data[at] << 7
+            at += 1
+        return number
+
+    def pixels(number: int) -> NDArray[np.uint32]:
+        nonlocal at
+        raw = np.frombuffer(data, np.uint8, 3 * number, at).reshape(number, 3).astype(np.uint32)
+        at += 3 * number
+        return np.asarray(raw[:, 0] << 16 | raw[:, 1] << 8 | raw[:, 2], np.uint32)
+
+    def room(number: int) -> int:
+        if done + number > len(out):
+            raise ValueError("more pixels than the image has")
+        return number
+
+    while True:
+        if data[at]:
+            number = room(count())
+            out[done : done + number] = pixels(1)
+            done += number
+        elif data[at + 1] == 0:  # end of a row
+            at += 2
+        elif data[at + 1] == 1:
+            at += 2
+            number = room(count())
+            if not number:
+                break
+            if done < width:
+                raise ValueError("there is no row above the first")
+            while number:  # a copy that is longer than a row copies what it wrote
+                part = min(number, width)
+                out[done : done + part] = out[done - width : done - width + part]
+                done, number = done + part, number - part
+        else:
+            at += 1
+            number = room(count())
+            out[done : done + number] = pixels(number)
+            done += number
+    if done != len(out):
+        raise ValueError("fewer pixels than the image has")
+    return out.reshape(height, width)
