@@ -22,8 +22,8 @@ from PIL import Image
 from firmware_iface.errors import InputError
 from runtime.lightpath import grid_for
 from runtime.propagation import band_limit, transfer_function
+from runtime.registration import dot_pattern
 from trainer.bench_file import Bench
-from trainer.registration import dot_pattern
 
 Gray = NDArray[np.uint8]
 Array = NDArray[np.floating]
@@ -89,7 +89,7 @@ def choose_patterns(bench: Bench, channel: str, plane_mm: float, count: int, see
 
 
 def dots_to_show(bench: Bench, channel: str, plane_mm: float, spacing: float) -> Gray:
-    """Gray levels that show the dot pattern of `trainer.registration` in a plane, for finding the camera.
+    """Gray levels that show the dot pattern of `runtime.registration` in a plane, for finding the camera.
 
     Raises InputError as `dot_pattern` does, and where the plane is out of reach.
     """

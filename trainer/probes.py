@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from runtime.legendre import legendre_count, legendre_curve, legendre_surface
 from runtime.lightpath import mode_irradiance, panel_phase, panel_spectrum
-from trainer.bases import legendre_count, legendre_curve, legendre_surface
 from trainer.candidates import chosen, opened
 from trainer.captures import Capture
 from trainer.evidence import Batch, load, load_batch, scenes

@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from runtime.fft import irfft2
+from runtime.legendre import legendre_maps
 from runtime.lightpath import FINE
-from trainer.bases import legendre_maps, zernike_maps
+from trainer.bases import zernike_maps
 from trainer.bench_file import Bench, read_bench
 from trainer.effects import catalogue
 from trainer.model import Model, Present, absent

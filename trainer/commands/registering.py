@@ -40,8 +40,8 @@ def run_register(args: Namespace, screen: Screen) -> Result:
 
         write_gray(args.out, dots_to_show(bench, channel, args.plane or bench.distance_mm, args.spacing))
         return {"pattern": str(args.out), "spacing_px": args.spacing, "channel": channel}
+    from runtime.registration import dots_of, find_homography
     from trainer.captures import read_picture
-    from trainer.registration import dots_of, find_homography
 
     depth = 16 if bench.camera.bit_depth > 8 else 8
     image = read_picture(args.image, bench.camera.shape, depth, f"the dot picture {args.image}")

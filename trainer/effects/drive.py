@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from trainer.bases import legendre_count, legendre_curve, legendre_surface
+from runtime.legendre import legendre_count, legendre_curve, legendre_surface
 from trainer.effects.definition import Parameter, effect
 from trainer.stages import Drive
 

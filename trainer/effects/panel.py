@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from trainer.bases import legendre_count, legendre_surface
+from runtime.legendre import legendre_count, legendre_surface
 from trainer.effects.definition import Parameter, effect
 from trainer.stages import Panel
 from trainer.starts import wavefront_starts

@@ -13,8 +13,9 @@ import itertools
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
+from PIL import Image
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from firmware_iface.errors import InputError
@@ -107,12 +108,13 @@ def panel_points(homography: np.ndarray, camera_xy: np.ndarray) -> np.ndarray:
 def resample(image: np.ndarray, homography: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """A camera picture [h, w] on the panel's pixels, float32 [H, W]; 0 where the camera did not look.
 
-    Interpolates with a Lanczos kernel: to look at, and to make registered sets of finely sampled pictures.
+    Interpolates with cubic splines: to look at, and to make registered sets of finely sampled pictures.
     """
-    there = np.ascontiguousarray(image, np.float32)
-    return cv2.warpPerspective(
-        there, np.asarray(homography, np.float64), (shape[1], shape[0]), flags=cv2.INTER_LANCZOS4
-    )
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    panel = np.stack([x.ravel(), y.ravel()], 1)
+    there = panel_points(np.linalg.inv(np.asarray(homography, np.float64)), panel)
+    seen = ndimage.map_coordinates(np.asarray(image, np.float32), (there[:, 1], there[:, 0]), order=3)
+    return seen.reshape(shape)
 
 
 def _spots(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -121,28 +123,33 @@ def _spots(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if image.ndim != 2 or min(image.shape) < 16:
         raise InputError(f"the dot picture has shape {image.shape}: give a gray one, 16 x 16 pixels or more")
     raw = np.nan_to_num(image.astype(np.float32), posinf=0, neginf=0)
-    picture: np.ndarray = cv2.GaussianBlur(raw, (0, 0), 0.7)
-    coarse = cv2.GaussianBlur(cv2.resize(picture, (24, 24), interpolation=cv2.INTER_AREA), (0, 0), 4)
-    background = cv2.resize(coarse, picture.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    picture: np.ndarray = ndimage.gaussian_filter(raw, 0.7)
+    coarse = ndimage.gaussian_filter(_resized(picture, (24, 24), Image.Resampling.BOX), 4)
+    background = _resized(coarse, picture.shape, Image.Resampling.BILINEAR)
     light = picture - np.minimum(background, np.median(picture))
     noise = 1.4826 * float(np.median(np.abs(light - np.median(light))))
     bright = float(np.quantile(light, 0.995))
     level = float(np.median(light)) + max(6 * noise, 0.25 * (bright - float(np.median(light))))
-    count, _, stats, _ = cv2.connectedComponentsWithStats((light > level).astype(np.uint8), connectivity=8)
+    labels, count = ndimage.label(light > level, np.ones((3, 3)))
+    areas = np.bincount(labels.ravel(), minlength=count + 1)[1:]
     points = []
-    for label in range(1, count):
-        x, y, w, h, area = (int(v) for v in stats[label])
-        if area < 4 or x == 0 or y == 0 or x + w >= picture.shape[1] or y + h >= picture.shape[0]:
+    for area, (rows, columns) in zip(areas, ndimage.find_objects(labels), strict=True):
+        h, w = rows.stop - rows.start, columns.stop - columns.start
+        at_edge = not (rows.start and columns.start) or rows.stop == picture.shape[0]
+        if area < 4 or at_edge or columns.stop == picture.shape[1] or max(w, h) > 3 * min(w, h):
             continue
-        if max(w, h) > 3 * min(w, h):
-            continue
-        points.append(_centroid(light, x + w / 2 - 0.5, y + h / 2 - 0.5, max(w, h)))
+        x, y = (columns.start + columns.stop - 1) / 2, (rows.start + rows.stop - 1) / 2
+        points.append(_centroid(light, x, y, max(w, h)))
     if len(points) < 9:
         return np.zeros((0, 2)), np.zeros(0)
     xy = np.asarray(points)
     distance, near = cKDTree(xy).query(xy, k=9)
     flux = _flux(light, xy, 0.48 * float(np.median(distance[:, 1])))
     return xy, flux / np.maximum(np.median(flux[near[:, 1:]], axis=1), 1e-9)
+
+
+def _resized(picture: np.ndarray, shape: tuple[int, ...], method: Image.Resampling) -> np.ndarray:
+    return np.asarray(Image.fromarray(picture).resize((shape[1], shape[0]), method))
 
 
 def _flux(light: np.ndarray, xy: np.ndarray, radius: float) -> np.ndarray:
@@ -207,9 +214,8 @@ def _guesses(points: np.ndarray, first: int, second: int, dots: Dots) -> list[np
         near = points[int(np.argmin(np.hypot(*(points - wanted).T)))]
         if np.hypot(*(near - wanted)) > 0.45 * np.hypot(*along):
             continue
-        camera = np.stack([points[first], points[second], near]).astype(np.float32)
-        panel = dots.xy[[0, 1, dots.columns]].astype(np.float32)
-        guesses.append(np.vstack([cv2.getAffineTransform(camera, panel), [0, 0, 1]]))
+        camera = np.stack([points[first], points[second], near])
+        guesses.append(_fitted_map(camera, dots.xy[[0, 1, dots.columns]], perspective=False))
     return guesses
 
 
@@ -231,13 +237,39 @@ def _refined(points: np.ndarray, guess: np.ndarray, dots: Dots) -> tuple[float, 
         if len(keep) < 4:
             return None
         camera, panel = points[keep], dots.xy[index[keep]]
-        if len(keep) < 9:  # too few for a perspective: an affine map, which does not bend
-            affine, _ = cv2.estimateAffine2D(camera, panel, ransacReprojThreshold=0.2 * dots.spacing)
-            found = None if affine is None else np.vstack([affine, [0, 0, 1]])
-        else:
-            found, _ = cv2.findHomography(camera, panel, cv2.RANSAC, max(0.05 * dots.spacing, 1.0))
-        if found is None or not np.isfinite(found).all():
+        # too few for a perspective: an affine map, which does not bend
+        found = _fitted_map(camera, panel, len(keep) >= 9, max(0.05 * dots.spacing, 1.0))
+        if not np.isfinite(found).all():
             return None
         homography = found
     error = np.hypot(*(panel_points(homography, camera) - panel).T)
     return float((error < 0.1 * dots.spacing).sum()), homography
+
+
+def _fitted_map(
+    camera: np.ndarray, panel: np.ndarray, perspective: bool, tolerance: float = math.inf
+) -> np.ndarray:
+    """The homography, or affine map, [3, 3], that takes camera points [n, 2] to panel points [n, 2].
+
+    Least squares of the equations that are linear in its eight (six) numbers, weighted again and again so that points
+    far beyond `tolerance` (panel pixels) lose their say.
+    """
+    middle, size = camera.mean(0), max(float(camera.std()), 1e-9)  # near 0 and of order one, or it is ill-posed
+    u, v = ((camera - middle) / size).T
+    one, none = np.ones_like(u), np.zeros_like(u)
+    rows = [
+        np.stack([u, v, one, none, none, none, -u * panel[:, 0], -v * panel[:, 0]], 1),
+        np.stack([none, none, none, u, v, one, -u * panel[:, 1], -v * panel[:, 1]], 1),
+    ]
+    equations = np.concatenate(rows)[:, : 8 if perspective else 6]
+    wanted, weight = panel.T.ravel(), np.ones(2 * len(panel))
+    into = np.diag([1 / size, 1 / size, 1.0])
+    into[:2, 2] = -middle / size
+    for _ in range(8 if math.isfinite(tolerance) else 1):
+        numbers = np.linalg.lstsq(equations * weight[:, None], wanted * weight, rcond=None)[0]
+        found = np.append(numbers, np.zeros(9 - len(numbers)))
+        found[8] = 1.0
+        found = found.reshape(3, 3) @ into
+        away = np.hypot(*(panel_points(found, camera) - panel).T) / tolerance
+        weight = np.tile(1 / (1 + away**2), 2)
+    return found

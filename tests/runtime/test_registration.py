@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from firmware_iface.errors import InputError
-from trainer.registration import (
+from runtime.registration import (
     BROAD,
     SPREAD,
     Dots,

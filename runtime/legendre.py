@@ -1,0 +1,65 @@
+"""Smooth curves and maps as sums of Legendre polynomials, against the array API.
+
+All are dimensionless and of order one, lowest order first; maps are stacks [count, rows, columns]. Over a
+panel or a picture, y and x run from -1 to 1 from edge to edge, at pixels' centres (`edge_to_edge`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from array_api_compat import array_namespace
+
+Array = Any
+
+
+def edge_to_edge(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates of the pixels' centres, (y [H, W], x [H, W]), with the outer edges at -1 and 1."""
+    y, x = ((2 * np.arange(n) + 1) / n - 1 for n in shape)
+    return np.broadcast_to(y[:, None], shape), np.broadcast_to(x[None, :], shape)
+
+
+def legendre_curve(t: Array, count: int) -> Array:
+    """Legendre polynomials P_0 ... P_{count-1} of `t` in -1 .. 1: [count, *t.shape]."""
+    xp = array_namespace(t)
+    terms = [xp.ones_like(t), t]
+    for n in range(1, count - 1):
+        terms.append(((2 * n + 1) * t * terms[n] - n * terms[n - 1]) / (n + 1))
+    return xp.stack(terms[:count])
+
+
+def legendre_count(order: int, lowest: int = 1) -> int:
+    """Number of Legendre products of total order `lowest` .. `order`."""
+    return (order + 1) * (order + 2) // 2 - lowest * (lowest + 1) // 2
+
+
+def legendre_maps(y: Array, x: Array, order: int, lowest: int = 1) -> Array:
+    """Products P_i(y) P_j(x), lowest <= i + j <= order, y and x in -1 .. 1 (broadcast): [count, rows, columns]."""
+    rows, columns = legendre_curve(y, order + 1), legendre_curve(x, order + 1)
+    return array_namespace(y, x).stack([rows[i, ...] * columns[j, ...] for i, j in _products(order, lowest)])
+
+
+def legendre_surface(terms: Array, y: Array, x: Array, lowest: int = 1) -> Array:
+    """Sum of `terms` times `legendre_maps`, over the grid that y [H, W] (rows) and x [H, W] (columns) span: [H, W].
+
+    Two small matrix products instead of a stack of maps. The order follows from the number of terms.
+    """
+    xp = array_namespace(terms)
+    order = legendre_order(terms.shape[0], lowest)
+    places = _products(order, lowest)
+    pick = np.zeros((len(places), (order + 1) ** 2))  # where each term stands in the table of i and j
+    for number, (i, j) in enumerate(places):
+        pick[number, i * (order + 1) + j] = 1
+    table = xp.reshape(terms @ xp.asarray(pick, dtype=terms.dtype), (order + 1, order + 1))
+    rows, columns = legendre_curve(y[:, 0], order + 1), legendre_curve(x[0, :], order + 1)
+    return xp.matrix_transpose(rows) @ table @ columns
+
+
+def legendre_order(count: int, lowest: int = 1) -> int:
+    """The highest order of `count` terms from order `lowest` on."""
+    return next(n for n in range(64) if legendre_count(n, lowest) == count)
+
+
+def _products(order: int, lowest: int) -> list[tuple[int, int]]:
+    return [(n - m, m) for n in range(lowest, order + 1) for m in range(n + 1)]
