@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trainer.bases import legendre_count
+from runtime.legendre import legendre_count
 from trainer.candidates import least_for_order
 from trainer.captures import CaptureSet
 from trainer.effects import catalogue
