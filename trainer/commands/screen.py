@@ -77,12 +77,14 @@ class Screen:
         if not self.err.isatty():
             yield lambda done, text="": None
             return
-        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
         columns = (
             BarColumn(30),
             TextColumn("{task.percentage:3.0f} %"),
             TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
             TextColumn("{task.description}", markup=False),
         )
         with Progress(*columns, console=self._console(self.err), transient=True) as bar:

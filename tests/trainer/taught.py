@@ -1,0 +1,36 @@
+"""A small bench whose one defect no effect of the catalogue names, and captures of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from firmware_iface.virtual import BenchDescription, VirtualHeadset, make_defect
+from firmware_iface.virtual.description import ChannelDescription
+from trainer.bench_file import Bench, read_bench
+from trainer.capture import capture_set
+from trainer.captures import CaptureSet, read_captures
+
+SHAPE = (48, 64)
+COLOURS = (ChannelDescription("red", 638.0), ChannelDescription("green", 520.0))
+
+
+def fringed(colours: bool = False, kind: str = "fringes") -> VirtualHeadset:
+    """A headset of SHAPE whose picture is crossed by bent fringes (or has another defect)."""
+    plain = BenchDescription("taught", defects=(make_defect(kind),))
+    if colours:
+        plain = BenchDescription("taught", channels=COLOURS, defects=(make_defect(kind),))
+    return VirtualHeadset(plain.resized(*SHAPE, 6.0), seed=3)
+
+
+def known(headset: VirtualHeadset) -> Bench:
+    """What a person would write down of it."""
+    tables = headset.description.nominal()
+    tables["panel"]["levels"] = int(tables["panel"]["levels"])
+    return read_bench(tables)
+
+
+def captured(folder: Path, patterns: int = 18, colours: bool = False) -> CaptureSet:
+    """A capture set of it."""
+    headset = fringed(colours)
+    capture_set(headset, known(headset), folder, patterns=patterns)
+    return read_captures(folder)

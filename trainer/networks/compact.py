@@ -1,0 +1,62 @@
+"""The compact approximator: small enough to stand in the headset's loop.
+
+Colours are shown one after another and their light does not mix, so each has its own weights (groups). What a
+bench does at fixed places, dust, fringes and seams, is a map of gain and offset over the panel's picture; what it
+does everywhere alike, blur and ghosts, is a convolution, here of whole patches at a time.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from trainer.networks.layers import LeakyReLU, cropped
+
+COLOURS = 3
+SLOPE = 0.02
+
+
+class Compact(nn.Module):
+    """Gain and offset maps plus patch convolutions: irradiance [B, 3, H, W] to its change, same shape.
+
+    shape : panel (rows, columns); irradiance of another size is refused by torch
+    filters : channels a colour between the patches; 0 leaves the convolutions out
+    cell : side of a cell of the maps, pixels; 0 leaves the maps out
+    """
+
+    def __init__(self, shape: tuple[int, int], filters: int = 8, cell: int = 2, patch: int = 4) -> None:
+        super().__init__()
+        self.shape, self.patch, self.cell = shape, patch, cell
+        if cell:
+            cells = [-(-n // cell) for n in shape]
+            self.maps = nn.Parameter(torch.zeros(2, COLOURS, *cells))
+        if filters:
+            wide = COLOURS * filters
+            self.first = nn.Conv2d(COLOURS, wide, patch, patch, groups=COLOURS)
+            self.inner = nn.Sequential(
+                LeakyReLU(SLOPE),
+                nn.Conv2d(wide, wide, 3, 1, 1, groups=COLOURS),
+                LeakyReLU(SLOPE),
+                nn.Conv2d(wide, wide, 3, 1, 1, groups=COLOURS),
+                LeakyReLU(SLOPE),
+            )
+            self.last = nn.ConvTranspose2d(wide, COLOURS, patch, patch, groups=COLOURS)
+
+    def forward(self, x: Tensor) -> Tensor:
+        change = torch.zeros_like(x)
+        if hasattr(self, "first"):
+            padded = functional.pad(x, (0, -x.shape[3] % self.patch, 0, -x.shape[2] % self.patch))
+            change = cropped(self.last(self.inner(self.first(padded))), x)
+        if self.cell:
+            gain, offset = self.fields()
+            change = change + x * gain + offset
+        return change
+
+    def fields(self) -> Tensor:
+        """Gain and offset at every pixel, [2, 3, H, W], straight lines between the cells' centres."""
+        if self.cell == 1:
+            return self.maps
+        size = [n * self.cell for n in self.maps.shape[2:]]
+        fields = functional.interpolate(self.maps, size=size, mode="bilinear", align_corners=False)
+        return fields[:, :, : self.shape[0], : self.shape[1]]

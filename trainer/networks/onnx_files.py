@@ -1,0 +1,219 @@
+"""An approximator as ONNX, with two entry points, which onnxruntime alone evaluates on the headset.
+
+    approximator.onnx           irradiance -> corrected
+    approximator_gradient.onnx  irradiance, target, adapters -> loss, gradient, gradient.ADAPTER for each adapter
+
+The second is the whole way forward and back as one graph of plain operations: the network and torch's own gradient
+of it are traced together into ATen operations, with decompositions for those that ONNX lacks, so network and
+gradient cannot come apart. The size is that of the panel. Adapters are the last layer's weights, and inputs: the
+headset refines them without a new export.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+import warnings
+from collections.abc import Callable, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import safetensors.torch
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from firmware_iface.errors import InputError
+from trainer.networks.approximator import PLANES, Approximator, amplitude
+
+FORWARD, GRADIENT = "approximator.onnx", "approximator_gradient.onnx"
+ADAPTERS = "approximator_adapters.safetensors"
+EXPORTED = ("published", "compact")
+OPSET = 18
+
+_aten = torch.ops.aten
+
+
+class _Penalty(torch.autograd.Function):
+    """`trainer.networks.approximator.penalty` with its gradient written out."""
+
+    @staticmethod
+    def forward(ctx: Any, corrected: Tensor, target: Tensor) -> Tensor:
+        ours = amplitude(corrected)
+        difference = ours - amplitude(target)
+        ctx.save_for_backward(corrected, ours, difference)
+        return (difference * difference).sum()
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        corrected, ours, difference = ctx.saved_tensors
+        slope = difference / ours * gradients[0]
+        return torch.where(corrected > 0, slope, torch.zeros_like(slope)), None
+
+
+def onnx_files(network: Approximator) -> dict[str, bytes]:
+    """The files of an approximator, by name. Raises InputError for a network that has no export."""
+    if network.architecture.network not in EXPORTED:
+        raise InputError(
+            f"the network '{network.architecture.network}' is a baseline and is not exported: train "
+            f"{' or '.join(EXPORTED)} for the headset"
+        )
+    network = _frozen(network)
+    shape = (1, PLANES, *network.architecture.shape)
+    irradiance, target = torch.ones(shape), torch.ones(shape)
+    adapters = {name: value.detach().clone() for name, value in network.adapters().items()}
+    joint = joint_gradient(network, tuple(adapters))
+    arguments = (irradiance, target, *adapters.values())
+    with _quiet():
+        forward = _saved(network, (irradiance,), ["irradiance"], ["corrected"])
+        graph = _traced(joint, arguments)
+        names = ["loss", "gradient", *(f"gradient.{name}" for name in adapters)]
+        gradient = _saved(graph, arguments, ["irradiance", "target", *adapters], names)
+    return {FORWARD: forward, GRADIENT: gradient, ADAPTERS: safetensors.torch.save(adapters)}
+
+
+def _frozen(network: Approximator) -> Approximator:
+    copy = Approximator(network.architecture)
+    copy.load_state_dict(network.state_dict())
+    return copy.requires_grad_(False).eval()
+
+
+def joint_gradient(network: Approximator, names: Sequence[str]) -> Callable[..., tuple[Tensor, ...]]:
+    """(irradiance, target, adapters) to (loss, gradient over irradiance, gradients over adapters)."""
+
+    def joint(irradiance: Tensor, target: Tensor, *weights: Tensor) -> tuple[Tensor, ...]:
+        x = irradiance.detach().requires_grad_(True)
+        adapters = [w.detach().requires_grad_(True) for w in weights]
+        with torch.enable_grad():
+            corrected = torch.func.functional_call(network, dict(zip(names, adapters, strict=True)), (x,))
+            loss = _Penalty.apply(corrected, target)
+            return (loss, *torch.autograd.grad(loss, [x, *adapters]))
+
+    return joint
+
+
+def _traced(function: Callable[..., Any], arguments: tuple[Tensor, ...]) -> torch.fx.GraphModule:
+    from torch.fx.experimental.proxy_tensor import make_fx
+
+    graph = make_fx(function, decomposition_table=_decompositions(), tracing_mode="real")(*arguments)
+    graph.graph.eliminate_dead_code()
+    graph.recompile()
+    return graph
+
+
+def _saved(module: Any, arguments: tuple[Tensor, ...], inputs: list[str], outputs: list[str]) -> bytes:
+    program = torch.onnx.export(
+        module,
+        arguments,
+        dynamo=True,
+        input_names=inputs,
+        output_names=outputs,
+        opset_version=OPSET,
+        verbose=False,
+    )
+    if program is None:  # what the exporter returns to callers that give it a file, which is not done here
+        raise RuntimeError("torch.onnx.export returned no program")
+    buffer = io.BytesIO()
+    import onnx
+
+    onnx.save(program.model_proto, buffer)
+    return buffer.getvalue()
+
+
+@contextmanager
+def _quiet() -> Any:
+    """The exporter warns of its own internals."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(before)
+
+
+def _decompositions() -> dict[Any, Callable[..., Any]]:
+    """How operations without a translation to ONNX are made of others; those with one of their own are kept."""
+    from torch._decomp import core_aten_decompositions
+
+    table: dict[Any, Callable[..., Any]] = dict(core_aten_decompositions())
+    table[_aten.convolution_backward.default] = _convolution_backward
+    for kept in (_aten.leaky_relu.default, _aten.constant_pad_nd.default):
+        table.pop(kept, None)
+    return table
+
+
+def _convolution_backward(
+    gradient: Tensor,
+    x: Tensor,
+    weight: Tensor,
+    bias_sizes: Any,
+    stride: Sequence[int],
+    padding: Sequence[int],
+    dilation: Sequence[int],
+    transposed: bool,
+    output_padding: Sequence[int],
+    groups: int,
+    wanted: Sequence[bool],
+) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+    """Adjoints of a convolution (dilation 1), as convolutions and matrix products.
+
+    Over the input it is a convolution of the other kind: at stride 1 a plain one with the turned kernel, which
+    onnxruntime runs fastest. Over the weights it is one matrix product for each tap of the kernel.
+    """
+    over_x = over_weight = over_bias = None
+    one, zero = [1, 1], [0, 0]
+    if wanted[0] and transposed:
+        over_x = _aten.convolution.default(gradient, weight, None, stride, padding, one, False, zero, groups)
+    elif wanted[0] and all(s == 1 for s in stride):
+        turned = _swapped(weight, groups).flip(2, 3)
+        edge = [weight.shape[2 + i] - 1 - padding[i] for i in (0, 1)]
+        over_x = _aten.convolution.default(gradient, turned, None, one, edge, one, False, zero, groups)
+    elif wanted[0]:
+        rest = [
+            x.shape[2 + i] - ((gradient.shape[2 + i] - 1) * stride[i] - 2 * padding[i] + weight.shape[2 + i])
+            for i in (0, 1)
+        ]
+        over_x = _aten.convolution.default(gradient, weight, None, stride, padding, one, True, rest, groups)
+    if wanted[1]:
+        wide, narrow = (gradient, x) if transposed else (x, gradient)
+        over_weight = _over_weight(wide, narrow, weight, stride, padding, groups)
+    if wanted[2]:
+        over_bias = gradient.sum((0, 2, 3))
+    return over_x, over_weight, over_bias
+
+
+def _swapped(weight: Tensor, groups: int) -> Tensor:
+    """A kernel [out, in / groups, k, k] with in and out exchanged, group by group."""
+    parts = [part.transpose(0, 1) for part in weight.chunk(groups)]
+    return parts[0] if groups == 1 else torch.cat(parts)
+
+
+def _over_weight(
+    wide: Tensor, narrow: Tensor, weight: Tensor, stride: Sequence[int], padding: Sequence[int], groups: int
+) -> Tensor:
+    """Correlation of the side of the convolution before its stride with the one after it, [out, in / groups, k, k]."""
+    rows, columns = weight.shape[2:]
+    height, width = narrow.shape[2:]
+    padded = functional.pad(wide, (padding[1], padding[1] + stride[1], padding[0], padding[0] + stride[0]))
+    taps = []
+    for i in range(rows):
+        for j in range(columns):
+            seen = padded[
+                :,
+                :,
+                i : i + (height - 1) * stride[0] + 1 : stride[0],
+                j : j + (width - 1) * stride[1] + 1 : stride[1],
+            ]
+            blocks = [
+                torch.mm(_flat(a), _flat(b).t())
+                for a, b in zip(narrow.chunk(groups, 1), seen.chunk(groups, 1), strict=True)
+            ]
+            taps.append(torch.cat(blocks) if groups > 1 else blocks[0])
+    return torch.stack(taps, -1).reshape(*taps[0].shape, rows, columns)
+
+
+def _flat(x: Tensor) -> Tensor:
+    """[B, C, h, w] to [C, B h w]."""
+    return x.permute(1, 0, 2, 3).reshape(x.shape[1], -1)

@@ -1,0 +1,1 @@
+"""Training of an approximator on what the camera saw."""

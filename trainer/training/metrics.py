@@ -1,0 +1,92 @@
+"""How near a predicted picture is to the camera's: PSNR, SSIM, 1 - LPIPS, on display-encoded pictures 0 .. 1."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from trainer.networks.perceptual import SMALLEST, Lpips
+from trainer.training.losses import picture, where_seen
+from trainer.training.pairs import Pairs
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """psnr_db : peak is white. ssim : Wang et al. 2004, Gaussian window of 1.5 pixels. one_minus_lpips : None
+    without weights, or where pictures are too small for it.
+    """
+
+    psnr_db: float
+    ssim: float
+    one_minus_lpips: float | None
+
+    def as_json(self) -> dict[str, Any]:
+        """For `--json`."""
+        return dict(vars(self))
+
+
+def likeness(ours: Tensor, target: Tensor, used: list[int], lpips: Lpips | None = None) -> Likeness:
+    """How near a picture [3, H, W] is to a target; `used` are the planes that hold a colour."""
+    from skimage.metrics import structural_similarity
+
+    ours, target = ours.clamp(0, 1), target.clamp(0, 1)
+    mse = float(((ours - target)[used].double() ** 2).mean())
+    ssim = [
+        structural_similarity(
+            ours[k].numpy(), target[k].numpy(), gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
+            data_range=1.0,
+        )
+        for k in used
+    ]  # fmt: skip
+    distance = None
+    if lpips is not None and min(ours.shape[1:]) >= SMALLEST:
+        distance = 1 - float(lpips(ours[None], target[None])[0])
+    return Likeness(-10 * float(np.log10(max(mse, 1e-12))), float(np.mean(ssim)), distance)
+
+
+def mean_likeness(several: list[Likeness]) -> Likeness:
+    """The mean over pictures; LPIPS only where all have it."""
+    distances = [one.one_minus_lpips for one in several]
+    known = [d for d in distances if d is not None]
+    return Likeness(
+        float(np.mean([one.psnr_db for one in several])),
+        float(np.mean([one.ssim for one in several])),
+        float(np.mean(known)) if known and len(known) == len(several) else None,
+    )
+
+
+@torch.no_grad()
+def evaluate(
+    pairs: Pairs, network: Callable[[Tensor], Tensor] | None, lpips: Lpips | None = None
+) -> Likeness:
+    """Likeness of a network's predictions to the measurements, mean over pictures; None is the identity."""
+    found = []
+    for k in range(len(pairs)):
+        given = pairs.predicted[k : k + 1]
+        ours = picture(given if network is None else network(given).cpu(), pairs.white)[0]
+        found.append(_likeness(pairs, k, ours, lpips))
+    return mean_likeness(found)
+
+
+def noise_floor(pairs: Pairs, lpips: Lpips | None = None, seed: int = 0) -> Likeness:
+    """Likeness of the measurements to themselves with the camera's noise once more.
+
+    What a perfect prediction would have: the noise added is as large as the one that is there, to first order.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    found = []
+    for k in range(len(pairs)):
+        noise = pairs.noise[k].clamp(min=0).sqrt() * torch.randn(pairs.noise[k].shape, generator=generator)
+        found.append(_likeness(pairs, k, picture(pairs.measured[k] + noise, pairs.white), lpips))
+    return mean_likeness(found)
+
+
+def _likeness(pairs: Pairs, k: int, ours: Tensor, lpips: Lpips | None) -> Likeness:
+    target = picture(pairs.measured[k], pairs.white)
+    used = [plane for plane, capture in enumerate(pairs.captures[k]) if capture is not None]
+    return likeness(where_seen(ours, target, pairs.weight[k]), target, used, lpips)

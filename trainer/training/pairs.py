@@ -1,0 +1,226 @@
+"""What a network is trained on: irradiance as the model predicts it, and as the camera saw it, on the panel's pixels.
+
+What the model tells to the camera (blur, offset, response) is taken out of the measurement, not put into the
+prediction: the network must not learn faults that the eye never sees. To first order that is
+
+    measured irradiance = predicted irradiance + (counts - predicted counts) / sensitivity
+
+with the difference carried from the camera's pixels to the panel's where the two are not the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from firmware_iface.errors import InputError
+from runtime.lightpath import irradiance, panel_phase, pixel_irradiance
+from trainer.captures import Capture, CaptureSet
+from trainer.evidence import Batch, load_batch
+from trainer.export import told_to_display
+from trainer.fit import Predictor
+from trainer.model import Model
+from trainer.networks.approximator import PLANES
+from trainer.prediction import counts, light_path
+from trainer.scene import Scene, Stages, looks_at, scene_for, stages_for
+
+WHITE = 0.999  # quantile of measured irradiance that is called white
+DULL = 0.02  # of the greatest sensitivity: below it the camera says too little
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Irradiance predicted and measured, and where the measurement counts, each [N, 3, H, W]; planes are colours.
+
+    noise : variance of the camera's noise in `measured`. white : irradiance of white in pictures.
+    captures : of each picture, by plane; None where a colour is missing
+    """
+
+    predicted: Tensor
+    measured: Tensor
+    weight: Tensor
+    noise: Tensor
+    white: float
+    captures: tuple[tuple[Capture | None, ...], ...]
+
+    def __len__(self) -> int:
+        return self.predicted.shape[0]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns) of the panel."""
+        return self.predicted.shape[2], self.predicted.shape[3]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One capture on the panel's pixels, each [H, W]: predicted and measured irradiance, weight, noise variance."""
+
+    predicted: Tensor
+    measured: Tensor
+    weight: Tensor
+    noise: Tensor
+
+
+def pairs_of(
+    captures: CaptureSet, rows: Sequence[Capture], model: Model, progress: Progress | None = None
+) -> Pairs:
+    """The pairs of some captures, under a model whose gains are fitted.
+
+    Colours of one plane are stacked in the order of their patterns. Raises InputError where there is no capture, or
+    the bench has more than three colours.
+    """
+    stacks = stacked(captures, rows)
+    if not stacks:
+        raise InputError(f"{captures.folder} has no captures to train on: capture some first")
+    height, width = captures.bench.panel.shape
+    shape = (len(stacks), PLANES, height, width)
+    predicted, measured, weight, noise = (torch.zeros(shape) for _ in range(4))
+    for k, stack in enumerate(stacks):
+        for plane, capture in enumerate(stack):
+            if capture is not None:
+                one = measured_on_panel(model, load_batch(captures, [capture]))
+                predicted[k, plane], measured[k, plane] = one.predicted, one.measured
+                weight[k, plane], noise[k, plane] = one.weight, one.noise
+        if progress:
+            progress((k + 1) / len(stacks))
+    seen = measured[weight > 0]
+    if not len(seen):
+        raise InputError(
+            f"every picture of {captures.folder} is saturated: lower the exposure and capture again"
+        )
+    white = float(np.quantile(seen.numpy(), WHITE))
+    return Pairs(predicted, measured, weight, noise, max(white, 1e-6), tuple(stacks))
+
+
+def stacked(captures: CaptureSet, rows: Sequence[Capture]) -> list[tuple[Capture | None, ...]]:
+    """Captures as pictures of three colours: the k-th of each colour and plane together; None where one is missing."""
+    names = [c.name for c in captures.bench.channels]
+    if len(names) > PLANES:
+        raise InputError(
+            f"the bench has {len(names)} colours, and networks take {PLANES}: choose three of them"
+        )
+    stacks: list[tuple[Capture | None, ...]] = []
+    for plane in dict.fromkeys(c.plane_mm for c in rows):
+        columns = [[c for c in rows if (c.plane_mm, c.channel) == (plane, name)] for name in names]
+        columns += [[]] * (PLANES - len(names))
+        for k in range(max(map(len, columns))):
+            stacks.append(tuple(column[k] if k < len(column) else None for column in columns))
+    return stacks
+
+
+def measured_on_panel(model: Model, batch: Batch) -> Measured:
+    """Prediction and measurement of one capture (a batch of one) as irradiance on the panel's pixels."""
+    predictor = Predictor(model, batch)
+    scene, stages = predictor.scene, predictor.stages(model)
+    with torch.no_grad():
+        light = predictor.light(model, predictor.trace(model))
+        gain = (
+            model.gain[batch.channel]
+            * batch.exposure[:, None, None]
+            * _own_gain(scene, stages, light, model, batch)
+        )
+    light.requires_grad_(True)
+    expected = counts(scene, stages, light, gain, None)
+    (sensitivity,) = torch.autograd.grad(expected.sum(), light)
+    sensitivity = sensitivity.expand_as(light)
+    sharp = sensitivity > DULL * sensitivity.max()
+    safe = torch.where(sharp, sensitivity, 1.0)
+    change = torch.where(sharp, (batch.signal - expected.detach()) / safe, 0.0)
+    weight = batch.weight * sharp
+    noise = batch.noise / safe**2
+    shown = display_irradiance(model, batch)
+    change, weight, noise = (onto_panel(scene, stages, one[0]) for one in (change, weight, noise))
+    weight = (weight > 0.999).to(change.dtype)
+    return Measured(shown, shown + change, weight, noise)
+
+
+def _own_gain(scene: Scene, stages: Stages, light: Tensor, model: Model, batch: Batch) -> Tensor:
+    """A capture's own gain where laser power drifts, else 1."""
+    sensor = stages.sensor
+    if not sensor.free_capture_gain:
+        return torch.ones(1, 1, 1)
+    linear = replace(stages, sensor=replace(sensor, offset=None, response=None, free_capture_gain=False))
+    one = counts(scene, linear, light, model.gain[batch.channel] * batch.exposure[:, None, None], None)
+    seen = batch.signal if sensor.offset is None else batch.signal - sensor.offset
+    total = (seen * one * batch.weight).sum((-2, -1)) / (one**2 * batch.weight).sum((-2, -1))
+    return total[:, None, None]
+
+
+def display_irradiance(model: Model, batch: Batch) -> Tensor:
+    """What the display shows of the first pattern of a batch, as its model says, on the panel's pixels [H, W]."""
+    shown = told_to_display(model)
+    scene = scene_for(shown, batch.channel, batch.plane_mm)
+    with torch.no_grad():
+        path = light_path(scene, stages_for(scene, shown.present))
+        return pixel_irradiance(path, irradiance(path, panel_phase(path, batch.gray[:1])))[0]
+
+
+def onto_panel(scene: Scene, stages: Stages, picture: Tensor) -> Tensor:
+    """A picture on the camera's pixels [h, w], seen at the panel's pixels [H, W]; zero where no pixel looks."""
+    if same_pixels(scene, stages):
+        return picture
+    y, x = panel_on_camera(scene)
+    if stages.sensor.displacement is not None:
+        moves = [d.to(picture.dtype).expand(picture.shape) for d in stages.sensor.displacement]
+        to_camera = _inverse_slope(scene)
+        for _ in range(2):  # displacements are a few pixels and vary slowly
+            dy, dx = (sampled(d, y, x) for d in moves)
+            y = panel_on_camera(scene)[0] - to_camera[0, 0] * dy - to_camera[0, 1] * dx
+            x = panel_on_camera(scene)[1] - to_camera[1, 0] * dy - to_camera[1, 1] * dx
+    return sampled(picture, y, x)
+
+
+def onto_camera(scene: Scene, stages: Stages, picture: Tensor) -> Tensor:
+    """A picture on the panel's pixels [H, W], seen by the camera's pixels [h, w]; zero outside the panel."""
+    if same_pixels(scene, stages):
+        return picture
+    y, x = (torch.as_tensor(a, dtype=picture.dtype) for a in looks_at(scene.bench.camera))
+    if stages.sensor.displacement is not None:
+        y, x = y + stages.sensor.displacement[0], x + stages.sensor.displacement[1]
+    return sampled(picture, y, x)
+
+
+def same_pixels(scene: Scene, stages: Stages) -> bool:
+    """Whether camera pixel (i, j) is panel pixel (i, j)."""
+    bench = scene.bench
+    aligned = bench.camera.registered and bench.camera.shape == bench.panel.shape
+    return aligned and stages.sensor.displacement is None
+
+
+@lru_cache(maxsize=8)
+def panel_on_camera(scene: Scene) -> tuple[Tensor, Tensor]:
+    """Where on the camera each panel pixel's centre falls, camera pixels (y, x), each [H, W]."""
+    height, width = scene.bench.panel.shape
+    y, x = np.meshgrid(np.arange(height, dtype=float), np.arange(width, dtype=float), indexing="ij")
+    given = scene.bench.camera.homography
+    if given is not None:
+        m = np.linalg.inv(np.asarray(given, dtype=float).reshape(3, 3))
+        w = m[2, 0] * x + m[2, 1] * y + m[2, 2]
+        y, x = (m[1, 0] * x + m[1, 1] * y + m[1, 2]) / w, (m[0, 0] * x + m[0, 1] * y + m[0, 2]) / w
+    return torch.as_tensor(y, dtype=scene.dtype), torch.as_tensor(x, dtype=scene.dtype)
+
+
+def _inverse_slope(scene: Scene) -> np.ndarray:
+    """Camera pixels a panel pixel, [2, 2], at the panel's centre."""
+    y, x = panel_on_camera(scene)
+    i, j = y.shape[0] // 2, y.shape[1] // 2
+    return np.array([[float(a[i + 1, j] - a[i, j]), float(a[i, j + 1] - a[i, j])] for a in (y, x)])
+
+
+def sampled(picture: Tensor, y: Tensor, x: Tensor) -> Tensor:
+    """Cubic interpolation of a picture [h, w] at places in its pixels; zero outside."""
+    height, width = picture.shape
+    places = torch.stack((2 * x / max(width - 1, 1) - 1, 2 * y / max(height - 1, 1) - 1), -1).to(
+        picture.dtype
+    )
+    return torch.nn.functional.grid_sample(
+        picture[None, None], places[None], mode="bicubic", padding_mode="zeros", align_corners=True
+    )[0, 0]
