@@ -27,7 +27,7 @@ from trainer.fit import Predictor
 from trainer.model import Model
 from trainer.networks.approximator import PLANES
 from trainer.prediction import counts, light_path
-from trainer.scene import Scene, Stages, looks_at, scene_for, stages_for
+from trainer.scene import Scene, Stages, scene_for, stages_for
 
 WHITE = 0.999  # quantile of measured irradiance that is called white
 DULL = 0.02  # of the greatest sensitivity: below it the camera says too little
@@ -167,14 +167,14 @@ def onto_panel(scene: Scene, stages: Stages, picture: Tensor) -> Tensor:
     """A picture on the camera's pixels [h, w], seen at the panel's pixels [H, W]; zero where no pixel looks."""
     if same_pixels(scene, stages):
         return picture
-    y, x = panel_on_camera(scene)
+    y, x = first_y, first_x = panel_on_camera(scene)
     if stages.sensor.displacement is not None:
         moves = [d.to(picture.dtype).expand(picture.shape) for d in stages.sensor.displacement]
-        to_camera = _inverse_slope(scene)
-        for _ in range(2):  # displacements are a few pixels and vary slowly
+        for _ in range(
+            2
+        ):  # a camera pixel looks where the one a displacement further on should; they vary slowly
             dy, dx = (sampled(d, y, x) for d in moves)
-            y = panel_on_camera(scene)[0] - to_camera[0, 0] * dy - to_camera[0, 1] * dx
-            x = panel_on_camera(scene)[1] - to_camera[1, 0] * dy - to_camera[1, 1] * dx
+            y, x = first_y - dy, first_x - dx
     return sampled(picture, y, x)
 
 
@@ -182,10 +182,11 @@ def onto_camera(scene: Scene, stages: Stages, picture: Tensor) -> Tensor:
     """A picture on the panel's pixels [H, W], seen by the camera's pixels [h, w]; zero outside the panel."""
     if same_pixels(scene, stages):
         return picture
-    y, x = (torch.as_tensor(a, dtype=picture.dtype) for a in looks_at(scene.bench.camera))
+    camera = scene.bench.camera
+    y, x = (torch.as_tensor(a, dtype=picture.dtype) for a in np.indices(camera.shape, dtype=float))
     if stages.sensor.displacement is not None:
         y, x = y + stages.sensor.displacement[0], x + stages.sensor.displacement[1]
-    return sampled(picture, y, x)
+    return sampled(picture, *camera.on_panel(y, x))
 
 
 def same_pixels(scene: Scene, stages: Stages) -> bool:
@@ -198,21 +199,13 @@ def same_pixels(scene: Scene, stages: Stages) -> bool:
 @lru_cache(maxsize=8)
 def panel_on_camera(scene: Scene) -> tuple[Tensor, Tensor]:
     """Where on the camera each panel pixel's centre falls, camera pixels (y, x), each [H, W]."""
-    height, width = scene.bench.panel.shape
-    y, x = np.meshgrid(np.arange(height, dtype=float), np.arange(width, dtype=float), indexing="ij")
+    y, x = np.indices(scene.bench.panel.shape, dtype=float)
     given = scene.bench.camera.homography
     if given is not None:
         m = np.linalg.inv(np.asarray(given, dtype=float).reshape(3, 3))
         w = m[2, 0] * x + m[2, 1] * y + m[2, 2]
         y, x = (m[1, 0] * x + m[1, 1] * y + m[1, 2]) / w, (m[0, 0] * x + m[0, 1] * y + m[0, 2]) / w
     return torch.as_tensor(y, dtype=scene.dtype), torch.as_tensor(x, dtype=scene.dtype)
-
-
-def _inverse_slope(scene: Scene) -> np.ndarray:
-    """Camera pixels a panel pixel, [2, 2], at the panel's centre."""
-    y, x = panel_on_camera(scene)
-    i, j = y.shape[0] // 2, y.shape[1] // 2
-    return np.array([[float(a[i + 1, j] - a[i, j]), float(a[i, j + 1] - a[i, j])] for a in (y, x)])
 
 
 def sampled(picture: Tensor, y: Tensor, x: Tensor) -> Tensor:
