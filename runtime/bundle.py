@@ -4,7 +4,10 @@
                             "description": {...}, "provenance": {...},
                             "sha256": SHA-256 of all the rest of this object}
     lightpath.safetensors   the arrays: real, integer, boolean or complex64
-    approximator.onnx       the network after the optics; may be absent
+    approximator.onnx       the network after the optics; may be absent, as all that follow may
+    approximator_gradient.onnx, approximator_adapters.safetensors
+                            the gradient of its penalty, and the weights that it takes as inputs
+    initialiser.onnx        a network that proposes a start
 
 `sha256` is over the object without that key as JSON with sorted keys, no spaces, and ASCII only. Everything
 is verified before anything is used, the bytes that were verified are the ones used, and nothing in a bundle
@@ -17,7 +20,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -33,6 +36,10 @@ VERSION = 1
 MANIFEST = "bundle.json"
 ARRAYS = "lightpath.safetensors"
 APPROXIMATOR = "approximator.onnx"
+GRADIENT = "approximator_gradient.onnx"
+ADAPTERS = "approximator_adapters.safetensors"
+INITIALISER = "initialiser.onnx"
+NETWORKS = (APPROXIMATOR, GRADIENT, ADAPTERS, INITIALISER)
 
 DTYPES = frozenset(np.dtype(code) for code in "?bBhHiIqQefdF")  # what both NumPy and safetensors have
 
@@ -49,6 +56,8 @@ class Bundle:
     approximator_path: Path | None = None
     approximator: bytes | None = None
     """What was verified at approximator_path; load this and not the file, which may have changed since."""
+    networks: dict[str, bytes] = field(default_factory=dict)
+    """The same for each of NETWORKS that is there, by name."""
 
 
 def write_bundle(
@@ -58,19 +67,26 @@ def write_bundle(
     provenance: Mapping[str, Any],
     approximator: bytes | None = None,
     *,
+    networks: Mapping[str, bytes] | None = None,
     replace: bool = False,
 ) -> None:
-    """Write a bundle, whole or not at all. A folder that is not empty is refused unless `replace`."""
+    """Write a bundle, whole or not at all. A folder that is not empty is refused unless `replace`.
+
+    networks : further files of NETWORKS, by name
+    """
     if not arrays:
         raise InputError(f"{folder}: a bundle without arrays says nothing of the light path")
     laid_out = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     for name, array in laid_out.items():
         _check_array(f"{folder}: array {name!r}", array)
     contents = {ARRAYS: safetensors.numpy.save(laid_out)}
-    if approximator is not None:
-        if not approximator:
-            raise InputError(f"{folder}: the approximator is empty")
-        contents[APPROXIMATOR] = approximator
+    given = dict(networks or {}) | ({} if approximator is None else {APPROXIMATOR: approximator})
+    for name, data in given.items():
+        if name not in NETWORKS:
+            raise ValueError(f"{name} is not one of {', '.join(NETWORKS)}")
+        if not data:
+            raise InputError(f"{folder}: the {Path(name).stem} is empty")
+        contents[name] = data
     manifest: dict[str, Any] = {
         "format": FORMAT,
         "version": VERSION,
@@ -105,10 +121,9 @@ def read_bundle(
                 f"{MANIFEST}; copy or export the bundle again"
             )
         contents[name] = data
-    if APPROXIMATOR not in contents and (folder / APPROXIMATOR).exists():
-        raise InputError(
-            f"{folder / APPROXIMATOR} is not listed in {MANIFEST}; remove it or export the bundle again"
-        )
+    for name in NETWORKS:
+        if name not in contents and (folder / name).exists():
+            raise InputError(f"{folder / name} is not listed in {MANIFEST}; remove it or export the bundle again")
     arrays = _read_arrays(folder / ARRAYS, contents[ARRAYS])
     _check_required(folder / ARRAYS, arrays, required)
     approximator = contents.get(APPROXIMATOR)
@@ -118,6 +133,7 @@ def read_bundle(
         provenance=manifest["provenance"],
         approximator_path=None if approximator is None else folder / APPROXIMATOR,
         approximator=approximator,
+        networks={name: contents[name] for name in NETWORKS if name in contents},
     )
 
 
@@ -142,7 +158,7 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
     for key in ("files", "description", "provenance"):
         if not isinstance(manifest.get(key), dict):
             raise InputError(f"{path} has no {key}; export the bundle again")
-    if unknown := sorted(manifest["files"].keys() - {ARRAYS, APPROXIMATOR}):
+    if unknown := sorted(manifest["files"].keys() - {ARRAYS, *NETWORKS}):
         raise InputError(f"{path} lists a file that version {VERSION} does not know: {unknown[0]!r}")
     if ARRAYS not in manifest["files"]:
         raise InputError(f"{path} does not list {ARRAYS}; export the bundle again")

@@ -29,13 +29,19 @@ from trainer.scene import scene_for, stages_for
 
 
 def export_bundle(
-    model: Model, captures: CaptureSet | None, folder: Path | str, *, replace_folder: bool = False
+    model: Model,
+    captures: CaptureSet | None,
+    folder: Path | str,
+    *,
+    network: Path | None = None,
+    replace_folder: bool = False,
 ) -> dict[str, Any]:
     """Write a model's light paths as a bundle, and say what went in.
 
     captures: what the model was fitted to, for its planes and its hash; without it the bench's own distance,
-    for every colour. Raises InputError where the folder is not empty (unless `replace_folder`) or where a
-    plane cannot be computed.
+    for every colour. network: file of a trained approximator, which goes in as ONNX. Raises InputError where the
+    folder is not empty (unless `replace_folder`), where a plane cannot be computed, and where the network was
+    trained for another panel or other colours.
     """
     if model.method == "fraunhofer":
         raise InputError(
@@ -83,7 +89,12 @@ def export_bundle(
         ],
         "effects_left_out": [_named(e) for e in left_out],
     }
-    write_bundle(folder, arrays, description, provenance, replace=replace_folder)
+    files: dict[str, bytes] = {}
+    if network is not None:
+        files, provenance["network"] = _network_files(
+            network, model, [c["name"] for c in description["channels"]]
+        )
+    write_bundle(folder, arrays, description, provenance, networks=files, replace=replace_folder)
     return {
         "bundle": str(folder),
         "channels": [c["name"] for c in description["channels"]],
@@ -92,8 +103,29 @@ def export_bundle(
         "effects_left_out": [e.name for e in left_out],
         "heldout": provenance["heldout"],
         "arrays": len(arrays),
-        "megabytes": round(sum(a.nbytes for a in arrays.values()) / 1e6, 3),
+        "network": None if network is None else str(network),
+        "megabytes": round((sum(a.nbytes for a in arrays.values()) + sum(map(len, files.values()))) / 1e6, 3),
     }
+
+
+def _network_files(path: Path, model: Model, channels: list[str]) -> tuple[dict[str, bytes], dict[str, Any]]:
+    """ONNX files of a trained approximator, and what its own file says of it."""
+    from trainer.networks.approximator import read_approximator
+    from trainer.networks.onnx_files import onnx_files
+
+    network, about = read_approximator(path)
+    shape = network.architecture.shape
+    if shape != model.bench.panel.shape:
+        raise InputError(
+            f"{path} was trained for a panel of {shape[0]} x {shape[1]} and the model's has "
+            f"{model.bench.panel.height} x {model.bench.panel.width} pixels: train one for it"
+        )
+    if about.get("channels", channels) != channels:
+        raise InputError(
+            f"{path} was trained on {', '.join(about['channels'])} and the bundle has {', '.join(channels)}: "
+            "give the captures of the same colours"
+        )
+    return onnx_files(network), about
 
 
 def told_to_display(model: Model) -> Model:

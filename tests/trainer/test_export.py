@@ -13,14 +13,16 @@ import pytest
 import torch
 
 from firmware_iface.errors import InputError
-from runtime.bundle import Bundle, read_bundle, write_bundle
+from runtime.bundle import ADAPTERS, APPROXIMATOR, GRADIENT, Bundle, read_bundle, write_bundle
 from runtime.calibrated import bundle_channels, load_light_path, plane_of
 from runtime.lightpath import irradiance, panel_phase
 from tests.trainer.test_effects import HEIGHT, PLANE, WIDTH, bench, gray, present
+from tests.trainer.test_networks import disturbed
 from trainer.captures import read_captures, write_captures
 from trainer.effects import catalogue
 from trainer.export import export_bundle
 from trainer.model import Model, Present, absent
+from trainer.networks.approximator import write_approximator
 from trainer.prediction import light_path
 from trainer.scene import scene_for, stages_for
 
@@ -218,3 +220,29 @@ def test_a_bundle_without_light_paths_is_refused(folder: Path, tmp_path: Path, p
     write_bundle(tmp_path / "b", good.arrays, {**good.description, "paths": paths}, {})
     with pytest.raises(InputError, match="light path"):
         load_light_path(read_bundle(tmp_path / "b"), "red")
+
+
+def test_a_trained_network_goes_in_as_onnx(tmp_path: Path) -> None:
+    """What onnxruntime gives from the bundle is what the trainer's network gives; its origin is kept."""
+    import onnxruntime
+
+    network = disturbed("compact", (HEIGHT, WIDTH), 2)
+    write_approximator(tmp_path / "network.safetensors", network, {"steps": 3, "channels": ["green"]})
+    export_bundle(Model(bench()), None, tmp_path / "b", network=tmp_path / "network.safetensors")
+    bundle = read_bundle(tmp_path / "b")
+    assert set(bundle.networks) == {APPROXIMATOR, GRADIENT, ADAPTERS}
+    assert bundle.provenance["network"]["steps"] == 3
+    given = torch.rand(1, 3, HEIGHT, WIDTH)
+    (found,) = onnxruntime.InferenceSession(bundle.networks[APPROXIMATOR]).run(None, {"irradiance": given.numpy()})
+    assert np.abs(found - network(given).detach().numpy()).max() < 1e-6
+    (tmp_path / "b" / GRADIENT).write_bytes(b"another")
+    with pytest.raises(InputError, match="SHA-256"):
+        read_bundle(tmp_path / "b")
+
+
+@pytest.mark.parametrize(("shape", "channels"), [((8, 8), ["green"]), ((HEIGHT, WIDTH), ["red"])])
+def test_a_network_of_another_bench_is_refused(tmp_path: Path, shape: tuple[int, int], channels: list[str]) -> None:
+    write_approximator(tmp_path / "n.safetensors", disturbed("compact", shape, 2), {"channels": channels})
+    with pytest.raises(InputError, match="trained"):
+        export_bundle(Model(bench()), None, tmp_path / "b", network=tmp_path / "n.safetensors")
+    assert not (tmp_path / "b").exists()

@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from firmware_iface.errors import InputError
+from runtime.bundle import ADAPTERS, APPROXIMATOR, GRADIENT
 from tests.trainer.test_networks import disturbed
 from trainer.networks.approximator import Approximator, penalty
-from trainer.networks.onnx_files import ADAPTERS, FORWARD, GRADIENT, onnx_files
+from trainer.networks.onnx_files import onnx_files
 
 ROUNDING = 2e-6  # relative, in the L2 norm: single precision, summed over a picture
 
@@ -53,7 +54,7 @@ def check_parity(network: Approximator, shape: Sequence[int]) -> None:
     irradiance, target = (torch.rand(1, 3, *shape, generator=generator) * 2 for _ in range(2))
     files = onnx_files(network)
     adapters = safetensors.numpy.load(files[ADAPTERS])
-    found = run(files[FORWARD], {"irradiance": irradiance.numpy()})
+    found = run(files[APPROXIMATOR], {"irradiance": irradiance.numpy()})
     found |= run(files[GRADIENT], {"irradiance": irradiance.numpy(), "target": target.numpy(), **adapters})
     double, single = (by_torch(network, irradiance, target, kind) for kind in (torch.float64, torch.float32))
     assert found.keys() == double.keys()

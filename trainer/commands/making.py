@@ -138,7 +138,7 @@ def run_export(args: Namespace, screen: Screen) -> Result:
     captures = read_captures(args.captures) if args.captures else None
     model = read_model(args.model, catalogue(args.effects), captures.bench if captures else None)
     use_every_core()
-    return dict(export_bundle(model, captures, args.out))
+    return dict(export_bundle(model, captures, args.out, network=args.network))
 
 
 def show_export(result: Result, args: Namespace, screen: Screen) -> None:
@@ -244,6 +244,12 @@ def _export_options(parser: ArgumentParser) -> None:
         metavar="CAPTURES",
         type=Path,
         help="the capture set that the model explains: its hash and the held-out errors go into the bundle",
+    )
+    parser.add_argument(
+        "--network",
+        metavar="FILE",
+        type=Path,
+        help="a trained approximator, RUN/network.safetensors, to go in as ONNX",
     )
     effects_option(parser)
 

@@ -24,10 +24,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from firmware_iface.errors import InputError
+from runtime.bundle import ADAPTERS, APPROXIMATOR, GRADIENT
 from trainer.networks.approximator import PLANES, Approximator, amplitude
 
-FORWARD, GRADIENT = "approximator.onnx", "approximator_gradient.onnx"
-ADAPTERS = "approximator_adapters.safetensors"
 EXPORTED = ("published", "compact")
 OPSET = 18
 
@@ -69,7 +68,7 @@ def onnx_files(network: Approximator) -> dict[str, bytes]:
         graph = _traced(joint, arguments)
         names = ["loss", "gradient", *(f"gradient.{name}" for name in adapters)]
         gradient = _saved(graph, arguments, ["irradiance", "target", *adapters], names)
-    return {FORWARD: forward, GRADIENT: gradient, ADAPTERS: safetensors.torch.save(adapters)}
+    return {APPROXIMATOR: forward, GRADIENT: gradient, ADAPTERS: safetensors.torch.save(adapters)}
 
 
 def _frozen(network: Approximator) -> Approximator:
