@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -21,6 +22,7 @@ from trainer.capture_writer import CaptureWriter
 from trainer.patterns import Pattern, choose_patterns, default_count
 
 Progress = Callable[[float, str], None]
+Choose = Callable[[str, float], list[Pattern]]
 
 SATURATED = 0.002  # of all pixels of a colour
 SATURATED_IN_ONE = 0.01  # of the pixels of one capture
@@ -89,13 +91,22 @@ def capture_from(
 
     Raises InputError for an unknown bench, channel or plane, or a folder that holds something already.
     """
+    headset, bench, own_planes = open_bench(spec, seed)
+    planes = tuple(planes_mm) if planes_mm else own_planes
+    return capture_set(headset, bench, folder, patterns, planes, channels, seed, progress)
+
+
+def open_bench(spec: str, seed: int = 0) -> tuple[Any, Bench, tuple[float, ...]]:
+    """The headset that `spec` names, what is known of its bench, and the planes worth capturing."""
     from firmware_iface.virtual import open_headset
 
     headset = open_headset(spec, seed)
-    description = headset.description
-    bench = read_bench(_whole_levels(description.nominal()))
-    planes = tuple(planes_mm) if planes_mm else description.planes_mm
-    return capture_set(headset, bench, folder, patterns, planes, channels, seed, progress)
+    return headset, nominal_bench(headset), headset.description.planes_mm
+
+
+def nominal_bench(headset: Any) -> Bench:
+    """What a person would write down of a virtual headset's bench."""
+    return read_bench(_whole_levels(headset.description.nominal()))
 
 
 def capture_set(
@@ -107,10 +118,12 @@ def capture_set(
     channels: Sequence[str] | None = None,
     seed: int = 0,
     progress: Progress | None = None,
+    choose: Choose | None = None,
 ) -> Taken:
     """Show patterns on a bench, capture them, and write the set.
 
     patterns : how many for each colour and plane; the first is shown twice, for the noise
+    choose : gives the patterns of a colour and plane instead
     """
     names = [c.name for c in bench.channels]
     chosen = list(dict.fromkeys(channels or names))
@@ -119,6 +132,10 @@ def capture_set(
             raise InputError(f"--channels: there is no channel '{name}'; {nearest(name, names)}")
     planes = list(dict.fromkeys(float(p) for p in planes_mm)) or [bench.distance_mm]
     count = default_count(len(chosen)) if patterns is None else patterns
+    if choose is None:
+        choose = partial(choose_patterns, bench, count=count, seed=seed)
+    else:
+        count = len(choose(chosen[0], planes[0]))
     steps = len(chosen) * len(planes) * (2 * count + 1)
     done = 0
 
@@ -135,7 +152,7 @@ def capture_set(
     started: float | None = None
     with CaptureWriter(folder, bench) as writer:
         for channel in chosen:
-            shown = [(p, choose_patterns(bench, channel, p, count, seed)) for p in planes]
+            shown = [(p, choose(channel, p)) for p in planes]
             headset.lasers.off()
             headset.lasers.set_power(channel, 1.0)
             try:

@@ -23,7 +23,8 @@ from runtime.cli import write_gray
 from runtime.files import whole_file
 from runtime.solver import Quality, quality, solve
 from runtime.targets import decode_srgb, encode_srgb, fit_area
-from trainer.bench_file import Bench, read_bench
+from trainer.bench_file import Bench
+from trainer.capture import nominal_bench
 from trainer.effects.registry import catalogue
 from trainer.export import export_bundle
 from trainer.model import Model
@@ -144,9 +145,8 @@ def _bench(quick: bool) -> tuple[VirtualHeadset, Bench]:
     description = load_bench(BENCH)
     if quick:
         description = description.resized(*QUICK_SHAPE, QUICK_DISTANCE_MM)
-    tables = description.nominal()
-    tables["panel"]["levels"] = int(tables["panel"]["levels"])
-    return VirtualHeadset(description, seed=1), read_bench(tables)
+    headset = VirtualHeadset(description, seed=1)
+    return headset, nominal_bench(headset)
 
 
 def _show_all(

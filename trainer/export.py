@@ -120,10 +120,11 @@ def _network_files(path: Path, model: Model, channels: list[str]) -> tuple[dict[
             f"{path} was trained for a panel of {shape[0]} x {shape[1]} and the model's has "
             f"{model.bench.panel.height} x {model.bench.panel.width} pixels: train one for it"
         )
-    if about.get("channels", channels) != channels:
+    learned = about.get("channels", [])
+    if learned != channels or network.architecture.planes != len(channels):
         raise InputError(
-            f"{path} was trained on {', '.join(about['channels'])} and the bundle has {', '.join(channels)}: "
-            "give the captures of the same colours"
+            f"{path} was trained on {', '.join(learned) or 'no known colours'} and the bundle has "
+            f"{', '.join(channels)}: give the captures of the same colours"
         )
     return onnx_files(network), about
 

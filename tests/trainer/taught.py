@@ -6,8 +6,8 @@ from pathlib import Path
 
 from firmware_iface.virtual import BenchDescription, VirtualHeadset, make_defect
 from firmware_iface.virtual.description import ChannelDescription
-from trainer.bench_file import Bench, read_bench
-from trainer.capture import capture_set
+from trainer.bench_file import Bench
+from trainer.capture import capture_set, nominal_bench
 from trainer.captures import CaptureSet, read_captures
 
 SHAPE = (48, 64)
@@ -24,9 +24,7 @@ def fringed(colours: bool = False, kind: str = "fringes") -> VirtualHeadset:
 
 def known(headset: VirtualHeadset) -> Bench:
     """What a person would write down of it."""
-    tables = headset.description.nominal()
-    tables["panel"]["levels"] = int(tables["panel"]["levels"])
-    return read_bench(tables)
+    return nominal_bench(headset)
 
 
 def captured(folder: Path, patterns: int = 18, colours: bool = False) -> CaptureSet:

@@ -226,13 +226,13 @@ def test_a_trained_network_goes_in_as_onnx(tmp_path: Path) -> None:
     """What onnxruntime gives from the bundle is what the trainer's network gives; its origin is kept."""
     import onnxruntime
 
-    network = disturbed("compact", (HEIGHT, WIDTH), 2)
+    network = disturbed("compact", (HEIGHT, WIDTH), 2, 1)
     write_approximator(tmp_path / "network.safetensors", network, {"steps": 3, "channels": ["green"]})
     export_bundle(Model(bench()), None, tmp_path / "b", network=tmp_path / "network.safetensors")
     bundle = read_bundle(tmp_path / "b")
     assert set(bundle.networks) == {APPROXIMATOR, GRADIENT, ADAPTERS}
     assert bundle.provenance["network"]["steps"] == 3
-    given = torch.rand(1, 3, HEIGHT, WIDTH)
+    given = torch.rand(1, 1, HEIGHT, WIDTH)
     (found,) = onnxruntime.InferenceSession(bundle.networks[APPROXIMATOR]).run(None, {"irradiance": given.numpy()})
     assert np.abs(found - network(given).detach().numpy()).max() < 1e-6
     (tmp_path / "b" / GRADIENT).write_bytes(b"another")
@@ -242,7 +242,7 @@ def test_a_trained_network_goes_in_as_onnx(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("shape", "channels"), [((8, 8), ["green"]), ((HEIGHT, WIDTH), ["red"])])
 def test_a_network_of_another_bench_is_refused(tmp_path: Path, shape: tuple[int, int], channels: list[str]) -> None:
-    write_approximator(tmp_path / "n.safetensors", disturbed("compact", shape, 2), {"channels": channels})
+    write_approximator(tmp_path / "n.safetensors", disturbed("compact", shape, 2, 1), {"channels": channels})
     with pytest.raises(InputError, match="trained"):
         export_bundle(Model(bench()), None, tmp_path / "b", network=tmp_path / "n.safetensors")
     assert not (tmp_path / "b").exists()

@@ -32,10 +32,10 @@ def weights(table: list[tuple[int, int, int]]) -> int:
     return sum(kernel**2 * before * after + after for kernel, before, after in table)
 
 
-def disturbed(network: str, shape: tuple[int, int], filters: int = 4) -> Approximator:
+def disturbed(network: str, shape: tuple[int, int], filters: int = 4, planes: int = 3) -> Approximator:
     """An approximator that is not the identity."""
     torch.manual_seed(3)
-    one = Approximator(Architecture(network, filters, shape))
+    one = Approximator(Architecture(network, filters, shape, planes))
     for value in one.parameters():
         value.data.add_(0.05 * torch.randn_like(value))
     return one.eval()

@@ -23,15 +23,14 @@ from trainer.networks.compact import Compact
 from trainer.networks.published import Generator
 
 FORMAT = "hololoop-approximator"
-PLANES = 3
 DYNAMIC_RANGE = 1e-3  # of irradiance: added before square roots, whose slope is unbounded in the dark
 
-_NETWORKS: dict[str, Callable[[tuple[int, int], int], nn.Module]] = {
-    "published": lambda shape, filters: Generator(filters),
+_NETWORKS: dict[str, Callable[[tuple[int, int], int, int], nn.Module]] = {
+    "published": lambda shape, filters, planes: Generator(filters, planes),
     "compact": Compact,
-    "unet": lambda shape, filters: UNet(filters),
-    "pix2pix": lambda shape, filters: Pix2Pix(filters),
-    "pix2pixhd": lambda shape, filters: Pix2PixHD(filters),
+    "unet": lambda shape, filters, planes: UNet(filters, planes),
+    "pix2pix": lambda shape, filters, planes: Pix2Pix(filters, planes),
+    "pix2pixhd": lambda shape, filters, planes: Pix2PixHD(filters, planes),
 }
 NETWORKS = tuple(_NETWORKS)
 FULL_FILTERS = {"published": 64, "compact": 8, "unet": 32, "pix2pix": 64, "pix2pixhd": 32}
@@ -39,11 +38,12 @@ FULL_FILTERS = {"published": 64, "compact": 8, "unet": 32, "pix2pix": 64, "pix2p
 
 @dataclass(frozen=True)
 class Architecture:
-    """Which network, how wide (channels of its first layer), and for which panel (rows, columns)."""
+    """Which network, how wide (channels of its first layer), for which panel (rows, columns), for how many colours."""
 
     network: str
     filters: int
     shape: tuple[int, int]
+    planes: int = 3
 
     def __post_init__(self) -> None:
         if self.network not in NETWORKS:
@@ -53,13 +53,13 @@ class Architecture:
 
 
 class Approximator(nn.Module):
-    """D(I) = I + network(I), for irradiance [B, 3, H, W]; the identity until it is trained."""
+    """D(I) = I + network(I), for irradiance [B, C, H, W]; the identity until it is trained."""
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__()
         self.architecture = architecture
         make = _NETWORKS[architecture.network]
-        self.network = make(architecture.shape, architecture.filters)
+        self.network = make(architecture.shape, architecture.filters, architecture.planes)
         last: Any = self.network.last
         for weight in last.parameters():
             nn.init.zeros_(weight)
@@ -105,7 +105,10 @@ def read_approximator(path: Path | str) -> tuple[Approximator, dict[str, Any]]:
         given = header["architecture"]
         network = Approximator(
             Architecture(
-                given["network"], int(given["filters"]), (int(given["shape"][0]), int(given["shape"][1]))
+                given["network"],
+                int(given["filters"]),
+                (int(given["shape"][0]), int(given["shape"][1])),
+                int(given["planes"]),
             )
         )
         network.load_state_dict(tensors)

@@ -24,11 +24,11 @@ def _padded(x: Tensor, multiple: int) -> Tensor:
 class UNet(nn.Module):
     """Two 3 x 3 convolutions a level, five levels, max pooling; filters 32 is half of the original."""
 
-    def __init__(self, filters: int = 32) -> None:
+    def __init__(self, filters: int = 32, planes: int = 3) -> None:
         super().__init__()
         widths = [filters * 2**level for level in range(5)]
         self.down, self.widen, self.up = nn.ModuleList(), nn.ModuleList(), nn.ModuleList()
-        before = 3
+        before = planes
         for width in widths:
             self.down.append(_twice(before, width))
             before = width
@@ -36,7 +36,7 @@ class UNet(nn.Module):
             self.widen.append(nn.ConvTranspose2d(before, width, 2, 2))
             self.up.append(_twice(2 * width, width))
             before = width
-        self.last = nn.Conv2d(before, 3, 1)
+        self.last = nn.Conv2d(before, planes, 1)
 
     def forward(self, x: Tensor) -> Tensor:
         h, skips = _padded(x, 16), []
@@ -57,11 +57,11 @@ def _twice(before: int, width: int) -> nn.Sequential:
 class Pix2Pix(nn.Module):
     """k4 s2 encoder and decoder of eight levels, instance norm, dropout in three levels, tanh at the end."""
 
-    def __init__(self, filters: int = 64) -> None:
+    def __init__(self, filters: int = 64, planes: int = 3) -> None:
         super().__init__()
         widths = [filters * n for n in (1, 2, 4, 8, 8, 8, 8, 8)]
         self.down, self.up = nn.ModuleList(), nn.ModuleList()
-        before = 3
+        before = planes
         for level, width in enumerate(widths):
             layers: list[nn.Module] = [LeakyReLU(0.2)] if level else []
             layers.append(nn.Conv2d(before, width, 4, 2, 1))
@@ -73,7 +73,7 @@ class Pix2Pix(nn.Module):
             layers += [nn.Dropout(0.5)] if 1 <= level <= 3 else []
             self.up.append(nn.Sequential(*layers))
             before = 2 * width
-        self.last = nn.ConvTranspose2d(before, 3, 4, 2, 1)
+        self.last = nn.ConvTranspose2d(before, planes, 4, 2, 1)
 
     def forward(self, x: Tensor) -> Tensor:
         h, skips = _padded(x, 256), []
@@ -89,10 +89,10 @@ class Pix2Pix(nn.Module):
 class Pix2PixHD(nn.Module):
     """The global generator: 7 x 7 convolution, four halvings, nine residual blocks, four doublings, tanh."""
 
-    def __init__(self, filters: int = 32) -> None:
+    def __init__(self, filters: int = 32, planes: int = 3) -> None:
         super().__init__()
         widths = [filters * 2**level for level in range(5)]
-        layers: list[nn.Module] = [nn.Conv2d(3, filters, 7, 1, 3, padding_mode="replicate")]
+        layers: list[nn.Module] = [nn.Conv2d(planes, filters, 7, 1, 3, padding_mode="replicate")]
         layers += [InstanceNorm(), nn.ReLU()]
         for before, width in pairwise(widths):
             layers += [nn.Conv2d(before, width, 3, 2, 1), InstanceNorm(), nn.ReLU()]
@@ -100,7 +100,7 @@ class Pix2PixHD(nn.Module):
         for before, width in pairwise(widths[::-1]):
             layers += [nn.ConvTranspose2d(before, width, 3, 2, 1, 1), InstanceNorm(), nn.ReLU()]
         self.layers = nn.Sequential(*layers)
-        self.last = nn.Conv2d(filters, 3, 7, 1, 3, padding_mode="replicate")
+        self.last = nn.Conv2d(filters, planes, 7, 1, 3, padding_mode="replicate")
 
     def forward(self, x: Tensor) -> Tensor:
         return torch.tanh(cropped(self.last(self.layers(_padded(x, 16))), x))

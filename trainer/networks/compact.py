@@ -13,35 +13,36 @@ from torch.nn import functional
 
 from trainer.networks.layers import LeakyReLU, cropped
 
-COLOURS = 3
 SLOPE = 0.02
 
 
 class Compact(nn.Module):
-    """Gain and offset maps plus patch convolutions: irradiance [B, 3, H, W] to its change, same shape.
+    """Gain and offset maps plus patch convolutions: irradiance [B, C, H, W] to its change, same shape.
 
     shape : panel (rows, columns); irradiance of another size is refused by torch
     filters : channels a colour between the patches; 0 leaves the convolutions out
     cell : side of a cell of the maps, pixels; 0 leaves the maps out
     """
 
-    def __init__(self, shape: tuple[int, int], filters: int = 8, cell: int = 2, patch: int = 4) -> None:
+    def __init__(
+        self, shape: tuple[int, int], filters: int = 8, planes: int = 3, cell: int = 2, patch: int = 4
+    ) -> None:
         super().__init__()
         self.shape, self.patch, self.cell = shape, patch, cell
         if cell:
             cells = [-(-n // cell) for n in shape]
-            self.maps = nn.Parameter(torch.zeros(2, COLOURS, *cells))
+            self.maps = nn.Parameter(torch.zeros(2, planes, *cells))
         if filters:
-            wide = COLOURS * filters
-            self.first = nn.Conv2d(COLOURS, wide, patch, patch, groups=COLOURS)
+            wide = planes * filters
+            self.first = nn.Conv2d(planes, wide, patch, patch, groups=planes)
             self.inner = nn.Sequential(
                 LeakyReLU(SLOPE),
-                nn.Conv2d(wide, wide, 3, 1, 1, groups=COLOURS),
+                nn.Conv2d(wide, wide, 3, 1, 1, groups=planes),
                 LeakyReLU(SLOPE),
-                nn.Conv2d(wide, wide, 3, 1, 1, groups=COLOURS),
+                nn.Conv2d(wide, wide, 3, 1, 1, groups=planes),
                 LeakyReLU(SLOPE),
             )
-            self.last = nn.ConvTranspose2d(wide, COLOURS, patch, patch, groups=COLOURS)
+            self.last = nn.ConvTranspose2d(wide, planes, patch, patch, groups=planes)
 
     def forward(self, x: Tensor) -> Tensor:
         change = torch.zeros_like(x)
@@ -54,7 +55,7 @@ class Compact(nn.Module):
         return change
 
     def fields(self) -> Tensor:
-        """Gain and offset at every pixel, [2, 3, H, W], straight lines between the cells' centres."""
+        """Gain and offset at every pixel, [2, C, H, W], straight lines between the cells' centres."""
         if self.cell == 1:
             return self.maps
         size = [n * self.cell for n in self.maps.shape[2:]]

@@ -5,7 +5,8 @@
 
 The second is the whole way forward and back as one graph of plain operations: the network and torch's own gradient
 of it are traced together into ATen operations, with decompositions for those that ONNX lacks, so network and
-gradient cannot come apart. The size is that of the panel. Adapters are the last layer's weights, and inputs: the
+gradient cannot come apart. Arrays are [1, C, H, W], C the
+bundle's colours and H, W the panel. Adapters are the last layer's weights, and inputs: the
 headset refines them without a new export.
 """
 
@@ -25,7 +26,7 @@ from torch.nn import functional
 
 from firmware_iface.errors import InputError
 from runtime.bundle import ADAPTERS, APPROXIMATOR, GRADIENT
-from trainer.networks.approximator import PLANES, Approximator, amplitude
+from trainer.networks.approximator import Approximator, amplitude
 
 EXPORTED = ("published", "compact")
 OPSET = 18
@@ -58,7 +59,7 @@ def onnx_files(network: Approximator) -> dict[str, bytes]:
             f"{' or '.join(EXPORTED)} for the headset"
         )
     network = _frozen(network)
-    shape = (1, PLANES, *network.architecture.shape)
+    shape = (1, network.architecture.planes, *network.architecture.shape)
     irradiance, target = torch.ones(shape), torch.ones(shape)
     adapters = {name: value.detach().clone() for name, value in network.adapters().items()}
     joint = joint_gradient(network, tuple(adapters))

@@ -21,18 +21,18 @@ _BARE = 2  # encoder layers from the front, and decoder layers from the end, wit
 
 
 class Generator(nn.Module):
-    """Irradiance [B, 3, H, W] to three planes of any sign, [B, 3, H, W].
+    """Irradiance [B, C, H, W] to planes of any sign, [B, C, H, W].
 
-    filters : channels of the first layer, a multiple of 2; 64 as published
+    filters : channels of the first layer, a multiple of 2; 64 as published. planes : C, 3 as published
     Strided layers round sizes up, and the decoder is cut to each skip, so any size from 1 x 1 on will do.
     """
 
-    def __init__(self, filters: int = FILTERS) -> None:
+    def __init__(self, filters: int = FILTERS, planes: int = 3) -> None:
         super().__init__()
         down = [round(filters * n) for n in _ENCODER]
         up = [round(filters * n) for n in _DECODER]
         self.down, self.up = nn.ModuleList(), nn.ModuleList()
-        before = 3
+        before = planes
         for level, channels in enumerate(down):
             layers: list[nn.Module] = [nn.Conv2d(before, channels, 5, 2, 2)]
             layers += [InstanceNorm()] if level >= _BARE else []
@@ -44,7 +44,7 @@ class Generator(nn.Module):
             layers += [LeakyReLU(SLOPE)] if level < len(up) - 1 else []
             self.up.append(nn.Sequential(*layers))
             before = channels + (down[-2 - level] if level < len(up) - 1 else 0)
-        self.last = nn.Conv2d(before, 3, 4)
+        self.last = nn.Conv2d(before, planes, 4)
 
     def forward(self, x: Tensor) -> Tensor:
         skips = [x]

@@ -16,8 +16,6 @@ from trainer.networks.perceptual import Perceptual
 from trainer.networks.published import FILTERS, PatchDiscriminator
 from trainer.training.recipe import Recipe
 
-PLANES = 3
-
 
 def picture(irradiance: Tensor, white: float) -> Tensor:
     """Irradiance as a picture, 1 at white and not cut there: amplitude over the amplitude of white."""
@@ -29,16 +27,24 @@ def where_seen(ours: Tensor, target: Tensor, weight: Tensor) -> Tensor:
     return weight * ours + (1 - weight) * target
 
 
+def three_planes(pictures: Tensor) -> Tensor:
+    """Pictures [B, C, H, W] as networks for photographs take them, [B, 3, H, W]: one colour is shown as gray."""
+    planes = pictures.shape[1]
+    if planes == 1:
+        return pictures.expand(-1, 3, -1, -1)
+    return pictures if planes == 3 else functional.pad(pictures, (0, 0, 0, 0, 0, 3 - planes))
+
+
 class Critic(nn.Module):
     """The discriminators of a recipe, each at half the size of the one before."""
 
-    def __init__(self, recipe: Recipe, filters: int = FILTERS) -> None:
+    def __init__(self, recipe: Recipe, filters: int = FILTERS, planes: int = 3) -> None:
         super().__init__()
         published = recipe.receptive == 94
         self.conditional, self.cross_entropy = recipe.conditional, recipe.cross_entropy
         self.scales = nn.ModuleList(
             PatchDiscriminator(
-                2 * PLANES if recipe.conditional else PLANES,
+                2 * planes if recipe.conditional else planes,
                 filters,
                 plain=2 if published else 1,
                 slope=0.02 if published else 0.2,
@@ -78,8 +84,8 @@ def matching_loss(ours: Sequence[Sequence[Tensor]], real: Sequence[Sequence[Tens
 
 
 def content_loss(recipe: Recipe, ours: Tensor, target: Tensor, perceptual: Perceptual | None) -> Tensor:
-    """The weighted l1 and perceptual losses of pictures [B, 3, H, W]."""
+    """The weighted l1 and perceptual losses of pictures [B, C, H, W]."""
     total = recipe.l1 * functional.l1_loss(ours, target)
     if perceptual is not None and recipe.perceptual:
-        total = total + recipe.perceptual * perceptual(ours, target)
+        total = total + recipe.perceptual * perceptual(three_planes(ours), three_planes(target))
     return total

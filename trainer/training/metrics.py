@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from trainer.networks.perceptual import SMALLEST, Lpips
-from trainer.training.losses import picture, where_seen
+from trainer.training.losses import picture, three_planes, where_seen
 from trainer.training.pairs import Pairs
 
 
@@ -31,7 +31,7 @@ class Likeness:
 
 
 def likeness(ours: Tensor, target: Tensor, used: list[int], lpips: Lpips | None = None) -> Likeness:
-    """How near a picture [3, H, W] is to a target; `used` are the planes that hold a colour."""
+    """How near a picture [C, H, W] is to a target; `used` are the planes that hold a colour."""
     from skimage.metrics import structural_similarity
 
     ours, target = ours.clamp(0, 1), target.clamp(0, 1)
@@ -45,7 +45,7 @@ def likeness(ours: Tensor, target: Tensor, used: list[int], lpips: Lpips | None 
     ]  # fmt: skip
     distance = None
     if lpips is not None and min(ours.shape[1:]) >= SMALLEST:
-        distance = 1 - float(lpips(ours[None], target[None])[0])
+        distance = 1 - float(lpips(three_planes(ours[None]), three_planes(target[None]))[0])
     return Likeness(-10 * float(np.log10(max(mse, 1e-12))), float(np.mean(ssim)), distance)
 
 

@@ -25,10 +25,10 @@ from trainer.evidence import Batch, load_batch
 from trainer.export import told_to_display
 from trainer.fit import Predictor
 from trainer.model import Model
-from trainer.networks.approximator import PLANES
 from trainer.prediction import counts, light_path
 from trainer.scene import Scene, Stages, scene_for, stages_for
 
+MOST_COLOURS = 3
 WHITE = 0.999  # quantile of measured irradiance that is called white
 DULL = 0.02  # of the greatest sensitivity: below it the camera says too little
 
@@ -37,7 +37,7 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True)
 class Pairs:
-    """Irradiance predicted and measured, and where the measurement counts, each [N, 3, H, W]; planes are colours.
+    """Irradiance predicted and measured, and where the measurement counts, each [N, C, H, W].
 
     noise : variance of the camera's noise in `measured`. white : irradiance of white in pictures.
     captures : of each picture, by plane; None where a colour is missing
@@ -57,6 +57,11 @@ class Pairs:
     def shape(self) -> tuple[int, int]:
         """(rows, columns) of the panel."""
         return self.predicted.shape[2], self.predicted.shape[3]
+
+    @property
+    def colours(self) -> int:
+        """Planes of a picture."""
+        return self.predicted.shape[1]
 
 
 @dataclass(frozen=True)
@@ -81,7 +86,7 @@ def pairs_of(
     if not stacks:
         raise InputError(f"{captures.folder} has no captures to train on: capture some first")
     height, width = captures.bench.panel.shape
-    shape = (len(stacks), PLANES, height, width)
+    shape = (len(stacks), len(captures.bench.channels), height, width)
     predicted, measured, weight, noise = (torch.zeros(shape) for _ in range(4))
     for k, stack in enumerate(stacks):
         for plane, capture in enumerate(stack):
@@ -101,16 +106,15 @@ def pairs_of(
 
 
 def stacked(captures: CaptureSet, rows: Sequence[Capture]) -> list[tuple[Capture | None, ...]]:
-    """Captures as pictures of three colours: the k-th of each colour and plane together; None where one is missing."""
+    """Captures as pictures of all colours: the k-th of each colour and plane together; None where one is missing."""
     names = [c.name for c in captures.bench.channels]
-    if len(names) > PLANES:
+    if len(names) > MOST_COLOURS:
         raise InputError(
-            f"the bench has {len(names)} colours, and networks take {PLANES}: choose three of them"
+            f"the bench has {len(names)} colours, and networks take {MOST_COLOURS}: capture fewer"
         )
     stacks: list[tuple[Capture | None, ...]] = []
     for plane in dict.fromkeys(c.plane_mm for c in rows):
         columns = [[c for c in rows if (c.plane_mm, c.channel) == (plane, name)] for name in names]
-        columns += [[]] * (PLANES - len(names))
         for k in range(max(map(len, columns))):
             stacks.append(tuple(column[k] if k < len(column) else None for column in columns))
     return stacks

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -116,13 +116,15 @@ class _Run:
             judges.perceptual.to(self.fabric.device)
         self.teacher = None if teacher is None else teacher.to(self.fabric.device)
         torch.manual_seed(seed)
-        network = Approximator(Architecture(recipe.network, recipe.filters, pairs.shape))
+        network = Approximator(Architecture(recipe.network, recipe.filters, pairs.shape, pairs.colours))
         if start is not None:
             network.load_state_dict(start.state_dict())
         self.network, self.network_steps = self._set_up(network)
         self.critic: Any = None
         if recipe.adversarial or recipe.matching:
-            self.critic, self.critic_steps = self._set_up(Critic(recipe, _critic_filters(recipe)))
+            self.critic, self.critic_steps = self._set_up(
+                Critic(recipe, recipe.filters, pairs.colours)  # as wide as the generator, as published
+            )
         self.step = 0
 
     def _set_up(self, module: torch.nn.Module) -> tuple[Any, Any]:
@@ -183,7 +185,7 @@ class _Run:
         return self._bare(self.critic).loss(judged, real)
 
     def _picture(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Input irradiance, target picture and weight of this step's picture, [1, 3, H, W]."""
+        """Input irradiance, target picture and weight of this step's picture, [1, C, H, W]."""
         count = len(self.pairs)
         turn = self.step * self.fabric.world_size + self.fabric.global_rank
         order = np.random.default_rng([self.seed, turn // count]).permutation(count)
@@ -256,11 +258,6 @@ class _Run:
         return module.module if hasattr(module, "module") else module
 
 
-def _critic_filters(recipe: Recipe) -> int:
-    """The critic's width: that of the generator, as published (64 and 64, 32 and 32)."""
-    return recipe.filters
-
-
 def _draw(*entropy: int) -> int:
     return int(np.random.SeedSequence(entropy).generate_state(1)[0])
 
@@ -270,8 +267,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {k: _plain(v) for k, v in value.items()}
     return [_plain(v) for v in value] if isinstance(value, (list, tuple)) else value
-
-
-def widened(recipe: Recipe, filters: int | None) -> Recipe:
-    """The recipe with another width, if one is given."""
-    return recipe if filters is None else replace(recipe, filters=filters)
