@@ -47,6 +47,32 @@ def irfft2(x: Array, shape: tuple[int, int]) -> Array:
     return array_namespace(x).fft.irfftn(x, s=shape, axes=(-2, -1))
 
 
+def into(x: np.ndarray, out: np.ndarray, axis: int, forward: bool, threads: int) -> None:
+    """DFT of complex `x` [n, m] along an axis, written to `out` (which may be x); neither way is scaled."""
+    if _ducc is not None:
+        _ducc.c2c(x, axes=(axis,), forward=forward, out=out, nthreads=threads)
+    elif forward:  # pragma: no cover
+        out[...] = _scipy.fft(x, axis=axis, overwrite_x=x is out, workers=threads)
+    else:  # pragma: no cover
+        out[...] = _scipy.ifft(x, axis=axis, norm="forward", overwrite_x=x is out, workers=threads)
+
+
+def filter_into(image: np.ndarray, transfer: np.ndarray, spectrum: np.ndarray, threads: int) -> None:
+    """A real image [n, m] times a transfer function over its half spectrum, in place.
+
+    `spectrum` is room for it: complex [n, m//2 + 1], as `transfer`.
+    """
+    if _ducc is not None:
+        _ducc.r2c(image, axes=(0, 1), out=spectrum, nthreads=threads)
+        np.multiply(spectrum, transfer, out=spectrum)
+        size = image.shape[1]
+        _ducc.c2r(spectrum, axes=(0, 1), lastsize=size, forward=False, inorm=2, out=image, nthreads=threads)
+    else:  # pragma: no cover
+        spectrum[...] = _scipy.rfft2(image, workers=threads)
+        np.multiply(spectrum, transfer, out=spectrum)
+        image[...] = _scipy.irfft2(spectrum, s=image.shape, workers=threads)
+
+
 def _transform(x: Array, axis: int, n: int | None, forward: bool) -> Array:
     if not isinstance(x, np.ndarray):
         transform = array_namespace(x).fft

@@ -1,0 +1,22 @@
+"""The headset's solver: the pattern whose light is nearest to a picture, by the deadline."""
+
+from runtime.solver.drive import DriveRange
+from runtime.solver.method import METHODS
+from runtime.solver.penalty import PENALTIES
+from runtime.solver.quality import Quality, quality, quality_of, shown
+from runtime.solver.solve import Solution, Solver, solve
+from runtime.solver.start import motion_between
+
+__all__ = [
+    "DriveRange",
+    "METHODS",
+    "PENALTIES",
+    "Quality",
+    "Solution",
+    "Solver",
+    "motion_between",
+    "quality",
+    "quality_of",
+    "shown",
+    "solve",
+]

@@ -1,0 +1,225 @@
+"""Solvers by name: how the next phase comes from the one that was just looked at.
+
+A method has `begin(objective)`, called for each picture, and `step(phase, out)`, which writes the phase that
+follows [C, H, W] to `out`. All are in place. What they have in common (the start, the best pattern met, the
+deadline) is in `runtime.solver.solve`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+from runtime.solver.drive import DriveRange
+from runtime.solver.objective import Objective
+
+Array = Any
+
+LONGEST = 0.5  # step of a pixel, rad, where its range has ends
+
+
+class Method(Protocol):
+    """One way to improve a pattern."""
+
+    def begin(self) -> None:
+        """Forget the picture before."""
+
+    def step(self, phase: Array, out: Array) -> None:
+        """The next phase, after `Objective.look(phase)`."""
+
+
+class QuasiNewton:
+    """Memoryless BFGS (Shanno 1978; L-BFGS with one pair), one gradient a step and no line search.
+
+    Where phases a turn apart are not alike (crosstalk mixes them; a drive of less than a turn lacks some),
+    steps are projected onto the panel's range, and pixels that are pushed out of it stay out of the curvature
+    (Bertsekas 1982).
+    """
+
+    def __init__(self, objective: Objective, drives: Sequence[DriveRange]) -> None:
+        xp = objective.backend.xp
+        self.objective, self.drives, self.backend = objective, drives, objective.backend
+        real = objective.light.dtype
+        self.gradient, self.before, self.move = (xp.zeros(objective.shape, real) for _ in range(3))
+        self.bounded = any(drive.bounded for drive in drives)
+        self.begin()
+
+    def begin(self) -> None:
+        """Start from steepest descent."""
+        self.first = True
+
+    def step(self, phase: Array, out: Array) -> None:
+        """One step: the move is a sum of this gradient, the one before and the move before."""
+        self.gradient, self.before = self.before, self.gradient
+        self.objective.gradient(phase, self.gradient)
+        if self.bounded:
+            self._hold(phase)
+        a, b, c = self._coefficients()
+        for colour in range(len(phase)):
+            self._move(colour, a[colour], b, c, phase[colour], out[colour])
+        self.first = False
+
+    def _coefficients(self) -> tuple[list[float], float, float]:
+        """Of the gradient (a colour), the one before and the move before."""
+        steepest = [-1 / self.objective.curvature(c) for c in range(len(self.gradient))]
+        if self.first:
+            return steepest, 0.0, 0.0
+        gg, go, oo, sg, so = self._dots()
+        sy, yy, yg = sg - so, gg - 2 * go + oo, gg - go
+        if sy <= 1e-12 * yy:
+            return steepest, 0.0, 0.0
+        gamma, along = sy / yy, sg / sy
+        beta = gamma * (yg - along * yy) / sy
+        return [gamma * (along - 1)] * len(steepest), -gamma * along, beta - along
+
+    def _dots(self) -> tuple[float, ...]:
+        dot = self.backend.xp.einsum
+        sums = []
+        for trio in zip(self.gradient, self.before, self.move, strict=True):
+
+            def work(worker: int, rows: slice, trio: tuple[Array, ...] = trio) -> tuple[float, ...]:
+                g, o, s = (whole[rows] for whole in trio)
+                pairs = ((g, g), (g, o), (o, o), (s, g), (s, o))
+                return tuple(float(dot("ij,ij->", u, v)) for u, v in pairs)
+
+            sums.append(self.backend.over_rows(len(trio[0]), self.objective.strip, work))
+        return tuple(map(sum, zip(*sums, strict=True)))
+
+    def _move(self, colour: int, a: float, b: float, c: float, phase: Array, out: Array) -> None:
+        xp, drive = self.backend.xp, self.drives[colour]
+        gradient, before, move = self.gradient[colour], self.before[colour], self.move[colour]
+
+        def work(worker: int, rows: slice) -> None:
+            part, s = self.objective.part[worker][: rows.stop - rows.start], move[rows]
+            s *= c
+            for factor, of in ((a, gradient), (b, before)):
+                if factor:
+                    xp.multiply(of[rows], factor, out=part)
+                    s += part
+            if self.bounded:
+                xp.clip(s, -LONGEST, LONGEST, out=s)
+            xp.add(phase[rows], s, out=out[rows])
+
+        self.backend.over_rows(len(phase), self.objective.strip, work)
+        if self.bounded:
+            xp.clip(out, xp.asarray(drive.low), xp.asarray(drive.high), out=out)
+            xp.subtract(out, phase, out=move)
+
+    def _hold(self, phase: Array) -> None:
+        """Leave pixels that are pushed out of the panel's range out of this step."""
+        xp = self.backend.xp
+        for colour, drive in enumerate(self.drives):
+            free = xp.asarray(
+                ~drive.pushed_out(
+                    self.backend.to_host(phase[colour]), self.backend.to_host(self.gradient[colour])
+                )
+            )
+            self.gradient[colour] *= free
+            if not self.first:
+                self.before[colour] *= free
+                self.move[colour] *= free
+
+
+class Adam:
+    """Gradient descent with Adam (Kingma and Ba 2015), by default with the rate that the field publishes.
+
+    rate: rad. The gradient is of the mean squared error, as the field's loops have it; Adam does not care.
+    """
+
+    def __init__(
+        self,
+        objective: Objective,
+        drives: Sequence[DriveRange],
+        rate: float = 8e-3,
+        betas: tuple[float, float] = (0.9, 0.999),
+    ) -> None:
+        xp = objective.backend.xp
+        self.objective, self.backend = objective, objective.backend
+        self.rate, self.betas = rate, betas
+        real = objective.light.dtype
+        self.gradient, self.mean, self.square = (xp.zeros(objective.shape, real) for _ in range(3))
+        self.steps = 0
+
+    def begin(self) -> None:
+        """Forget the moments."""
+        self.mean[...] = 0
+        self.square[...] = 0
+        self.steps = 0
+
+    def step(self, phase: Array, out: Array) -> None:
+        """One step of at most about the rate."""
+        xp, (first, second) = self.backend.xp, self.betas
+        self.objective.gradient(phase, self.gradient)
+        self.steps += 1
+        root = math.sqrt(1 - second**self.steps)
+        rate = -self.rate * root / (1 - first**self.steps)
+        for g, m, v, old, new in zip(self.gradient, self.mean, self.square, phase, out, strict=True):
+
+            def work(
+                worker: int,
+                rows: slice,
+                g: Array = g,
+                m: Array = m,
+                v: Array = v,
+                old: Array = old,
+                new: Array = new,
+            ) -> None:
+                part = self.objective.part[worker][: rows.stop - rows.start]
+                m[rows] *= first
+                xp.multiply(g[rows], 1 - first, out=part)
+                m[rows] += part
+                xp.multiply(g[rows], g[rows], out=part)
+                part *= 1 - second
+                v[rows] *= second
+                v[rows] += part
+                xp.sqrt(v[rows], out=part)
+                part += 1e-8 * root
+                xp.divide(m[rows], part, out=part)
+                part *= rate
+                xp.add(old[rows], part, out=new[rows])
+
+            self.backend.over_rows(len(g), self.objective.strip, work)
+
+
+class GerchbergSaxton:
+    """Gerchberg and Saxton 1972: the target's amplitude with the image's phase, back to the panel, whose phase is kept.
+
+    Where pixels do not count, the image stays as it is. Several modes and planes: the sum of what each sends back.
+    """
+
+    def __init__(self, objective: Objective, drives: Sequence[DriveRange]) -> None:
+        xp = objective.backend.xp
+        self.objective, self.backend = objective, objective.backend
+        pair = objective.stacks[0][0].source.dtype
+        self.wave, self.other = (xp.zeros(objective.shape[1:], pair) for _ in range(2))
+
+    def begin(self) -> None:
+        """Nothing is remembered."""
+
+    def step(self, phase: Array, out: Array) -> None:
+        """The phase of what the constrained image sends back."""
+        xp = self.backend.xp
+        for c, stack in enumerate(self.objective.optics):
+            self.objective.constrain(c)
+            for k, optics in enumerate(stack):
+                optics.adjoint_wave(self.objective.light[c, k], self.other if k else self.wave)
+                if k:
+                    self.wave += self.other
+            source = optics.panel.source
+            if source is not None:
+                self.wave *= source.conj()
+            wave, new = self.wave, out[c]
+
+            def work(worker: int, rows: slice, wave: Array = wave, new: Array = new) -> None:
+                xp.arctan2(wave[rows].imag, wave[rows].real, out=new[rows])
+
+            self.backend.over_rows(len(wave), self.objective.strip, work)
+
+
+METHODS: dict[str, Any] = {
+    "default": QuasiNewton,
+    "adam": Adam,
+    "gerchberg_saxton": GerchbergSaxton,
+    "double_phase": None,  # the start alone
+}

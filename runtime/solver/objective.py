@@ -1,0 +1,193 @@
+"""What is minimised: light of a phase pattern through one or several light paths, against its targets."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from runtime.approximator import Approximator
+from runtime.backend import Backend
+from runtime.lightpath import LightPath
+from runtime.solver.optics import Optics, carries_irradiance
+from runtime.solver.penalty import FLOOR, PENALTIES, Irradiance
+
+Array = Any
+
+
+class Objective:
+    """Loss over phase [C, H, W] for targets [C, K, H, W]: C colours with a pattern each, K planes a colour.
+
+    A colour's planes share its pattern and its scale. fine: samples a pixel, an axis (see `Optics`). weight:
+    None, or [H, W], how much a pixel counts. approximator: None, or D, which sees all colours of the first
+    plane at once. `look` comes before `gradient`, which uses up what it left.
+    """
+
+    def __init__(
+        self,
+        stacks: Sequence[Sequence[LightPath]],
+        fine: int,
+        penalty: str,
+        weight: np.ndarray | None,
+        approximator: Approximator | None,
+        backend: Backend,
+    ) -> None:
+        xp, path = backend.xp, stacks[0][0]
+        self.backend, self.stacks, self.fine = backend, stacks, fine
+        self.approximator = approximator
+        self.penalty = PENALTIES[penalty](xp)
+        # On the panel's own grid the pixel's area is undone in the target, once, and not done to the light.
+        self.integrated = (
+            fine > 1
+            or approximator is not None
+            or any(p.irradiance_filter is not None for s in stacks for p in s)
+        )
+        self.optics = [[Optics(p, fine, self.integrated, backend) for p in stack] for stack in stacks]
+        real = path.response.dtype
+        self.shape = (len(stacks), *path.grid.shape)
+        deep = (len(stacks), len(stacks[0]), *path.grid.shape)
+        self.light = xp.zeros(deep, real)
+        self.wanted = xp.zeros(deep, real)
+        self.weight = None if weight is None else xp.asarray(weight, real)
+        self.pixels = float(np.prod(deep)) if weight is None else float(np.sum(weight)) * deep[0] * deep[1]
+        self.room = xp.zeros(self.shape[1:], real)
+        self.strip = min(backend.strip_rows(path.grid.shape[1]), path.grid.shape[0])
+        self.part = [xp.empty((self.strip, path.grid.shape[1]), real) for _ in range(backend.threads)]
+        self.power = [float(np.mean(np.abs(stack[0].source) ** 2)) for stack in stacks]
+        self.floor: list[float] = []
+        self.scale = [1.0] * len(stacks)
+        self.loss, self.squared_error, self.peak = math.inf, math.inf, 1.0
+        if not self.integrated:
+            self.half_spectrum = xp.zeros((deep[2], deep[3] // 2 + 1), path.source.dtype)
+            self.sharpener = xp.asarray(_sharpener(path).astype(path.source.dtype))
+
+    def aim(self, targets: np.ndarray) -> None:
+        """Take other targets, irradiance [C, K, H, W] of any scale, none of them dark."""
+        xp = self.backend.xp
+        bare = isinstance(self.penalty, Irradiance)
+        for c in range(self.shape[0]):
+            mean = float(np.mean(targets[c], dtype=np.float64))
+            for k in range(self.wanted.shape[1]):
+                wanted = self.wanted[c, k]
+                wanted[...] = xp.asarray(targets[c, k])
+                wanted *= 1 / mean
+                if not self.integrated:
+                    self.backend.filter(wanted, self.sharpener, self.half_spectrum)
+                    xp.maximum(wanted, 0, out=wanted)
+                if self.approximator is None and not bare:
+                    wanted += FLOOR
+                    xp.sqrt(wanted, out=wanted)
+        self.floor = []
+        top = float(self.wanted.max())
+        self.peak = top if self.approximator is None and not bare else math.sqrt(top)
+
+    def look(self, phase: Array) -> float:
+        """The loss at a phase, mean over pixels; keeps what `gradient` needs."""
+        for c, stack in enumerate(self.optics):
+            for k, optics in enumerate(stack):
+                optics.forward(phase[c], self.light[c, k])
+        first = not self.floor
+        if first:
+            self.mean_light = [float(self.light[c].mean()) for c in range(self.shape[0])]
+            self.floor = [FLOOR * mean for mean in self.mean_light]
+        if self.approximator is not None:
+            return self._look_through(self.approximator, first)
+        loss = squares = 0.0
+        for c in range(self.shape[0]):
+            planes = range(self.wanted.shape[1])
+            sums = [self._measure(c, k) for k in planes]
+            self.scale[c] = self.penalty.scale(tuple(map(sum, zip(*sums, strict=True))))
+            for k in planes:
+                part = self._slope(c, k)
+                loss, squares = loss + part[0], squares + part[1]
+        self.loss, self.squared_error = loss / self.pixels, squares / self.pixels
+        return self.loss
+
+    def gradient(self, phase: Array, out: Array) -> None:
+        """Gradient over the phase last looked at, of the loss's sum over pixels: [C, H, W] written to `out`."""
+        for c, stack in enumerate(self.optics):
+            for k, optics in enumerate(stack):
+                optics.adjoint(phase[c], self.light[c, k], self.room if k else out[c])
+                if k:
+                    out[c] += self.room
+
+    def constrain(self, colour: int) -> None:
+        """For Gerchberg-Saxton, in place of a slope: half of what each field has to be multiplied by."""
+        for light in self.light[colour]:  # dLoss / dI = c^2 (1 - wanted / (c sqrt(I))), where it counts
+            light *= -0.5 / self.scale[colour] ** 2
+            light += 0.5
+
+    @property
+    def psnr_db(self) -> float:
+        """Amplitude PSNR of the last look, on the solver's own grid."""
+        return 20 * math.log10(self.peak / max(math.sqrt(self.squared_error), 1e-15))
+
+    def curvature(self, colour: int) -> float:
+        """About the loss's second derivative over a pixel's phase, for a path that loses no light."""
+        rms = math.sqrt(self.squared_error)
+        bend = self.penalty.curvature(self.scale[colour], self.mean_light[colour], rms)
+        return bend * self.power[colour] * len(self.optics[colour])
+
+    def _measure(self, c: int, k: int) -> tuple[float, ...]:
+        light, wanted, weight, floor = self.light[c, k], self.wanted[c, k], self.weight, self.floor[c]
+
+        def work(worker: int, rows: slice) -> tuple[float, ...]:
+            some = None if weight is None else weight[rows]
+            return self.penalty.measure(light[rows], wanted[rows], some, floor)
+
+        return self.backend.over_rows(len(light), self.strip, work)
+
+    def _slope(self, c: int, k: int) -> tuple[float, ...]:
+        light, wanted, weight, scale = self.light[c, k], self.wanted[c, k], self.weight, self.scale[c]
+
+        def work(worker: int, rows: slice) -> tuple[float, ...]:
+            some = None if weight is None else weight[rows]
+            error = self.part[worker][: rows.stop - rows.start]
+            return self.penalty.slope(light[rows], wanted[rows], some, scale, error)
+
+        return self.backend.over_rows(len(light), self.strip, work)
+
+    def _look_through(self, d: Approximator, first: bool) -> float:
+        """The loss of what D makes of the light, mean over pixels."""
+        xp = self.backend.xp
+        for c in range(self.shape[0]):
+            light, wanted = self.light[c, 0], self.wanted[c, 0]
+            xp.multiply(light, 1 / self.mean_light[c], out=light)
+            d.irradiance[c] = self.backend.to_host(light)
+            self.scale[c] = _root_scale(light, wanted)
+        if first:
+            # D's own scale against the optics' is measured once a picture; then it follows that of the light.
+            d.correct()
+            self.through = [
+                _root_scale(xp.asarray(d.corrected[c]), self.wanted[c, 0]) / self.scale[c]
+                for c in range(self.shape[0])
+            ]
+        for c in range(self.shape[0]):
+            share = 1 / max(self.scale[c] * self.through[c], 1e-15) ** 2
+            np.multiply(self.backend.to_host(self.wanted[c, 0]), share, out=d.target[c])
+        loss = d.look()
+        for c in range(self.shape[0]):
+            self.light[c, 0] = xp.asarray(d.slope[c])
+            self.light[c, 0] *= 1 / self.mean_light[c]
+        self.loss = self.squared_error = loss / self.pixels
+        return self.loss
+
+
+def needs_fine_grid(stacks: Sequence[Sequence[LightPath]]) -> bool:
+    """Whether one sample a pixel hides some of the light of any of these paths."""
+    return not all(carries_irradiance(path) for stack in stacks for path in stack)
+
+
+def _root_scale(light: Array, target: Array) -> float:
+    """c for which c sqrt(light) is nearest to sqrt(target)."""
+    root, wanted = np.sqrt(np.maximum(light, 0)), np.sqrt(target)
+    return float((root * wanted).sum() / max(float((root * root).sum()), 1e-30))
+
+
+def _sharpener(path: LightPath) -> np.ndarray:
+    """Inverse of what integrating over a pixel does to irradiance that is sampled once a pixel."""
+    height, width = path.grid.shape
+    fy, fx = np.fft.fftfreq(height), np.fft.rfftfreq(width)
+    return np.asarray(1 / (np.sinc(fy)[:, None] * np.sinc(fx)[None, :]))

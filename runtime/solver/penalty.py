@@ -1,0 +1,119 @@
+"""Penalties: how far light is from a target, and the slope of that, with the scale in closed form.
+
+The light is compared up to one scale c, which is eliminated: at each pattern it has its best value. A penalty
+works on strips, in place. `measure` prepares `light` and returns the sums from which `scale` finds c; `slope`
+then turns it into the loss's gradient over light and returns (loss, squared error of amplitude).
+
+A floor, a share of the mean light, is added under every square root, whose slope is unbounded in the dark.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+Array = Any
+Sums = tuple[float, ...]
+
+FLOOR = 1e-4  # of the mean light
+ROUNDING = 1e-2  # of the root mean square amplitude: below it, l1 is rounded off
+
+
+class Amplitude:
+    """sum w (c sqrt(I) - sqrt(t))^2: the seed's eq. 14 with f the squared error of amplitude."""
+
+    def __init__(self, xp: Any) -> None:
+        self.xp = xp
+
+    def measure(self, light: Array, wanted: Array, weight: Array | None, floor: float) -> Sums:
+        """`light` becomes its square root; `wanted` is the target's."""
+        xp = self.xp
+        xp.maximum(light, 0, out=light)
+        light += floor
+        xp.sqrt(light, out=light)
+        return _dots(xp, light, wanted, weight)
+
+    @staticmethod
+    def scale(sums: Sums) -> float:
+        """c, from the summed results of `measure`."""
+        return sums[0] / max(sums[1], 1e-30)
+
+    def slope(self, root: Array, wanted: Array, weight: Array | None, scale: float, error: Array) -> Sums:
+        """`root`, from `measure`, becomes dLoss / dI; `error` is room."""
+        xp = self.xp
+        xp.multiply(root, scale, out=error)
+        error -= wanted
+        square = _squares(xp, error, weight)
+        xp.divide(error, root, out=root)
+        root *= scale
+        if weight is not None:
+            root *= weight
+        return square, square
+
+    @staticmethod
+    def curvature(scale: float, light: float, rms_error: float) -> float:
+        """About the second derivative over |z|, from the mean of the light: what a first step is divided by."""
+        return 2 * scale**2
+
+
+class Smooth(Amplitude):
+    """sum w |c sqrt(I) - sqrt(t)|, rounded off at the bottom so that it has a slope everywhere: l1."""
+
+    def slope(self, root: Array, wanted: Array, weight: Array | None, scale: float, error: Array) -> Sums:
+        xp = self.xp
+        xp.multiply(root, scale, out=error)
+        error -= wanted
+        square = _squares(xp, error, weight)
+        size = xp.sqrt(error * error + ROUNDING**2)
+        loss = float(size.sum()) if weight is None else float((size * weight).sum())
+        xp.divide(error, root, out=root)
+        root /= size
+        root *= scale / 2
+        if weight is not None:
+            root *= weight
+        return loss, square
+
+    @staticmethod
+    def curvature(scale: float, light: float, rms_error: float) -> float:
+        return scale**2 / max(rms_error, ROUNDING)
+
+
+class Irradiance(Amplitude):
+    """sum w (c I - t)^2."""
+
+    def measure(self, light: Array, wanted: Array, weight: Array | None, floor: float) -> Sums:
+        """`light` stays; `wanted` is the target itself."""
+        return _dots(self.xp, light, wanted, weight)
+
+    def slope(self, light: Array, wanted: Array, weight: Array | None, scale: float, error: Array) -> Sums:
+        xp = self.xp
+        xp.multiply(light, scale, out=light)
+        xp.maximum(light, 0, out=error)
+        xp.sqrt(error, out=error)
+        error -= xp.sqrt(wanted)
+        square = _squares(xp, error, weight)
+        light -= wanted
+        loss = _squares(xp, light, weight)
+        light *= 2 * scale
+        if weight is not None:
+            light *= weight
+        return loss, square
+
+    @staticmethod
+    def curvature(scale: float, light: float, rms_error: float) -> float:
+        return 8 * scale**2 * light
+
+
+PENALTIES: dict[str, type[Amplitude]] = {"amplitude": Amplitude, "irradiance": Irradiance, "l1": Smooth}
+
+
+def _dots(xp: Any, a: Array, b: Array, weight: Array | None) -> Sums:
+    """Sums of a b and a a."""
+    if weight is None:
+        return float(xp.einsum("ij,ij->", a, b)), float(xp.einsum("ij,ij->", a, a))
+    return float(xp.einsum("ij,ij,ij->", a, b, weight)), float(xp.einsum("ij,ij,ij->", a, a, weight))
+
+
+def _squares(xp: Any, a: Array, weight: Array | None) -> float:
+    if weight is None:
+        return float(xp.einsum("ij,ij->", a, a))
+    return float(xp.einsum("ij,ij,ij->", a, a, weight))
