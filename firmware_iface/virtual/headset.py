@@ -124,6 +124,7 @@ class VirtualHeadset:
         self._optics = BenchOptics(description)
         self._sensor = Sensor(description)
         self._drift = Drift(description.defect(defects.LaserDrift), seed)
+        self._seen: dict[str, tuple[Gray, float, NDArray[np.float64]]] = {}
         self._integrators: OrderedDict[tuple[int, int, int], Integrator] = OrderedDict()
 
     def move_to_plane(self, plane_mm: float) -> None:
@@ -209,7 +210,15 @@ class VirtualHeadset:
         return self.plane_mm if plane_mm is None else checked_plane(plane_mm)
 
     def _camera_irradiance(self, gray: Gray, channel: str, plane_mm: float) -> NDArray[np.float64]:
-        return self._integrator(channel, plane_mm).camera(self._optics.irradiance(gray, channel, plane_mm))
+        """Irradiance on camera pixels; kept for each channel, since a camera that runs sees most of it again."""
+        last = self._seen.get(channel)
+        if last is not None and last[1] == plane_mm and np.array_equal(last[0], gray):
+            return last[2]
+        optics = self._optics.irradiance(gray, channel, plane_mm)
+        seen = self._integrator(channel, plane_mm).camera(optics)
+        seen.flags.writeable = False
+        self._seen[channel] = gray.copy(), plane_mm, seen
+        return seen
 
     def _integrator(self, channel: str, plane_mm: float) -> Integrator:
         band = self._optics.path(channel, plane_mm).band

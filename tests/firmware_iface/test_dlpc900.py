@@ -112,7 +112,9 @@ def test_encoded_rows_of_known_bytes() -> None:
     assert data[:12].hex(" ") == "53 70 6c 64 05 00 02 00 48 00 00 00" and len(data) == 0x48
     assert data[24:27] == bytes([0, 2, 1])
     first, second = "03 000007  00 02 000001 000002  0000", "00 01 05  0000"
-    assert data[48:] == bytes.fromhex(first + second + "00 01 00" + "0000")  # end of the image, padding to four
+    assert data[48:] == bytes.fromhex(
+        first + second + "00 01 00" + "0000"
+    )  # end of the image, padding to four
 
 
 images = arrays(
