@@ -196,6 +196,12 @@ def test_where_there_is_no_camera_opening_says_so_in_time() -> None:
     assert time.monotonic() - begun < 4
 
 
+def test_without_the_library_opening_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(DeviceError, match="extra 'camera'"):
+        open_oak("127.0.8.1")
+
+
 @pytest.mark.parametrize(
     "options",
     [{"exposure_ms": 0}, {"exposure_ms": 40.0}, {"gain": 0.5}, {"gain": 17}, {"encoding": "nv12"}],

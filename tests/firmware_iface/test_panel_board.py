@@ -228,6 +228,44 @@ def test_the_serial_number_chooses_among_boards() -> None:
     assert second.gray.any() and not first.gray.any()
 
 
+script = st.tuples(
+    st.sampled_from(["stall", "short_write", "garbage", "timeout", "late", "hang", "unplug"]),
+    st.integers(1, 4),
+    st.integers(0, 8),
+)
+
+
+@given(st.lists(st.one_of(script, st.just("show"), st.just("clear")), max_size=14), st.integers(0, 99))
+@settings(max_examples=60)
+def test_under_any_script_of_faults_show_shows_or_says_so(script: list, seed: int) -> None:
+    """A show that returns has its pattern on the panel; whatever happened, only whole sent frames were displayed."""
+    model = BoardModel((3, 5), faults=Faults(seed))
+    model.faults.late_s = 0.004
+    panel = opened(model, timeout_s=0.008)
+    sent = set()
+    for number, step in enumerate([*script, "clear", "show"]):
+        match step:
+            case "show":
+                gray = pattern(number, (3, 5))
+                sent.add(zlib.crc32(gray.tobytes()))
+                try:
+                    panel.show(gray)
+                except DeviceError as error:
+                    assert script and str(error).endswith(".")
+                else:
+                    assert model.faults.standing("unplug") or (model.gray == gray).all()
+            case "clear":
+                model.faults.clear()
+            case kind, count, after:
+                model.faults.arm(kind, count, after)
+    try:
+        panel.show(gray)  # the last show may have met a board that was out meanwhile
+    except DeviceGoneError:
+        panel.show(gray)
+    assert (model.gray == gray).all()
+    assert {crc for _, crc in model.shown} <= sent
+
+
 SMALL = (3, 5)
 good = st.integers(0, 255).map(lambda level: np.full(SMALL, level, np.uint8))
 act = st.one_of(
