@@ -1,0 +1,10 @@
+"""Lasers over I2C. Emission needs key, interlock, heartbeat and no fault, combined in the board's safety controller.
+
+Software does not make a product Class 1: see eye_safety.py for what is budgeted, safety_controller.md for what the
+hardware must do, and have a test house classify the product.
+"""
+
+from .channels import VIRTUAL_CHANNELS, LaserChannel
+from .lasers import Lasers, open_lasers
+
+__all__ = ["VIRTUAL_CHANNELS", "LaserChannel", "Lasers", "open_lasers"]

@@ -1,0 +1,107 @@
+"""How much light may leave the exit pupil: Class 1, intentional long-term viewing, weighted by wavelength and summed.
+
+Limits are those of IEC/EN 60825-1:2014 for 400 to 700 nm, as published implementations code its Table 3; check them
+against the standard itself before any claim. Two hazards are kept apart, and in each the shares of all wavelengths add:
+
+thermal         390 µW for a point source (1.5 mrad or less); 7e-4 C6 T2^-0.25 W for a source of alpha mrad, with
+                C6 = alpha/1.5, T2 = 10 * 10^((alpha - 1.5)/98.5) s, up to 100 mrad
+photochemical   39 µW * C3 from 400 to 600 nm, C3 = 1 below 450 nm and 10^(0.02 (wavelength - 450)) above; over
+                30 000 s the eye moves, so all light counts as one spot
+
+A hologram can send all its light into one spot, so without a prediction it is taken to do that. A predicted picture
+counts with its brightest spots: for squares from 1.5 to 100 mrad, the largest share of the light that any square
+holds, against the limit of a source as large as the next smaller square. Sizes in between are then covered too.
+
+This is arithmetic, not a classification. Software does not make a product Class 1.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+
+POINT_MRAD, LARGEST_MRAD = 1.5, 100.0
+SIZES_MRAD = tuple(np.geomspace(POINT_MRAD, LARGEST_MRAD, 13).tolist())
+ALL_IN_ONE_SPOT = (1.0,) * len(SIZES_MRAD)
+
+
+def thermal_limit_uw(source_mrad: float = POINT_MRAD) -> float:
+    """Class 1 thermal limit for a source of this angular size, µW."""
+    alpha = min(max(source_mrad, POINT_MRAD), LARGEST_MRAD)
+    if alpha == POINT_MRAD:
+        return 390.0
+    t2_s = 10 * 10 ** ((alpha - 1.5) / 98.5)
+    return 1e6 * 7e-4 * (alpha / 1.5) * t2_s**-0.25
+
+
+def photochemical_limit_uw(wavelength_nm: float) -> float:
+    """Class 1 photochemical limit over 30 000 s, µW; infinite above 600 nm."""
+    if wavelength_nm > 600:
+        return math.inf
+    return 39.0 * 10 ** (0.02 * max(0.0, wavelength_nm - 450))
+
+
+def spot_shares(irradiance: NDArray[np.floating], mrad_per_pixel: float) -> tuple[float, ...]:
+    """The largest share of a picture's light in any square of each of SIZES_MRAD.
+
+    irradiance : [H, W], predicted in the image plane, any unit, not negative
+    mrad_per_pixel : angle that a pixel takes at the eye
+    Raises InputError where the picture cannot be one. A square is rounded up to whole pixels, so is never too small.
+    """
+    picture = np.asarray(irradiance, np.float64)
+    if picture.ndim != 2 or not np.isfinite(picture).all() or picture.size == 0 or picture.min() < 0:
+        raise InputError("a predicted picture must be [H, W], finite and nowhere negative; correct it.")
+    if not (math.isfinite(mrad_per_pixel) and mrad_per_pixel > 0):
+        raise InputError(f"{mrad_per_pixel!r} mrad a pixel is not an angle; give a number above 0.")
+    total = float(picture.sum())
+    if total == 0:
+        return ALL_IN_ONE_SPOT  # nothing is predicted: assume nothing
+    table = np.zeros((picture.shape[0] + 1, picture.shape[1] + 1))
+    table[1:, 1:] = picture.cumsum(0).cumsum(1)
+    shares = []
+    for size in SIZES_MRAD:
+        side = math.ceil(size / mrad_per_pixel) + 1  # wherever between the pixels the square begins
+        h, w = min(side, picture.shape[0]), min(side, picture.shape[1])
+        sums = table[h:, w:] - table[:-h, w:] - table[h:, :-w] + table[:-h, :-w]
+        shares.append(min(1.0, float(sums.max()) / total))
+    return tuple(shares)
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """Shares of the Class 1 limits that are used; 1 is the limit."""
+
+    thermal: float
+    photochemical: float
+
+    @property
+    def worst(self) -> float:
+        """The larger of the two."""
+        return max(self.thermal, self.photochemical)
+
+
+def exposure(
+    power_uw: Mapping[str, float],
+    wavelength_nm: Mapping[str, float],
+    shares: Mapping[str, Sequence[float]] | None = None,
+) -> Exposure:
+    """What these lasers use of the Class 1 limits.
+
+    power_uw : by channel, through a 7 mm aperture at the exit pupil
+    wavelength_nm : by channel, 400 to 700
+    shares : by channel, from `spot_shares`; channels without: all their light in one spot. The brightest spots of
+        all channels are taken to fall on one another.
+    """
+    photochemical = sum(p / photochemical_limit_uw(wavelength_nm[c]) for c, p in power_uw.items())
+    found = {c: (shares or {}).get(c, ALL_IN_ONE_SPOT) for c in power_uw}
+    thermal = sum(power_uw.values()) / thermal_limit_uw(LARGEST_MRAD)  # all light, in the largest source
+    for k in range(len(SIZES_MRAD)):
+        limit = thermal_limit_uw(SIZES_MRAD[max(0, k - 1)])
+        thermal = max(thermal, sum(p * found[c][k] for c, p in power_uw.items()) / limit)
+    return Exposure(thermal, photochemical)

@@ -1,0 +1,377 @@
+"""Three lasers over I2C, behind the safety controller.
+
+with open_lasers("/dev/i2c-1", CHANNELS) as lasers:
+    lasers.arm()
+    lasers.set_power("green", 1.0)
+    while showing:
+        lasers.heartbeat()          # at least every 50 ms, from the loop that must be alive
+
+Every failure (of the bus, of a reply, of the light) goes the same way: everything is told to go dark, each part by
+itself, and DeviceError is raised. Nothing is tried twice. When the process dies, the heartbeat dies with it, and the
+safety controller is dark after 100 ms.
+"""
+
+from __future__ import annotations
+
+import atexit
+import math
+import time
+import weakref
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import DeviceError, InputError
+from .channels import LaserChannel
+from .eye_safety import ALL_IN_ONE_SPOT, exposure
+from .mcp4728 import VOLTS_PER_CODE
+from .parts import Parts
+from .safety_controller import Command, Input, State
+from .wire import open_bus
+
+if TYPE_CHECKING:
+    from smbus2 import SMBus
+
+BEAT_S, LATEST_BEAT_S, SOONEST_BEAT_S = 0.025, 0.050, 0.006
+RAMP_S, RAMP_STEPS = 0.100, 20  # a rise of 5 ms a step is twice as slow as the safety controller's limiter
+TOLERANCE, FLOOR_V = 0.2, 0.02  # of the photodiode's voltage
+
+MISSING = {
+    Input.KEY: "turn the key on",
+    Input.INTERLOCK: "close the interlock",
+    Input.HEARTBEAT: "send the heartbeat at least every 50 ms",
+    Input.DARK: "the DAC is not dark; switch the board off and on",
+    Input.COOL: "let the lasers cool down",
+    Input.QUIET: "the photodiodes see too much light",
+    Input.CEILINGS: "the ceilings are not written; open the lasers again",
+}
+
+
+class Lasers:
+    """The lasers of one board, opened dark and not armed.
+
+    bus : an open smbus2.SMBus, which is closed with the lasers
+    channels : one to three, in the order of the DAC's outputs
+    clock, wait : seconds, and sleeping; tests give their own
+    Raises InputError where the channels do not fit the board, DeviceError where a part fails or the DAC would not be
+    dark at power-on.
+    """
+
+    def __init__(
+        self,
+        bus: SMBus,
+        channels: Sequence[LaserChannel],
+        clock: Callable[[], float] = time.monotonic,
+        wait: Callable[[float], None] = time.sleep,
+    ) -> None:
+        if not 1 <= len(channels) <= 3 or len({c.name for c in channels}) != len(channels):
+            raise InputError(
+                "a board has one to three lasers with names of their own; correct the list of lasers."
+            )
+        self._bus, self._clock, self._wait = bus, clock, wait
+        self._lasers = tuple(channels)
+        self.channels = tuple(c.name for c in channels)
+        self._wavelengths = {c.name: c.wavelength_nm for c in channels}
+        self.parts = Parts(bus)
+        self._fractions = [0.0] * len(channels)
+        self._codes = [0] * len(channels)
+        self._shares: dict[str, tuple[float, ...]] = {}
+        self._token = 0
+        self._beat_at = self._changed_at = self._selected_at = -math.inf
+        self._selected, self._ramping = 0, False
+        self._closed = False
+        with self._dark_on_failure():
+            self.parts.set_up(self._lasers)
+            self._token = self.parts.controller.token()
+            self._select(0)
+        _open.add(self)
+
+    # --- the headset's interface
+
+    def power(self, channel: str) -> float:
+        """A laser's power, fraction of full; raises InputError for an unknown one."""
+        return self._fractions[self._index(channel)]
+
+    def set_power(self, channel: str, fraction: float) -> None:
+        """Set a laser to a fraction of full power: down at once, up over 100 ms with the photodiode watched.
+
+        Raises InputError where either is unknown or the lasers together would exceed the Class 1 budget, and
+        DeviceError (dark by then) where a part fails or the photodiode does not follow.
+        """
+        for _ in self.ramp(channel, fraction):
+            self._wait(RAMP_S / RAMP_STEPS)
+
+    def off(self) -> None:
+        """Every laser to 0, at once; the board stays armed. Where the DAC fails, everything is told to go dark."""
+        self._forget()
+        with self._dark_on_failure():
+            self.parts.dac.dark()
+
+    # --- arming and staying alive
+
+    def clear(self) -> None:
+        """First act after a fault: forget it. Raises DeviceError that says what holds it."""
+        with self._dark_on_failure():
+            self.parts.dac.dark()
+            self.parts.controller.command(Command.CLEAR)
+            held = self.parts.controller.state() is State.FAULT
+            needed = Input.INTERLOCK | Input.DARK | Input.COOL | Input.QUIET
+            missing = self._missing(needed) if held else ""
+        if held:
+            raise DeviceError(f"the fault cannot be cleared: {missing}.")
+
+    def arm(self) -> None:
+        """Second act: arm the board, dark. Raises DeviceError that says what is missing."""
+        with self._dark_on_failure():
+            state = self.parts.controller.state()
+            if state is State.OFF:
+                self.parts.dac.dark()
+                self.parts.expander.enable((1 << len(self._lasers)) - 1)
+                self._beat()
+                self.parts.controller.command(Command.ARM_FIRST)
+                self.parts.controller.command(Command.ARM_SECOND)
+                state = self.parts.controller.state()
+            latched, missing = self._latched(), self._missing(Input(0x7F))
+        if state is State.FAULT:
+            raise DeviceError(f"a fault is latched ({latched}); find its cause, then clear() and arm().")
+        if state is State.OFF:
+            raise DeviceError(f"the lasers cannot be armed: {missing}.")
+
+    def heartbeat(self) -> None:
+        """Say that the caller is alive, at least every 50 ms; looks at one photodiode each time.
+
+        Raises DeviceError (dark by then) where a fault is latched, a photodiode shows what it should not, or a part
+        does not answer. No token is written sooner than 6 ms after the last.
+        """
+        with self._dark_on_failure():
+            self._beat()
+            self._raise_latched()
+            self._look()
+            if not self._ramping:
+                self._select((self._selected + 1) % len(self._lasers))
+
+    def ramp(self, channel: str, fraction: float) -> Iterator[None]:
+        """`set_power`, a step at a time: yields between steps, which should be 5 ms apart.
+
+        A caller that must do other things meanwhile (or that must be able to stop) drives it.
+        """
+        k = self._index(channel)
+        if (
+            isinstance(fraction, bool)
+            or not isinstance(fraction, int | float | np.floating)
+            or not 0 <= fraction <= 1
+        ):
+            raise InputError(f"power {fraction!r} of laser '{channel}' is not a fraction; give 0 to 1.")
+        self._check_budget(
+            {**dict(zip(self.channels, self._fractions, strict=True)), channel: float(fraction)}
+        )
+        start, end = self._codes[k], self._lasers[k].code(fraction)
+        if end <= start:
+            with self._dark_on_failure():
+                self._put(k, end)
+            self._fractions[k] = float(fraction)
+            return
+        with self._dark_on_failure():
+            if self.parts.controller.state() not in (State.ARMED, State.EMIT):
+                raise DeviceError("the lasers are not armed; arm() them first.")
+            self._select(k)
+        self._fractions[k] = float(fraction)
+        start = max(
+            start, min(end, self._lasers[k].code(1e-9))
+        )  # below the threshold there is no light to ramp
+        self._ramping = True
+        try:
+            for step in range(1, RAMP_STEPS + 1):
+                with self._dark_on_failure():
+                    self._put(k, start + (end - start) * step // RAMP_STEPS)
+                yield
+                with self._dark_on_failure():
+                    if self._clock() - self._beat_at >= BEAT_S:
+                        self._beat()
+                    self._look()
+        finally:
+            self._ramping = False
+
+    # --- the Class 1 budget
+
+    def expect(self, shares: Mapping[str, Sequence[float]] | None) -> float:
+        """Say what the next pattern is predicted to make, before it is shown (None: unknown, all in one spot).
+
+        shares : by channel, from eye_safety.spot_shares
+        Lowers every laser by one factor, at once, where the pattern's brightest spots would exceed the budget, and
+        returns that factor (1: nothing changed). Powers do not rise again by themselves.
+        """
+        found = dict(shares or {})
+        for channel, values in found.items():
+            self._index(channel)
+            values = tuple(float(v) for v in values)
+            if len(values) != len(ALL_IN_ONE_SPOT) or not all(0 < v <= 1 for v in values):
+                raise InputError(
+                    f"the shares of '{channel}' are not what spot_shares gives; use it to make them."
+                )
+            found[channel] = values
+        self._shares = {c: tuple(v) for c, v in found.items()}
+        worst = self._exposure(dict(zip(self.channels, self._fractions, strict=True)))["worst"]
+        factor = min(1.0, 1 / worst) if worst > 0 else 1.0
+        if factor < 1:
+            self._fractions = [f * factor for f in self._fractions]
+            with self._dark_on_failure():
+                for k, laser in enumerate(self._lasers):
+                    self._put(k, laser.code(self._fractions[k]))
+        return factor
+
+    def _check_budget(self, fractions: dict[str, float]) -> None:
+        worst = self._exposure(fractions)["worst"]
+        if worst > 1 + 1e-9:
+            raise InputError(
+                f"the lasers together would make {worst:.2f} of the Class 1 limit of a point source; lower one, or "
+                "say with expect() what the pattern is predicted to make."
+            )
+
+    def _exposure(self, fractions: Mapping[str, float]) -> dict[str, float]:
+        power_uw = {c.name: c.full_power_uw * fractions[c.name] for c in self._lasers}
+        found = exposure(power_uw, self._wavelengths, self._shares)
+        return {"thermal": found.thermal, "photochemical": found.photochemical, "worst": found.worst}
+
+    # --- what is seen
+
+    def status(self) -> dict[str, Any]:
+        """What the board says of itself, ready for JSON. Raises DeviceError (dark by then) where it does not answer."""
+        with self._dark_on_failure():
+            inputs = self.parts.controller.inputs()
+            fractions = dict(zip(self.channels, self._fractions, strict=True))
+            return {
+                "state": self.parts.controller.state().name.lower(),
+                "faults": [f.name.lower() for f in self.parts.controller.faults() if f.name],
+                "holds": {i.name.lower(): bool(inputs & i) for i in Input if i.name},
+                "power": fractions,
+                "celsius": round(self.parts.thermometer.celsius(), 2),
+                "class1": self._exposure(fractions),
+                "class1_at_full_power": self._exposure(dict.fromkeys(self.channels, 1.0))["worst"],
+            }
+
+    def _look(self) -> None:
+        """Compare the selected photodiode with what it should show, if the light has had the time to settle."""
+        if self._clock() - max(self._changed_at, self._selected_at) < RAMP_S / RAMP_STEPS - 1e-6:
+            return
+        k = self._selected
+        seen_v = self.parts.converter.volts()
+        expected_v = self._lasers[k].photodiode_v(self._codes[k] * VOLTS_PER_CODE)
+        if abs(seen_v - expected_v) <= TOLERANCE * expected_v + FLOOR_V:
+            return
+        self._raise_latched()
+        raise DeviceError(
+            f"laser '{self.channels[k]}' should make {expected_v:.3f} V at its photodiode and makes {seen_v:.3f} V, so "
+            "the lasers were switched off; check the photodiode, the calibration, and that the set point of the "
+            "laser's controller is 0."
+        )
+
+    def _raise_latched(self) -> None:
+        if self.parts.controller.state() is State.FAULT:
+            raise DeviceError(f"the safety controller has switched the lasers off: {self._latched()}.")
+
+    def _latched(self) -> str:
+        return ", ".join(f.name.lower() for f in self.parts.controller.faults() if f.name)
+
+    def _missing(self, wanted: Input) -> str:
+        inputs = self.parts.controller.inputs()
+        return "; ".join(MISSING[i] for i in wanted if not inputs & i) or "it gives no reason; try again"
+
+    # --- what is done
+
+    def _index(self, channel: str) -> int:
+        if channel not in self.channels:
+            raise InputError(f"there is no laser '{channel}'; use one of {', '.join(self.channels)}.")
+        return self.channels.index(channel)
+
+    def _beat(self) -> None:
+        if self._clock() - self._beat_at < SOONEST_BEAT_S:
+            return
+        self._token = (self._token + 1) % 256
+        self.parts.controller.beat(self._token)
+        self._beat_at = self._clock()
+
+    def _put(self, k: int, code: int) -> None:
+        self._changed_at = self._clock()
+        self._codes[k] = code
+        self.parts.dac.set_code(k, code)
+
+    def _select(self, k: int) -> None:
+        self.parts.converter.select(k)
+        self._selected, self._selected_at = k, self._clock()
+
+    @contextmanager
+    def _dark_on_failure(self) -> Iterator[None]:
+        """Whatever fails inside, go dark first and then tell."""
+        if self._closed:
+            raise DeviceError("the lasers are closed; open them again.")
+        try:
+            yield
+        except OSError as error:
+            self._go_dark()
+            raise DeviceError(
+                f"the laser board does not answer ({error.strerror or error}), so the lasers were switched off; "
+                "check its power and its bus, then clear() and arm()."
+            ) from error
+        except InputError:
+            self._go_dark(Command.OFF)
+            raise
+        except BaseException:
+            self._go_dark()
+            raise
+
+    def trip(self) -> None:
+        """Latch a fault of the host's own: dark until clear() and arm(). Raises nothing."""
+        self._go_dark()
+
+    def _go_dark(self, command: Command = Command.FAULT) -> None:
+        self._forget()
+        self.parts.go_dark(command)
+
+    def _forget(self) -> None:
+        self._fractions = [0.0] * len(self._lasers)
+        self._codes = [0] * len(self._lasers)
+        self._changed_at = self._clock()
+
+    def close(self) -> None:
+        """Dark, disarmed, every enable off; the bus is closed. May be called again."""
+        if self._closed:
+            return
+        self._closed = True
+        self._go_dark(Command.OFF)
+        self._bus.close()
+
+    def __enter__(self) -> Lasers:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+_open: weakref.WeakSet[Lasers] = weakref.WeakSet()
+
+
+@atexit.register
+def _close_all() -> None:
+    for lasers in list(_open):
+        lasers.close()
+
+
+def open_lasers(bus: str, channels: Sequence[LaserChannel]) -> Lasers:
+    """Open the lasers on a bus (see wire.open_bus). Raises InputError, DeviceError."""
+    try:
+        opened = open_bus(bus)
+    except OSError as error:
+        raise InputError(
+            f"the bus {bus} cannot be opened ({error.strerror or error}); give another one."
+        ) from error
+    try:
+        return Lasers(opened, channels)
+    except BaseException:
+        opened.close()
+        raise

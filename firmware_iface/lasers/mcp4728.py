@@ -1,0 +1,86 @@
+"""MCP4728: the DAC whose four outputs set the lasers' currents. Internal reference, gain 1: 0.5 mV a code.
+
+At 50 mA/V that is 0.025 mA a code and at most 102.4 mA. The part has no watchdog, and at power-on it shows what its
+EEPROM holds: both are why the safety controller stands behind it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from ..errors import DeviceError
+from .wire import read, write
+
+if TYPE_CHECKING:
+    from smbus2 import SMBus
+
+VOLTS_PER_CODE = 2.048 / 4096
+MULTI_WRITE, SEQUENTIAL_WRITE = 0x40, 0x50
+INTERNAL_REFERENCE = 0x80
+OFF_500K = 0x60  # the output is off, 500 kΩ to ground
+CHANNELS = 4
+
+
+@dataclass(frozen=True)
+class Output:
+    """One channel as the part reports it: code, whether it is powered, whether at 0.5 mV a code."""
+
+    code: int
+    powered: bool
+    fine: bool
+
+    @property
+    def dark(self) -> bool:
+        """Whether it puts out nothing."""
+        return self.code == 0 or not self.powered
+
+
+def decode(reply: bytes) -> tuple[list[Output], list[Output]]:
+    """(outputs now, outputs after power-on) from the 24 bytes that the part sends; raises DeviceError.
+
+    Each channel is status, two bytes of the register, status, two bytes of the EEPROM; bits 5 and 4 of the status
+    count the channels.
+    """
+    if len(reply) != 6 * CHANNELS or any(reply[3 * i] >> 4 & 3 != i // 2 for i in range(2 * CHANNELS)):
+        raise DeviceError(
+            "the DAC (MCP4728) sent no sense; check its wiring, then switch the board off and on."
+        )
+    found = [
+        Output(
+            (high & 15) << 8 | low, not high & OFF_500K, bool(high & INTERNAL_REFERENCE) and not high & 0x10
+        )
+        for high, low in (reply[3 * i + 1 : 3 * i + 3] for i in range(2 * CHANNELS))
+    ]
+    return found[0::2], found[1::2]
+
+
+class Mcp4728:
+    """The DAC.
+
+    bus : an open smbus2.SMBus
+    """
+
+    def __init__(self, bus: SMBus, address: int = 0x60) -> None:
+        self._bus, self._address = bus, address
+
+    def read(self) -> tuple[list[Output], list[Output]]:
+        """(outputs now, outputs after power-on), A to D. Raises DeviceError, OSError."""
+        return decode(read(self._bus, self._address, 6 * CHANNELS))
+
+    def set_code(self, channel: int, code: int) -> None:
+        """Put out `code`, 0 to 4095, on channel 0 (A) to 3 (D), at once. Raises OSError."""
+        high, low = INTERNAL_REFERENCE | code >> 8, code & 0xFF
+        write(self._bus, self._address, bytes([MULTI_WRITE | channel << 1, high, low]))
+
+    def dark(self) -> None:
+        """Code 0 on every channel, in one message (fast write). Raises OSError."""
+        write(self._bus, self._address, bytes(2 * CHANNELS))
+
+    def store_dark(self) -> None:
+        """Make power-on dark: every channel off in the EEPROM, and now. It takes 50 ms. Raises OSError.
+
+        The EEPROM bears a million writes: do this when a board is made, not when it is opened.
+        """
+        off = bytes([INTERNAL_REFERENCE | OFF_500K, 0])
+        write(self._bus, self._address, bytes([SEQUENTIAL_WRITE]) + CHANNELS * off)

@@ -1,0 +1,93 @@
+"""An emulated bus for other processes, over a Unix socket: each transfer is one packet there and one back."""
+
+from __future__ import annotations
+
+import errno
+import json
+import socket
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+from .board import LaserBoard
+from .bus import Message, failure
+from .kernel import attach
+
+TICK_S = 0.002
+PACKET = 65536
+
+
+class BoardServer:
+    """Serves a board's bus and lets its time run. `close` ends both.
+
+    path : of the socket; made new
+    """
+
+    def __init__(self, board: LaserBoard, path: Path) -> None:
+        self.board, self.path = board, path
+        self._ended = threading.Event()
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._listener.bind(str(path))
+        self._listener.listen(8)
+        for run in (self._accept, self._tick):
+            threading.Thread(target=run, daemon=True).start()
+
+    def close(self) -> None:
+        """Stop serving; transfers that come later fail as on a board without power."""
+        self._ended.set()
+        self._listener.close()
+        self.path.unlink(missing_ok=True)
+
+    def _tick(self) -> None:
+        while not self._ended.wait(TICK_S):
+            self.board.settle()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                connection, _ = self._listener.accept()
+            except OSError:
+                return
+            threading.Thread(target=self._serve, args=(connection,), daemon=True).start()
+
+    def _serve(self, connection: socket.socket) -> None:
+        with connection:
+            while packet := connection.recv(PACKET):
+                try:
+                    if self._ended.is_set():
+                        raise failure(errno.ENXIO)
+                    messages = [
+                        Message(a, None if data is None else bytes.fromhex(data), n)
+                        for a, data, n in json.loads(packet)
+                    ]
+                    answer: object = [reply.hex() for reply in self.board.bus.transfer(messages)]
+                except OSError as error:
+                    answer = error.errno
+                try:
+                    connection.send(json.dumps(answer).encode())
+                except OSError:  # the process that asked has died meanwhile
+                    return
+
+
+class RemoteBus:
+    """The bus of a board that another process serves."""
+
+    def __init__(self, path: str) -> None:
+        self._lock = threading.Lock()
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._socket.connect(path)
+
+    def transfer(self, messages: Sequence[Message]) -> list[bytes]:
+        """Carry the messages; the bytes read. Raises OSError as an adapter."""
+        asked = [(m.address, None if m.data is None else m.data.hex(), m.length) for m in messages]
+        with self._lock:
+            self._socket.send(json.dumps(asked).encode())
+            answer = json.loads(self._socket.recv(PACKET) or str(errno.ENODEV))
+        if isinstance(answer, int):
+            raise failure(answer)
+        return [bytes.fromhex(reply) for reply in answer]
+
+
+def connect(path: str) -> str:
+    """A node for smbus2.SMBus, with the bus that is served at `path` behind it. Raises OSError."""
+    return attach(RemoteBus(path))
