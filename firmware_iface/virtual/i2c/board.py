@@ -91,13 +91,18 @@ class LaserBoard:
     def power_cycle(self) -> None:
         """Off and on again: every part in its power-on state, the DAC as its EEPROM says."""
         with self.bus.lock:
-            for part in (self.dac, self.expander, self.converter, self.thermometer, self.controller):
-                part.power_on()
+            self._power_on()
         self.settle()
+
+    def _power_on(self) -> None:
+        for part in (self.dac, self.expander, self.converter, self.thermometer, self.controller):
+            part.power_on()
 
     def settle(self) -> None:
         """Let every part do what is due by now, and tell of a change of light."""
         with self.bus.lock:
+            if self.bus.faults.standing("unplug"):
+                self._power_on()
             self.thermometer.settle()
             self.converter.settle()
             self.controller.settle()

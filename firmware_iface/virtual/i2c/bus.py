@@ -73,6 +73,7 @@ class I2cBus:
 
     def transfer(self, messages: Sequence[Message]) -> list[bytes]:
         """Carry the messages between one START and one STOP; the bytes read. Raises OSError as an adapter."""
+        self._settle()
         kinds = ("unplug", "nack", "timeout", "stall", "hang", "late", "short_write", "garbage", "die")
         fault = self.faults.take(*kinds)
         if fault == "die":

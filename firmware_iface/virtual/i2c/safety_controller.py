@@ -114,22 +114,25 @@ class SafetyController:
             self._run_until(deadline)
             self._latch(Fault.HEARTBEAT)
         self._run_until(now)
+        self._limits_v = [min(a, b) for a, b in zip(self._limits_v, self._next_limits_v(), strict=True)]
         self._watch()
 
     def _run_until(self, time_s: float) -> None:
         while self.armed and self._ticked + TICK_S <= time_s + SLACK_S:
             self._ticked += TICK_S
-            self._raise_limits()
+            self._limits_v = self._next_limits_v()
             self._watch()
         if not self.armed:
             self._ticked = max(self._ticked, time_s)
 
-    def _raise_limits(self) -> None:
+    def _next_limits_v(self) -> list[float]:
+        """Where the limits may be in a tick from now; they fall there at once, and rise there with the tick."""
+        limits = []
         for k in LASERS:
-            ceiling = (self.ceilings[k][0] or 0) * 1e-4
-            threshold = self._threshold_v(k)
+            ceiling, threshold = (self.ceilings[k][0] or 0) * 1e-4, self._threshold_v(k)
             step = max(0.0, ceiling - threshold) / RISE_TICKS
-            self._limits_v[k] = min(ceiling, max(self.output_v(k), threshold) + step)
+            limits.append(min(ceiling, max(self.output_v(k), threshold) + step))
+        return limits
 
     def _watch(self) -> None:
         if not self.armed:

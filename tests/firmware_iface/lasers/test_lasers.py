@@ -1,0 +1,470 @@
+"""The lasers over the emulated board: what is emitted, when, and that whatever goes wrong ends dark."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import smbus2
+
+from firmware_iface.errors import DeviceError, InputError
+from firmware_iface.lasers import VIRTUAL_CHANNELS, Lasers, open_lasers
+from firmware_iface.lasers.eye_safety import spot_shares
+from firmware_iface.lasers.store_dark import main as store_dark
+from firmware_iface.virtual.i2c import attach
+from firmware_iface.virtual.i2c.mcp4728 import Setting
+from tests.firmware_iface.lasers.boards import Bench
+
+RED = VIRTUAL_CHANNELS[0]
+
+
+def test_power_is_what_was_asked_to_a_step_of_the_dac_and_never_more(bench: Bench) -> None:
+    lasers = bench.armed()
+    for channel in VIRTUAL_CHANNELS:
+        for fraction in (0.1, 0.5, np.float64(1.0)):
+            lasers.set_power(channel.name, fraction)
+            asked, made = fraction * channel.full_power_uw, bench.board.emitted_uw[channel.name]
+            assert asked - 0.025 * channel.slope_uw_per_ma <= made <= asked + 1e-9
+            assert lasers.power(channel.name) == fraction
+    lasers.off()
+    assert bench.light_uw == 0 and lasers.power("red") == 0
+    lasers.set_power("blue", 0.2)
+    assert bench.light_uw == pytest.approx(3, rel=0.01)
+
+
+def test_light_rises_over_at_least_50_ms_and_falls_at_once(bench: Bench) -> None:
+    lasers = bench.armed()
+    bench.seen.clear()
+    began = bench.now
+    lasers.set_power("red", 1.0)
+    assert bench.now - began >= 0.050
+    powers = [(t, p["red"]) for t, p in bench.seen]
+    for (t1, p1), (t2, p2) in pairwise(powers):
+        assert p1 <= p2 <= p1 + 120 * (t2 - t1 + 0.001) / 0.050 + 1e-9
+    began = bench.now
+    lasers.set_power("red", 0.3)
+    assert bench.now == began and bench.light_uw == pytest.approx(36, abs=0.1)
+
+
+def test_the_controllers_limiter_ramps_even_for_a_host_that_jumps(bench: Bench) -> None:
+    lasers = bench.armed()
+    bench.seen.clear()
+    began = bench.now
+    lasers.parts.dac.set_code(0, 3000)
+    bench.pass_time(0.080)
+    full = next(t for t, p in bench.seen if p["red"] == pytest.approx(120))
+    assert 0.049 <= full - began <= 0.052
+
+
+def test_no_code_of_the_dac_passes_the_ceiling(bench: Bench) -> None:
+    lasers = bench.armed()
+    bench.seen.clear()
+    for vref in (0x00, 0x80, 0x90):
+        for k in range(3):
+            bench.bus.i2c_rdwr(smbus2.i2c_msg.write(0x60, [0x40 | k << 1, vref | 0x0F, 0xFF]))
+        for _ in range(4):
+            bench.pass_time(0.03)
+            lasers.parts.controller.beat(lasers._token + 1)
+            lasers._token += 1
+    for channel in VIRTUAL_CHANNELS:
+        assert max(p[channel.name] for _, p in bench.seen) == pytest.approx(channel.full_power_uw)
+
+
+@pytest.mark.parametrize("silent_s", [0.0995, 0.1005])
+def test_the_dead_man(bench: Bench, silent_s: float) -> None:
+    lasers = bench.armed()
+    lasers.set_power("green", 1.0)
+    lasers.heartbeat()
+    bench.pass_time(silent_s)
+    if silent_s < 0.1:
+        assert bench.light_uw > 0
+        lasers.heartbeat()
+        return
+    assert bench.light_uw == 0
+    assert bench.seen[-1][0] - (bench.now - silent_s) <= 0.1011
+    with pytest.raises(DeviceError, match="heartbeat"):
+        lasers.heartbeat()
+    bench.pass_time(1)
+    assert bench.light_uw == 0, "latched"
+
+
+def test_the_same_token_again_is_no_heartbeat(bench: Bench) -> None:
+    lasers = bench.armed()
+    lasers.set_power("green", 1.0)
+    bench.pass_time(0.02)
+    lasers.parts.controller.beat(lasers._token)
+    assert bench.light_uw == 0
+    with pytest.raises(DeviceError, match="heartbeat"):
+        lasers.heartbeat()
+
+
+def test_a_token_too_soon_is_a_loop_run_wild(bench: Bench) -> None:
+    lasers = bench.armed()
+    lasers.set_power("green", 1.0)
+    bench.pass_time(0.02)
+    lasers.heartbeat()
+    bench.pass_time(0.003)
+    lasers.heartbeat()  # the driver itself never does it
+    assert bench.light_uw > 0
+    lasers.parts.controller.beat(lasers._token + 1)
+    assert bench.light_uw == 0
+
+
+@pytest.mark.parametrize("condition", ["key", "interlock"])
+def test_key_and_interlock_latch_and_it_takes_two_acts_to_see_light_again(
+    bench: Bench, condition: str
+) -> None:
+    lasers = bench.armed()
+    lasers.set_power("green", 1.0)
+    setattr(bench.board, condition, False)
+    assert bench.light_uw == 0
+    setattr(bench.board, condition, True)
+    with pytest.raises(DeviceError, match=condition):
+        lasers.heartbeat()
+    with pytest.raises(DeviceError, match="not armed"):
+        lasers.set_power("green", 1.0)
+    with pytest.raises(DeviceError, match=r"clear\(\)"):
+        lasers.arm()
+    assert bench.light_uw == 0
+    lasers.clear()
+    with pytest.raises(DeviceError, match="not armed"):
+        lasers.set_power("green", 1.0)
+    lasers.clear()
+    lasers.arm()
+    assert bench.light_uw == 0, "armed is dark"
+    lasers.set_power("green", 1.0)
+    assert bench.light_uw > 0
+
+
+def test_what_is_missing_is_said(bench: Bench) -> None:
+    lasers = bench.open()
+    with pytest.raises(DeviceError, match="turn the key on; close the interlock"):
+        lasers.arm()
+    bench.ready()
+    bench.board.celsius = 50
+    with pytest.raises(DeviceError, match="cool down"):
+        lasers.arm()
+    bench.board.celsius = 30
+    lasers.arm()
+    bench.board.interlock = False
+    with pytest.raises(DeviceError, match="cannot be cleared: close the interlock"):
+        lasers.clear()
+
+
+def test_the_second_arming_word_counts_only_right_after_the_first(bench: Bench) -> None:
+    from firmware_iface.lasers.safety_controller import Command, State
+
+    bench.ready()
+    controller = (lasers := bench.open()).parts.controller
+    for between in (lambda: controller.command(Command.OFF), lambda: bench.pass_time(1.001)):
+        lasers.heartbeat()
+        controller.command(Command.ARM_FIRST)
+        between()
+        lasers.heartbeat()
+        controller.command(Command.ARM_SECOND)
+        assert controller.state() is State.OFF
+    controller.command(Command.ARM_SECOND)
+    assert controller.state() is State.OFF
+
+
+def test_heat_switches_off(bench: Bench) -> None:
+    lasers = bench.armed()
+    lasers.set_power("green", 1.0)
+    bench.board.celsius = 45.5
+    assert bench.light_uw == 0
+    with pytest.raises(DeviceError, match="temperature"):
+        lasers.heartbeat()
+
+
+def test_a_knob_turned_up_trips_on_the_photodiode_within_a_tick(bench: Bench) -> None:
+    lasers = bench.armed()
+    lasers.set_power("green", 1.0)
+    began = bench.now
+    bench.board.diodes[1].offset_ma = 10.0
+    bench.pass_time(0.002)
+    assert bench.light_uw == 0 and bench.seen[-1][0] - began <= 0.001 + 1e-9
+    with pytest.raises(DeviceError, match="overpower_1"):
+        lasers.heartbeat()
+
+
+def test_the_converters_comparator_trips_too_when_the_controllers_own_ceilings_are_wide(bench: Bench) -> None:
+    bench.board.controller.built_for = ((15000, 60000, 9000),) * 3
+    bench.ready()
+    lasers = bench.open()
+    lasers.arm()
+    lasers.set_power("red", 1.0)
+    for pair in bench.board.controller.ceilings:
+        pair[1] = 60000
+    bench.board.diodes[0].efficiency = 1.5
+    for _ in range(4):  # the converter looks at one photodiode after the other
+        bench.pass_time(0.025)
+        if bench.light_uw == 0:
+            break
+        lasers.heartbeat()
+    with pytest.raises(DeviceError, match="alert"):
+        lasers.heartbeat()
+
+
+@pytest.mark.parametrize("change", [{"efficiency": 0.7}, {"efficiency": 1.15, "offset_ma": 3.0}])
+def test_a_laser_that_drifts_from_its_calibration_is_switched_off(
+    bench: Bench, change: dict[str, float]
+) -> None:
+    lasers = bench.armed()
+    lasers.set_power("red", 0.3)
+    for name, value in change.items():
+        setattr(bench.board.diodes[0], name, value)
+    with pytest.raises(DeviceError, match="photodiode"):
+        for _ in range(4):
+            bench.pass_time(0.025)
+            lasers.heartbeat()
+    assert bench.light_uw == 0
+
+
+def test_a_ramp_stops_where_the_photodiode_does_not_follow(bench: Bench) -> None:
+    lasers = bench.armed()
+    bench.board.break_photodiode(0)
+    bench.seen.clear()
+    with pytest.raises(DeviceError, match="laser 'red' should make .* V at its photodiode and makes 0.000 V"):
+        lasers.set_power("red", 1.0)
+    assert bench.light_uw == 0
+    assert max(p["red"] for _, p in bench.seen) < 0.1 * 120, "stopped early"
+
+
+def test_the_ceilings_can_be_written_once_and_only_lowered_from_what_the_board_was_built_for(
+    bench: Bench,
+) -> None:
+    bench.ready()
+    with pytest.raises(InputError, match="built for 1.5000 V"):
+        Lasers(bench.bus, (replace(RED, full_power_uw=121.0),), lambda: bench.now, bench.pass_time)
+    lasers = Lasers(bench.bus, (replace(RED, full_power_uw=60.0),), lambda: bench.now, bench.pass_time)
+    for drive_v in (1.0, 1.5):
+        with pytest.raises(OSError, match="Remote I/O"):
+            lasers.parts.controller.set_ceilings(0, drive_v, 1.2)
+    assert lasers.parts.controller.ceilings_v(0)[0] == pytest.approx(1.2)
+    with pytest.raises(DeviceError, match="config"):
+        lasers.heartbeat()
+    with pytest.raises(DeviceError, match=r"holds ceilings of 1\.2000 .* switch the board off and on"):
+        bench.open()
+    bench.board.power_cycle()
+    bench.open()
+
+
+def test_lasers_that_are_not_there_get_a_ceiling_of_0(bench: Bench) -> None:
+    bench.ready()
+    lasers = Lasers(bench.bus, (RED,), lambda: bench.now, bench.pass_time)
+    lasers.arm()
+    lasers.parts.expander.enable(0b111)
+    lasers.parts.dac.set_code(2, 1800)
+    bench.pass_time(0.08)
+    assert bench.light_uw == 0
+
+
+def test_an_eeprom_that_would_light_lasers_is_refused_and_can_be_written_dark(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench.board.dac.eeprom = [Setting(True, 0, False, 0), Setting(True, 0, False, 2000)] * 2
+    with pytest.raises(DeviceError, match="store_dark"):
+        bench.open()
+    assert store_dark([]) == 2 and store_dark(["/nowhere"]) == 2
+    bench.board.dac._clock = iter(range(1000, 2000)).__next__  # the command waits in real time
+    assert store_dark([bench.node]) == 0
+    assert capsys.readouterr().out == "the DAC is dark at power-on\n"
+    bench.board.dac._clock = lambda: bench.now + 3000
+    bench.open()
+    bench.board.power_cycle()
+    assert [bench.board.dac.volts(k) for k in range(4)] == [0] * 4
+
+
+def test_power_on_is_dark_even_with_a_bright_eeprom_and_everything_closed(bench: Bench) -> None:
+    bench.armed().set_power("red", 1.0)
+    bench.board.dac.eeprom = [Setting(True, 0, False, 3000)] * 4
+    bench.board.power_cycle()
+    bench.pass_time(1)
+    assert bench.light_uw == 0
+
+
+@pytest.mark.parametrize(
+    "kind", ["nack", "timeout", "stall", "short_write", "garbage", "unplug", "late", "hang"]
+)
+@pytest.mark.parametrize("after", range(0, 12))
+def test_any_fault_of_the_bus_ends_dark_within_150_ms_and_is_told(
+    bench: Bench, kind: str, after: int
+) -> None:
+    """While showing, wherever in the traffic it strikes: four heartbeats' transfers and a change of power."""
+    lasers = bench.armed()
+    lasers.set_power("green", 0.5)
+    lasers.set_power("red", 0.5)
+    faults, take = bench.board.bus.faults, bench.board.bus.faults.take
+    struck_at: list[float] = []
+    told = False
+
+    def watched(*kinds: str) -> str | None:
+        hit = take(*kinds)
+        if hit:
+            struck_at.append(bench.now)
+        return hit
+
+    faults.take = watched  # type: ignore[method-assign]
+    if kind == "hang":
+        began = bench.now
+        bench.board.bus.sleep = lambda s: (bench.pass_time(s), bench.now - began > 0.4 and faults.clear())
+    faults.arm(kind, count=None if kind in ("hang", "unplug") else 1, after=after)
+    try:
+        for _ in range(4):
+            bench.pass_time(0.025)
+            lasers.heartbeat()
+        lasers.set_power("red", 0.6)
+    except DeviceError:
+        told = True
+    assert struck_at
+    assert told or kind in ("garbage", "late"), (
+        "garbage in a write, or lateness within the window, harms nothing"
+    )
+    assert (bench.light_uw == 0) == told
+    if told:
+        assert lasers.power("red") == 0
+        assert bench.seen[-1][0] - struck_at[0] <= 0.150
+
+
+def test_a_reply_of_garbage_is_never_believed(bench: Bench) -> None:
+    """Over many random replies to heartbeats: it is told and dark, or the reply did not matter."""
+    told = 0
+    for _ in range(60):
+        lasers = bench.armed()
+        lasers.set_power("green", 0.5)
+        bench.board.bus.faults.arm("garbage", count=None)
+        try:
+            for _ in range(3):
+                bench.pass_time(0.025)
+                lasers.heartbeat()
+        except DeviceError:
+            told += 1
+            assert bench.light_uw == 0
+        bench.board.bus.faults.clear()
+        lasers.close()
+        bench.board.power_cycle()
+    assert told >= 59, "one in 256 passes the packet error code"
+
+
+def test_the_budget_is_kept_across_channels_and_by_prediction(bench: Bench) -> None:
+    bench.board.controller.built_for = ((40000, 40000, 9000),) * 3
+    for diode in bench.board.diodes:
+        diode.photodiode_v_per_uw = 1 / 300
+    bench.ready()
+    bright = tuple(replace(c, threshold_ma=d.threshold_ma, slope_uw_per_ma=20.0, full_power_uw=300.0)
+                   for c, d in zip(VIRTUAL_CHANNELS[:2], bench.board.diodes, strict=False))  # fmt: skip
+    for diode in bench.board.diodes:
+        diode.slope_uw_per_ma = 20.0
+    lasers = Lasers(bench.bus, bright, lambda: bench.now, bench.pass_time)
+    lasers.arm()
+    lasers.set_power("red", 1.0)
+    with pytest.raises(InputError, match="1.54 of the Class 1 limit"):
+        lasers.set_power("green", 1.0)
+    assert bench.light_uw == pytest.approx(300, rel=0.01), "a refusal changes nothing"
+    flat = spot_shares(np.ones((100, 100)), 1.0)
+    assert lasers.expect({"red": flat, "green": flat}) == 1
+    lasers.set_power("green", 1.0)
+    assert bench.light_uw == pytest.approx(600, rel=0.01)
+    factor = lasers.expect(None)  # the next pattern may be one spot
+    assert factor == pytest.approx(390 / 600)
+    assert bench.light_uw <= 390
+    assert lasers.status()["class1"]["worst"] == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    "shares", [{"red": (1.0,)}, {"red": (2.0,) * 13}, {"pink": (1.0,) * 13}, {"red": (0.0,) * 13}]
+)
+def test_a_prediction_that_is_none_is_refused(bench: Bench, shares: dict[str, tuple[float, ...]]) -> None:
+    with pytest.raises(InputError):
+        bench.armed().expect(shares)
+
+
+@pytest.mark.parametrize("fraction", [-0.1, 1.1, float("nan"), "1", True, None])
+def test_a_power_that_is_no_fraction_is_refused(bench: Bench, fraction: object) -> None:
+    lasers = bench.armed()
+    with pytest.raises(InputError, match="give 0 to 1"):
+        lasers.set_power("red", fraction)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="there is no laser 'pink'"):
+        lasers.set_power("pink", 0.5)
+
+
+def test_an_exception_and_a_close_end_dark_and_disarmed(bench: Bench) -> None:
+    with pytest.raises(ZeroDivisionError), bench.armed() as lasers:
+        lasers.set_power("green", 1.0)
+        assert bench.light_uw > 0
+        1 / 0  # noqa: B018
+    assert bench.light_uw == 0 and not bench.board.controller.armed
+    lasers.close()
+    with pytest.raises(DeviceError, match="closed"):
+        lasers.heartbeat()
+
+
+def test_an_interruption_between_the_steps_of_a_ramp_is_not_swallowed(bench: Bench) -> None:
+    lasers = bench.armed()
+    steps = 0
+
+    def interrupted(seconds: float) -> None:
+        nonlocal steps
+        steps += 1
+        bench.pass_time(seconds)
+        if steps == 5:
+            raise KeyboardInterrupt
+
+    lasers._wait = interrupted
+    with pytest.raises(KeyboardInterrupt), lasers:
+        lasers.set_power("green", 1.0)
+    assert bench.light_uw == 0
+
+
+def test_a_channel_must_be_possible() -> None:
+    for wrong in (
+        {"wavelength_nm": 800.0},
+        {"full_power_uw": 0.0},
+        {"full_power_uw": 900.0},
+        {"threshold_ma": -1.0},
+    ):
+        with pytest.raises(InputError, match="'red'"):
+            replace(RED, **wrong)
+    with pytest.raises(InputError, match="one to three"):
+        Lasers(smbus2.SMBus(), [])
+    with pytest.raises(InputError, match="names of their own"):
+        Lasers(smbus2.SMBus(), [RED, RED])
+
+
+def test_a_bus_that_is_not_there_is_said() -> None:
+    with pytest.raises(InputError, match="/dev/i2c-99 cannot be opened"):
+        open_lasers("/dev/i2c-99", VIRTUAL_CHANNELS)
+
+
+def test_another_part_at_an_address_is_said(bench: Bench) -> None:
+    bench.board.thermometer._registers[0xF] = 0x0190
+    with pytest.raises(DeviceError, match="TMP117"):
+        bench.open()
+    del bench.board.bus.parts[0x60]
+    with pytest.raises(DeviceError, match="does not answer"):
+        bench.open()
+
+
+def test_two_boards_are_two_boards(bench: Bench) -> None:
+    other = Bench()
+    first, second = bench.armed(), other.armed()
+    first.set_power("red", 1.0)
+    assert bench.light_uw > 0 and other.light_uw == 0
+    second.close()
+    first.heartbeat()
+    other.close()
+    assert attach(bench.board.bus) != bench.node
+
+
+def test_a_new_host_goes_on_where_the_last_token_was(bench: Bench) -> None:
+    first = bench.armed()
+    first._token = 0
+    bench.pass_time(0.02)
+    first._beat()  # token 1, as a new host's first one would be
+    first._closed = True  # the process is gone without a word
+    bench.pass_time(0.2)
+    second = bench.open()
+    second.clear()
+    second.arm()
