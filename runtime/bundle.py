@@ -69,10 +69,12 @@ def write_bundle(
     *,
     networks: Mapping[str, bytes] | None = None,
     replace: bool = False,
+    keep: str | os.PathLike[str] | None = None,
 ) -> None:
     """Write a bundle, whole or not at all. A folder that is not empty is refused unless `replace`.
 
     networks : further files of NETWORKS, by name
+    keep : where the bundle that is replaced goes; none: it is removed
     """
     if not arrays:
         raise InputError(f"{folder}: a bundle without arrays says nothing of the light path")
@@ -96,7 +98,7 @@ def write_bundle(
     }
     manifest["sha256"] = _manifest_hash(manifest)
     contents[MANIFEST] = json.dumps(manifest, indent=2, ensure_ascii=False, allow_nan=False).encode() + b"\n"
-    with whole_folder(folder, replace=replace) as temporary:
+    with whole_folder(folder, replace=replace, keep=keep) as temporary:
         for name, data in contents.items():
             (temporary / name).write_bytes(data)
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from firmware_iface.errors import InputError, nearest
+from runtime.calibration import command as calibration
 
 PROGRAM = "hololoop-runtime"
 DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
@@ -141,6 +142,15 @@ def _parser() -> ArgumentParser:
     )
     solve.add_argument("--fit", action="store_true", help="crop and resize pictures of another size")
     solve.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
+    refit = parts.add_parser(
+        "calibrate",
+        help="find what has drifted and put it into the bundle",
+        description=calibration.ABOUT,
+        formatter_class=RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    calibration.arguments(refit)
+    refit.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
     return parser
 
 
@@ -220,7 +230,7 @@ def show_solve(result: dict[str, Any]) -> None:
         )
 
 
-COMMANDS = {"solve": (run_solve, show_solve)}
+COMMANDS = {"solve": (run_solve, show_solve), "calibrate": (calibration.run, calibration.show)}
 
 
 def jobs(targets: Sequence[Path], channels: Sequence[str], out: Path) -> list[Job]:

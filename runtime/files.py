@@ -7,6 +7,7 @@ and it can be deleted.
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import os
 import secrets
@@ -56,12 +57,14 @@ def whole_file(path: str | os.PathLike[str], mode: str = "wb") -> Iterator[IO[An
 
 
 @contextmanager
-def whole_folder(path: str | os.PathLike[str], *, replace: bool = False) -> Iterator[Path]:
+def whole_folder(
+    path: str | os.PathLike[str], *, replace: bool = False, keep: str | os.PathLike[str] | None = None
+) -> Iterator[Path]:
     """Give an empty temporary folder to fill; it is renamed to `path` when the block ends without error.
 
-    A folder that is there and not empty is refused, or with `replace` swapped for the new one and then
-    removed. The swap is two renames: a reader may find no folder for an instant, but never a mixture, and
-    if the second rename fails the old folder is put back.
+    A folder that is there and not empty is refused, or with `replace` exchanged for the new one and then removed, or
+    moved to `keep` (what was there goes). Linux exchanges two names at once; elsewhere it takes two renames, so that
+    a reader may find no folder for an instant, but never a mixture.
     """
     target = _resolved(path)
     _refuse_taken(path, target, replace)
@@ -79,7 +82,7 @@ def whole_folder(path: str | os.PathLike[str], *, replace: bool = False) -> Iter
         _refuse_taken(path, target, replace)
         try:
             if replace and target.exists():
-                _swap(temporary, target)
+                _swap(temporary, target, None if keep is None else _resolved(keep))
             else:
                 os.rename(temporary, target)
         except OSError as error:
@@ -92,15 +95,32 @@ def whole_folder(path: str | os.PathLike[str], *, replace: bool = False) -> Iter
     _sync(target.parent)
 
 
-def _swap(new: Path, target: Path) -> None:
-    old = _neighbour(target, "old")
-    os.rename(target, old)
-    try:
-        os.rename(new, target)
-    except BaseException:
-        os.rename(old, target)
-        raise
+def _swap(new: Path, target: Path, keep: Path | None) -> None:
+    """Put a new folder in place of an old one, which is removed or moved to `keep`."""
+    if _exchange(new, target):
+        old = new
+    else:
+        old = _neighbour(target, "old")
+        os.rename(target, old)
+        try:
+            os.rename(new, target)
+        except BaseException:
+            os.rename(old, target)
+            raise
+    if keep is not None and not (keep.exists() and _exchange(old, keep)):
+        shutil.rmtree(keep, ignore_errors=True)
+        os.rename(old, keep)
     shutil.rmtree(old, ignore_errors=True)
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Let two names change places at once; False where the system or the file system cannot."""
+    try:
+        rename = ctypes.CDLL(None, use_errno=True).renameat2
+    except (OSError, AttributeError):
+        return False
+    here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE of <linux/fs.h>
+    return bool(rename(here, os.fsencode(one), here, os.fsencode(other), exchange) == 0)
 
 
 def _resolved(path: str | os.PathLike[str]) -> Path:

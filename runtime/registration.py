@@ -68,10 +68,12 @@ def dot_pattern(shape: tuple[int, int], spacing: float) -> np.ndarray:
     return target
 
 
-def find_homography(image: np.ndarray, dots: Dots) -> np.ndarray:
+def find_homography(image: np.ndarray, dots: Dots, believed: np.ndarray | None = None) -> np.ndarray:
     """The homography, float64 [3, 3], from a camera picture [h, w] of a dot pattern.
 
     image : counts or any scale, uneven background allowed; mirrored and turned pictures are found as well
+    believed : a homography that is right to a quarter of the dots' spacing, for pictures in which the marker is not
+        told from other dots
     Raises InputError if too few dots are seen, or they are not the expected grid.
     """
     points, light = _spots(image)
@@ -89,6 +91,8 @@ def find_homography(image: np.ndarray, dots: Dots) -> np.ndarray:
                 best = fitted
         if best is not None and best[0] > len(dots.xy) * 0.9:
             break
+    if best is None and believed is not None:
+        best = _refined(points, believed, dots)
     if best is None or best[0] < FEWEST * len(dots.xy):
         raise InputError(
             f"{len(points)} dots are seen but they do not fit the expected {dots.columns} x "
@@ -254,7 +258,10 @@ def _fitted_map(
     Least squares of the equations that are linear in its eight (six) numbers, weighted again and again so that points
     far beyond `tolerance` (panel pixels) lose their say.
     """
-    middle, size = camera.mean(0), max(float(camera.std()), 1e-9)  # near 0 and of order one, or it is ill-posed
+    middle, size = (
+        camera.mean(0),
+        max(float(camera.std()), 1e-9),
+    )  # near 0 and of order one, or it is ill-posed
     u, v = ((camera - middle) / size).T
     one, none = np.ones_like(u), np.zeros_like(u)
     rows = [

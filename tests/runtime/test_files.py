@@ -3,11 +3,15 @@ from __future__ import annotations
 import errno
 import os
 import stat
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
 
 from firmware_iface.errors import InputError
+from runtime import files
 from runtime.files import whole_file, whole_folder
 
 
@@ -135,8 +139,49 @@ def test_a_swap_that_fails_half_way_is_undone(tmp_path: Path, monkeypatch: pytes
             raise OSError(errno.EIO, "the disk is gone")
         rename(source, target)
 
+    monkeypatch.setattr(files, "_exchange", lambda one, other: False)  # as on a system that cannot
     monkeypatch.setattr(os, "rename", fails_for_the_new)
     with pytest.raises(InputError, match="the disk is gone"), whole_folder(path, replace=True) as folder:
         (folder / "new").touch()
     assert names(path) == ["old"]
     assert names(tmp_path) == ["set"]
+
+
+@pytest.mark.parametrize("at_once", [True, False])
+def test_what_is_replaced_can_be_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at_once: bool
+) -> None:
+    """The last one only, whether the system exchanges names at once or not."""
+    if not at_once:
+        monkeypatch.setattr(files, "_exchange", lambda one, other: False)
+    path, kept = tmp_path / "set", tmp_path / "set.previous"
+    for name in ("first", "second", "third"):
+        with whole_folder(path, replace=True, keep=kept) as folder:
+            (folder / name).touch()
+    assert names(path) == ["third"] and names(kept) == ["second"]
+    assert names(tmp_path) == ["set", "set.previous"]
+
+
+def test_a_killed_replacement_leaves_a_whole_folder(tmp_path: Path) -> None:
+    """kill -9 at any moment: both files are of one generation, and the folder is never missing."""
+    script = (
+        "import sys\n"
+        "from runtime.files import whole_folder\n"
+        "for n in range(100000):\n"
+        "    with whole_folder(sys.argv[1], replace=True, keep=sys.argv[1] + '.previous') as folder:\n"
+        "        for name in 'ab':\n"
+        "            (folder / name).write_text(str(n))\n"
+        "    print(n, flush=True)\n"
+    )
+    path = tmp_path / "set"
+    for wait in (0.0, 0.003, 0.011, 0.023):
+        with subprocess.Popen(
+            [sys.executable, "-c", script, str(path)], stdout=subprocess.PIPE, cwd=Path(files.__file__).parents[1]
+        ) as writer:
+            assert writer.stdout is not None
+            for _ in range(3):
+                writer.stdout.readline()
+            time.sleep(wait)
+            writer.kill()
+        assert (path / "a").read_text() == (path / "b").read_text()
+        assert names(tmp_path / "set.previous") == ["a", "b"]

@@ -1,0 +1,129 @@
+"""`hololoop-runtime calibrate`."""
+
+from __future__ import annotations
+
+import sys
+from argparse import ArgumentParser, Namespace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+ABOUT = """Find out with the headset's own camera what has drifted, and put it into the bundle's light path.
+
+Some thirty patterns a colour are shown and captured: dots (where the camera looks), a sweep of gratings (the panel's
+phase response), ten patterns of random grains (wavefront, beam and distance, refit together) and three that the fit
+does not see. The light path is replaced only if it predicts those three better, surely and by enough to matter. The
+folder holds the old bundle or the new one at every moment; the old one is kept as BUNDLE.previous.
+
+verdict: recalibrated (replaced), unchanged (it was as good as the camera can tell), not_explained (it is wrong, and
+refitting what drifts does not mend it: capture and diagnose on the workstation).
+
+examples:
+  hololoop-runtime calibrate bundle/ --headset virtual:panel_wavefront --report calibration.html
+  hololoop-runtime calibrate bundle/ --headset my_bench.toml --check
+  hololoop-runtime calibrate bundle/ --restore"""
+
+
+def arguments(parser: ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("bundle", metavar="BUNDLE", type=Path, help="the bundle that the headset uses")
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--headset", metavar="SPEC", help="virtual:NAME, or the TOML file of a virtual bench")
+    what.add_argument("--restore", action="store_true", help="put back the bundle that was last replaced")
+    parser.add_argument(
+        "--plane", metavar="MM", type=float, help="plane that the camera sees (default: the bundle's)"
+    )
+    parser.add_argument("--check", action="store_true", help="measure and report, but replace nothing")
+    parser.add_argument("--report", metavar="FILE.html", type=Path, help="write a report with pictures")
+    parser.add_argument("--seed", metavar="N", type=int, default=0, help="which random patterns (default 0)")
+
+
+def run(args: Namespace) -> dict[str, Any]:
+    """Calibrate, report, and replace the bundle where that is right; returns what `--json` prints."""
+    from firmware_iface.virtual import open_headset
+    from runtime.bundle import read_bundle
+    from runtime.calibration.numbers import numbers
+    from runtime.calibration.replacing import previous, replace_bundle, restore_bundle
+    from runtime.calibration.report import write_report
+    from runtime.calibration.run import calibrate
+
+    if args.restore:
+        restore_bundle(args.bundle)
+        return {"verdict": "restored", "bundle": str(args.bundle), "previous": str(previous(args.bundle))}
+    bundle = read_bundle(args.bundle)
+    with _progress() as say:
+        found = calibrate(open_headset(args.headset, args.seed), bundle, args.plane, args.seed, say)
+    replaced = found.verdict == "recalibrated" and not args.check
+    result: dict[str, Any] = {
+        "bundle": str(args.bundle),
+        "replaced": replaced,
+        "previous": None,
+        "report": None,
+    }
+    if replaced:
+        result["previous"] = str(replace_bundle(args.bundle, bundle, found))
+    if args.report:
+        write_report(args.report, found, replaced)
+        result["report"] = str(args.report)
+    return {**numbers(found), **result, "sentence": sentence_of(numbers(found), replaced)}
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[float, str], None]]:
+    """A callback (share done, what is done now); a moving bar on stderr if that is a terminal."""
+    if not sys.stderr.isatty():
+        yield lambda done, what: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (BarColumn(30), TimeRemainingColumn(), TextColumn("{task.description}", markup=False))
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("calibrating", total=1.0)
+        yield lambda done, what: bar.update(task, completed=done, description=what)
+
+
+def show(result: dict[str, Any]) -> None:
+    """The verdict in words, and what drifted."""
+    if result["verdict"] == "restored":
+        print(f"{result['bundle']} is again what it was; the calibrated one is now {result['previous']}.")
+        return
+    print(result["sentence"])
+    wavefront, distance = result["wavefront"], result["distance_mm"]
+    print(
+        f"\nwavefront   {wavefront['rms_nm']:.1f} nm rms, {wavefront['peak_to_valley_nm']:.0f} nm peak to valley "
+        f"(± {wavefront['error_rms_nm']:.2f} nm rms from noise)\n"
+        f"distance    {distance['value']:+.4f} ± {distance['error']:.4f} mm"
+    )
+    for name, c in result["channels"].items():
+        print(
+            f"{name:<11} response up to {c['response_change_rad']:.3f} rad from what was believed; beam "
+            f"{100 * c['illumination_rms']:.1f} % rms; power steady to {100 * c['power_spread']:.2f} %; picture "
+            f"{c['picture_psnr_db']['before']:.1f} -> {c['picture_psnr_db']['after']:.1f} dB"
+        )
+    if result["replaced"]:
+        print(
+            f"\nThe old light path is {result['previous']}; to put it back: calibrate {result['bundle']} --restore"
+        )
+
+
+def sentence_of(found: dict[str, Any], replaced: bool) -> str:
+    """The verdict in plain words."""
+    before, after = found["heldout"]["before"]["excess"], found["heldout"]["after"]["excess"]
+    if found["verdict"] == "unchanged":
+        return (
+            f"Nothing has drifted that the camera can see: the excess on held-out patterns is {before:.2g}."
+        )
+    if found["verdict"] == "not_explained":
+        return (
+            f"The light path does not fit (excess {before:.2g} on held-out patterns) and refitting what drifts does "
+            f"not mend it ({after:.2g}): take captures and run hololoop-trainer diagnose; nothing was replaced."
+        )
+    done = "it was replaced" if replaced else "nothing was replaced, as asked"
+    more = (
+        ""
+        if found["complete"]
+        else ("; more is wrong than drifts here: take captures and run hololoop-trainer diagnose")
+    )
+    return f"The light path has drifted: the refit takes the excess from {before:.2g} to {after:.2g}; {done}{more}."

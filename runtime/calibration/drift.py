@@ -1,0 +1,83 @@
+"""What of a light path drifts on a headset, as low-order corrections to the baked arrays of a bundle.
+
+The panel's wavefront and the beam multiply the source field and the leak, distance multiplies the transfer
+functions, and the response replaces the table. A tilt of the wavefront is left out: at one plane it is the
+same as a camera that has moved sideways, and no eye sees it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from runtime.legendre import edge_to_edge, legendre_maps, legendre_surface
+from runtime.lightpath import LightPath, band_frequencies
+
+LOWEST_WAVEFRONT, LOWEST_AMPLITUDE = 2, 1  # Legendre orders: without piston and tilt; without power
+
+
+@dataclass(frozen=True)
+class Drift:
+    """How a headset's light differs from what its bundle says.
+
+    wavefront_nm: Legendre terms of a path difference over the panel, from order 2 on, one for all colours.
+    log_amplitude: of each colour, Legendre terms from order 1 on of the logarithm of the beam's amplitude.
+    distance_mm: how much farther the image plane is. response: of each colour that has a new one, the phase
+    (rad) of each gray level.
+    """
+
+    wavefront_nm: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    log_amplitude: Mapping[str, np.ndarray] = field(default_factory=dict)
+    distance_mm: float = 0.0
+    response: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def wavefront(self, shape: tuple[int, int]) -> np.ndarray:
+        """The path difference over the panel, nm, float64 [H, W]."""
+        return _surface(self.wavefront_nm, shape, LOWEST_WAVEFRONT)
+
+    def amplitude(self, channel: str, shape: tuple[int, int]) -> np.ndarray:
+        """The factor on a colour's amplitude over the panel, float64 [H, W]."""
+        return np.exp(_surface(self.log_amplitude.get(channel, np.zeros(0)), shape, LOWEST_AMPLITUDE))
+
+
+def drifted(path: LightPath, channel: str, wavelength_nm: float, drift: Drift) -> LightPath:
+    """A colour's light path with a drift put in, in the path's own precision."""
+    shape, complex_type = path.grid.shape, path.source.dtype
+    turn = np.exp(2j * math.pi / wavelength_nm * drift.wavefront(shape))
+    factor = (drift.amplitude(channel, shape) * turn).astype(complex_type)
+    step = np.exp(1j * drift.distance_mm * axial_phase(path, wavelength_nm))
+    response = drift.response.get(channel, path.response)
+    return replace(
+        path,
+        source=path.source * factor,
+        leak=None if path.leak is None else path.leak * factor,
+        transfers=path.transfers * step.astype(complex_type),
+        response=np.asarray(response, path.response.dtype),
+    )
+
+
+def axial_phase(path: LightPath, wavelength_nm: float) -> np.ndarray:
+    """Phase (rad) that each frequency of the band gains a millimetre, against the axis: float64 [n, m]."""
+    wavelength = wavelength_nm * 1e-9
+    fy, fx = band_frequencies(path.grid, np.zeros((), np.float64))
+    sine2 = np.minimum((wavelength * fy[:, None]) ** 2 + (wavelength * fx[None, :]) ** 2, 1)
+    return -2e-3 * math.pi / wavelength * sine2 / (1 + np.sqrt(1 - sine2))
+
+
+def wavefront_maps(shape: tuple[int, int], order: int) -> np.ndarray:
+    """The maps that `Drift.wavefront_nm` has a term for, up to an order: float64 [count, H, W]."""
+    return legendre_maps(*edge_to_edge(shape), order, LOWEST_WAVEFRONT)
+
+
+def amplitude_maps(shape: tuple[int, int], order: int) -> np.ndarray:
+    """The maps that `Drift.log_amplitude` has a term for, up to an order: float64 [count, H, W]."""
+    return legendre_maps(*edge_to_edge(shape), order, LOWEST_AMPLITUDE)
+
+
+def _surface(terms: np.ndarray, shape: tuple[int, int], lowest: int) -> np.ndarray:
+    if not len(terms):
+        return np.zeros(shape)
+    return legendre_surface(np.asarray(terms, np.float64), *edge_to_edge(shape), lowest)

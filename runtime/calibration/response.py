@@ -1,0 +1,143 @@
+"""The panel's phase response from a sweep of binary gratings: gray 0 on one half of the lines, gray g on the other.
+
+The field is then a sum of two, one of them turned by the phase d between the two grays, so every camera pixel sees
+A + B cos d + C sin d. A, B and C follow from the light path at three trial phases; d and its error follow by linear
+least squares over all pixels, and which of several turns it is from its neighbours in the sweep. In the first
+diffraction order, where a power meter would stand, A = 1/2, B = -1/2 and C = 0: `phase_of_power` is for that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.signal import find_peaks
+
+from firmware_iface.errors import InputError
+from runtime.calibration.fit import Base, Estimate, Shot, predicted
+from runtime.calibration.patterns import grating
+from runtime.calibration.view import Sampler
+from runtime.legendre import legendre_curve
+
+SWEEP = (*range(16, 256, 16), 255)  # gray levels
+PERIODS = (4, 6, 8, 12, 16, 24)  # pixels
+TERMS = 6  # of the curve's deviation from what was believed
+TRIALS = (0.0, 2 * math.pi / 3, -2 * math.pi / 3)
+PROMINENCE = 0.25  # of the range of power: what turns less than this is noise
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A measured sweep. gray: int [n]. phase: rad from gray 0, float [n]. error: standard errors, float [n].
+    visibility: of the gratings against the prediction, [n]; 1 where the light path is right.
+    """
+
+    gray: np.ndarray
+    phase: np.ndarray
+    error: np.ndarray
+    visibility: np.ndarray
+
+
+def best_period(base: Base, channel: str, estimate: Estimate, sample: Sampler) -> int:
+    """The grating's period, pixels, whose phase is seen best in this plane: gratings image themselves at
+    some distances, and there a phase shows nothing.
+    """
+
+    def seen(period: int) -> float:
+        _, cosine, sine = _harmonics(base, _blank(channel, base, period, 128), estimate, sample)
+        return float(np.mean(cosine**2 + sine**2))
+
+    return max(PERIODS, key=seen)
+
+
+def _blank(channel: str, base: Base, period: int, gray: int) -> Shot:
+    nothing = np.zeros((1, 1), np.float32)
+    return Shot(channel, grating(base.path.grid.shape, period, gray), nothing, nothing)
+
+
+def measured_sweep(base: Base, shots: Sequence[Shot], estimate: Estimate, sample: Sampler) -> Sweep:
+    """The phase of each shot's brighter gray against gray 0, given all else of an estimate."""
+    believed = estimate.drift.response.get(shots[0].channel, base.path.response)
+    found = []
+    for shot in shots:
+        gray = int(shot.gray.max())
+        start = float(believed[gray] - believed[0])
+        model = np.stack([m.ravel() for m in _harmonics(base, shot, estimate, sample)], 1)
+        root = np.sqrt(shot.weight.ravel())
+        weighted = (model * root[:, None]).astype(np.float64)
+        normal = weighted.T @ weighted
+        gain, cosine, sine = np.linalg.solve(normal, weighted.T @ (root * shot.signal.ravel()))
+        size2 = max(float(cosine**2 + sine**2), 1e-30)
+        across = np.array([0.0, -sine, cosine]) / size2
+        error = math.sqrt(float(across @ np.linalg.solve(normal, across)))
+        found.append((gray, start + math.atan2(sine, cosine), error, math.sqrt(size2) / max(gain, 1e-30)))
+    grays, phases, errors, visibility = (np.array(v) for v in zip(*sorted(found), strict=True))
+    # one turn more or less than was believed is told by the neighbours: the sweep's steps are far below a turn
+    unwrapped = np.unwrap(np.concatenate([[0.0], phases]))[1:]
+    return Sweep(grays, unwrapped, errors, visibility)
+
+
+def _harmonics(base: Base, shot: Shot, estimate: Estimate, sample: Sampler) -> tuple[np.ndarray, ...]:
+    """A, B and C [h, w] of what the camera sees of a grating, for a phase d beyond what is believed."""
+    gray = int(shot.gray.max())
+    believed = np.asarray(estimate.drift.response.get(shot.channel, base.path.response), float)
+    seen = []
+    for trial in TRIALS:
+        response = believed.copy()
+        response[gray] += trial
+        drift = replace(estimate.drift, response={**estimate.drift.response, shot.channel: response})
+        seen.append(predicted(base, shot, replace(estimate, drift=drift), sample))
+    mean = (seen[0] + seen[1] + seen[2]) / 3
+    return mean, (2 * seen[0] - seen[1] - seen[2]) / 3, (seen[1] - seen[2]) / math.sqrt(3)
+
+
+def fitted_response(believed: np.ndarray, sweep: Sweep) -> np.ndarray:
+    """A response [levels] (rad) that follows a sweep: what was believed and a smooth deviation, 0 at gray 0.
+
+    It is monotone where what was believed was.
+    """
+    levels = len(believed)
+    t = np.arange(levels) / (levels - 1)
+    shapes = t * legendre_curve(2 * t - 1, min(TERMS, len(sweep.gray)))
+    wanted = sweep.phase - (believed[sweep.gray] - believed[0])
+    weight = 1 / np.hypot(sweep.error, 1e-3)  # no panel is smoother than a milliradian
+    terms = np.linalg.lstsq((shapes[:, sweep.gray] * weight).T, wanted * weight, rcond=None)[0]
+    response = believed + terms @ shapes
+    steps = np.diff(believed)
+    if (steps >= 0).all():
+        return np.maximum.accumulate(response)
+    return np.minimum.accumulate(response) if (steps <= 0).all() else response
+
+
+def phase_of_power(power: np.ndarray) -> np.ndarray:
+    """Phase (rad) of each gray level from the first-order power [levels] of gratings of gray 0 and that gray.
+
+    power goes as (1 - cos phase) / 2 between its extremes, which may differ from turn to turn, as on a real panel.
+    Phase starts at 0 and only grows; beyond the last extreme the last range of power holds on. Raises InputError
+    where power never turns, so that there is no half wave to measure by.
+    """
+    power = np.asarray(power, float)
+    smooth = gaussian_filter1d(power, 1.0)
+    least = PROMINENCE * float(np.ptp(smooth))
+    turns = np.sort(np.concatenate([find_peaks(s * smooth, prominence=least)[0] for s in (1, -1)]))
+    if len(turns) == 0:
+        raise InputError(
+            "the first order's power has no maximum over the gray levels, so the panel's phase stays below half a "
+            "wave: give it more voltage range, or sweep at a shorter wavelength"
+        )
+    edges = [0, *turns.tolist(), len(power) - 1]
+    phase = np.zeros(len(power))
+    low, high = smooth[0], smooth[turns[0]]
+    for half, (first, last) in enumerate(pairwise(edges)):
+        if half < len(turns):
+            low, high = smooth[first], smooth[last]
+        else:  # an unfinished half wave: it would reach what the one before came from
+            low, high = smooth[first], smooth[edges[half - 1]]
+        inside = slice(first, last + 1)
+        share = np.clip((power[inside] - low) / (high - low), 0, 1)
+        phase[inside] = math.pi * half + np.arccos(1 - 2 * share)
+    return np.maximum.accumulate(phase)

@@ -1,0 +1,46 @@
+"""A headset whose light has drifted from its bundle: a perfect bundle, and a bench with hidden defects."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from firmware_iface.virtual import BenchDescription, VirtualHeadset
+from firmware_iface.virtual.defects import make_defect
+from runtime.bundle import write_bundle
+from runtime.calibrated import pack_light_paths
+from runtime.calibration.fit import Base
+from runtime.legendre import edge_to_edge
+from tests.runtime.benches import ideal_path
+
+SHAPE, DISTANCE_MM, WAVELENGTH_NM = (96, 128), 8.0, 520.0
+
+
+def drifted_bench(*defects: str, shape: tuple[int, int] = SHAPE, **parameters: float) -> BenchDescription:
+    """A bench with defects of their default sizes; parameters go to the first."""
+    made = [make_defect(kind, **(parameters if n == 0 else {})) for n, kind in enumerate(defects)]
+    return BenchDescription(defects=tuple(made)).resized(*shape, DISTANCE_MM)
+
+
+def headset(bench: BenchDescription, seed: int = 1) -> VirtualHeadset:
+    return VirtualHeadset(bench, seed)
+
+
+def base(shape: tuple[int, int] = SHAPE) -> Base:
+    """The light path that the bundle believes in: nothing wrong."""
+    return Base(ideal_path(shape, DISTANCE_MM * 1e-3, dtype=np.float32), WAVELENGTH_NM)
+
+
+def ideal_bundle(folder: Path, shape: tuple[int, int] = SHAPE) -> Path:
+    records, arrays = pack_light_paths([("green", DISTANCE_MM, WAVELENGTH_NM, base(shape).path)])
+    write_bundle(folder, arrays, {"paths": records, "distance_mm": DISTANCE_MM}, {"bench": "ideal"})
+    return folder
+
+
+def without_tilt(surface: np.ndarray) -> np.ndarray:
+    """A map [H, W] less its best plane, which at one plane cannot be told from a camera that has moved."""
+    y, x = edge_to_edge(surface.shape)
+    plane = np.stack([np.ones(surface.size), y.ravel(), x.ravel()], 1)
+    flat = surface.ravel()
+    return (flat - plane @ np.linalg.lstsq(plane, flat, rcond=None)[0]).reshape(surface.shape)

@@ -1,0 +1,249 @@
+"""The parts of a calibration: drift, the camera's view, derivatives, the response, verdicts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_iface.errors import InputError
+from firmware_iface.virtual.panel import Drive
+from runtime.calibration.check import Heldout, complete, verdict
+from runtime.calibration.drift import Drift, drifted, wavefront_maps
+from runtime.calibration.fit import Base, Estimate, Shot, _columns, _Layout, _stepped_views, predicted
+from runtime.calibration.patterns import grains, grating
+from runtime.calibration.response import (
+    SWEEP,
+    Sweep,
+    best_period,
+    fitted_response,
+    measured_sweep,
+    phase_of_power,
+)
+from runtime.calibration.taking import Taker
+from runtime.calibration.view import View, sampler
+from runtime.lightpath import irradiance, panel_phase, pixel_irradiance
+from tests.runtime.benches import PITCH, ideal_path, random_path
+from tests.runtime.calibration.drifting import WAVELENGTH_NM, base, drifted_bench, headset
+
+SMALL = (40, 52)
+
+
+def test_a_distance_drift_is_a_light_path_to_another_plane() -> None:
+    near, far = (ideal_path(SMALL, z) for z in (8e-3, 8.3e-3))
+    phase = np.random.default_rng(0).uniform(0, 6, SMALL)
+    moved = drifted(near, "green", WAVELENGTH_NM, Drift(distance_mm=0.3))
+    inside = (slice(8, -8), slice(8, -8))  # the far grid is padded a little more
+    seen, wanted = (pixel_irradiance(p, irradiance(p, phase))[inside] for p in (moved, far))
+    assert np.corrcoef(seen.ravel(), wanted.ravel())[0, 1] > 0.9999
+    before = pixel_irradiance(near, irradiance(near, phase))[inside]
+    assert np.corrcoef(before.ravel(), wanted.ravel())[0, 1] < 0.9
+
+
+def test_a_wavefront_turns_source_and_leak_alike_and_in_nanometres() -> None:
+    path = random_path(SMALL)
+    terms = np.zeros(len(wavefront_maps(SMALL, 3)))
+    terms[1] = 65.0
+    moved = drifted(path, "green", WAVELENGTH_NM, Drift(wavefront_nm=terms))
+    turn = np.exp(2j * np.pi * 65.0 / WAVELENGTH_NM * wavefront_maps(SMALL, 3)[1])
+    np.testing.assert_allclose(moved.source, path.source * turn, rtol=1e-12)
+    np.testing.assert_allclose(moved.leak, path.leak * turn, rtol=1e-12)
+    np.testing.assert_array_equal(moved.transfers, path.transfers)
+
+
+def test_no_drift_changes_nothing() -> None:
+    path = random_path(SMALL)
+    same = drifted(path, "green", WAVELENGTH_NM, Drift())
+    for name in ("source", "leak", "transfers", "response"):
+        np.testing.assert_allclose(getattr(same, name), getattr(path, name), rtol=1e-14)
+
+
+def test_a_registered_view_sees_what_the_panels_pixels_integrate() -> None:
+    path = ideal_path(SMALL, 8e-3)
+    image = irradiance(path, np.random.default_rng(1).uniform(0, 6, SMALL))
+    wanted = pixel_irradiance(path, image)
+    np.testing.assert_allclose(sampler(View(SMALL), path.grid)(image), wanted, atol=2e-5 * wanted.max())
+
+
+@pytest.mark.parametrize("finer", [1, 2])
+def test_a_moved_view_sees_a_wave_where_it_looks(finer: int) -> None:
+    """A sinusoid is integrated, blurred and read at positions that are known in closed form."""
+    path = ideal_path(SMALL, 8e-3)
+    grid = path.grid
+    fy, fx = (
+        6 / (grid.image_shape[0] / 2),
+        -9 / (grid.image_shape[1] / 2),
+    )  # cycles a panel pixel, whole periods
+    y, x = (np.arange(n) / 2 - grid.margin for n in grid.image_shape)
+    image = 2 + np.cos(2 * np.pi * (fy * y[:, None] + fx * x[None, :]))
+    view = View((33, 41), (1.2, 0.03, -2, -0.03, 1.1, 3, 0, 0, 1), 0.3, -0.7, 8.0, 0.1, 0.2)
+    rows, columns = view.positions(SMALL)
+    down, right = rows[17, 20] - rows[16, 20], rows[16, 21] - rows[16, 20]
+    across = (columns[17, 20] - columns[16, 20], columns[16, 21] - columns[16, 20])
+    area = np.sinc(fy * down + fx * across[0]) * np.sinc(fy * right + fx * across[1])
+    blur = np.exp(-2 * np.pi**2 * (0.1 * fy**2 + 0.2 * fx**2))
+    wanted = 2 + area * blur * np.cos(2 * np.pi * (fy * rows + fx * columns))
+    np.testing.assert_allclose(sampler(view, grid, finer)(image), wanted, atol=2e-3 if finer == 1 else 2e-4)
+
+
+def test_a_view_is_what_it_was_after_a_bundle() -> None:
+    view = View((3, 4), shift_x_px=0.5, sensitivity=(0.1, 0, 0, 0, 0.2))
+    assert View.from_json(view.as_json()) == view
+
+
+def test_derivatives_are_what_differences_say() -> None:
+    """Every column of the fit against a central difference of the prediction, with modes, leak and crosstalk."""
+    full = random_path(SMALL)
+    one = Base(full, WAVELENGTH_NM)
+    rng = np.random.default_rng(2)
+    gray = rng.integers(0, 256, SMALL, dtype=np.uint8)
+    shot = Shot("green", gray, np.zeros(SMALL, np.float32), np.ones(SMALL, np.float32))
+    layout = _Layout(("green",), 3, 2)
+    start = layout.moved(
+        layout.nothing(Estimate(Drift(), View(SMALL))), 0.02 * rng.normal(size=int(layout.edges[-1]))
+    )
+    bases = {"green": one}
+    columns = dict(
+        _columns(
+            one, shot, start, layout, sampler(start.view, full.grid, 1), _stepped_views(bases, start.view)
+        )
+    )
+    assert sorted(columns) == list(range(int(layout.edges[-1])))
+    for place, column in columns.items():
+        step = np.zeros(int(layout.edges[-1]))
+        step[place] = 1e-2 if place < layout.edges[1] else 1e-3
+        above, below = (
+            predicted(
+                one,
+                shot,
+                layout.moved(start, s * step),
+                sampler(layout.moved(start, s * step).view, full.grid),
+            )
+            for s in (1, -1)
+        )
+        wanted = (above - below).astype(float) / (2 * step[place])
+        assert np.linalg.norm(column - wanted) < 0.05 * np.linalg.norm(wanted), place
+
+
+def test_a_sweep_of_gratings_gives_a_hidden_response() -> None:
+    shape = (64, 80)
+    bench = drifted_bench("phase_response", shape=shape)
+    device, one, still = headset(bench), base(shape), Estimate(Drift(), View(shape))
+    taker = Taker(device, lambda what: None)
+    black, floor = taker.darkness()
+    taker.light("green")
+    taker.expose(grains(shape, 4, 0), black)
+    noise = taker.noise(grains(shape, 4, 0), black, floor)
+    sample = sampler(still.view, one.path.grid)
+    period = best_period(one, "green", still, sample)
+    shots = taker.shots("green", [grating(shape, period, g) for g in SWEEP], noise, "grating")
+    sweep = measured_sweep(one, shots, still, sample)
+    true = Drive(bench, WAVELENGTH_NM).magnitude(np.arange(256.0)[None])[0]
+    assert np.abs(true - one.path.response).max() > 0.5
+    assert np.abs(sweep.phase - true[sweep.gray]).max() < 0.03
+    assert sweep.visibility.min() > 0.98 and 0 < sweep.error.max() < 0.02
+    found = fitted_response(np.asarray(one.path.response, float), sweep)
+    assert np.abs(found - true).max() < 0.02 and (np.diff(found) >= 0).all()
+
+
+def test_the_cameras_noise_is_measured_without_its_data_sheet() -> None:
+    shape = (64, 80)
+    device = headset(drifted_bench(shape=shape))
+    camera = device.description.camera
+    taker = Taker(device, lambda what: None)
+    black, floor = taker.darkness()
+    taker.light("green")
+    exposure = taker.expose(grains(shape, 4, 0), black)
+    noise = taker.noise(grains(shape, 4, 0), black, floor)
+    counts = (2**camera.bit_depth - 1 - camera.black_level) / camera.full_well_e  # of an electron
+    assert noise.black == pytest.approx(camera.black_level, abs=0.2)
+    assert noise.slope == pytest.approx(counts, rel=0.1)
+    assert noise.floor == pytest.approx((camera.read_noise_e * counts) ** 2 + 1 / 12, rel=0.1)
+    top = taker.shot("green", grains(shape, 4, 0), noise, "").weight == 0
+    assert top.mean() < 0.005 and 1 < exposure < 100
+
+
+def test_power_of_gratings_gives_the_phase_that_made_it() -> None:
+    gray = np.arange(256)
+    true = 12.0 * (gray / 255) ** 1.4
+    envelope = 1 - 0.3 * gray / 255  # the contrast of a real panel falls with voltage
+    power = envelope * (1 - np.cos(true)) / 2 + 0.02
+    assert np.abs(phase_of_power(power) - true).max() < 0.3
+    assert np.abs(phase_of_power((1 - np.cos(true)) / 2) - true)[true < 4 * np.pi].max() < 0.15
+    with pytest.raises(InputError, match="half a wave"):
+        phase_of_power((1 - np.cos(0.8 * np.pi * gray / 255)) / 2)
+
+
+def test_a_real_panels_linear_table_is_straightened_by_its_own_corrected_one(shared: Path) -> None:
+    """Meadowlark 1920 x 1152, 532 nm: the measured phase, read at the corrected table's voltages, is a line.
+
+    The sweep has one point every 8 voltage steps; the corrected table was made by the panel's owner, from it.
+    """
+    folder = shared / "real" / "panel_response"
+    if not folder.is_dir():
+        pytest.skip("no measurements of a real panel here")
+    power = np.loadtxt(folder / "GlobalNormalizedMeasurements.csv", delimiter=",")[:, 1]
+    table = np.loadtxt(folder / "SN5721_WL532_Global.lut")[:, 1] / 8
+    gray = np.arange(256)
+    phase = np.interp(table, gray, phase_of_power(power))
+    slope, start = np.polyfit(gray, phase, 1)
+    assert slope == pytest.approx(2 * np.pi / 256, rel=0.02)
+    assert np.std(phase - start - slope * gray) < 0.07  # a 90th of a wave
+
+
+def test_a_real_panels_correction_is_seen_to_peak_too_early(shared: Path) -> None:
+    """After correction half a wave comes at gray 118 where 128 was meant, in noisy power."""
+    folder = shared / "real" / "panel_response"
+    if not folder.is_dir():
+        pytest.skip("no measurements of a real panel here")
+    power = np.loadtxt(folder / "Raw0.csv", delimiter=",")[:, 1]
+    gray = np.arange(256)
+    measured = Sweep(gray, phase_of_power(power), np.full(256, 0.1), np.ones(256))
+    found = fitted_response(2 * np.pi * gray / 256, measured)
+    assert np.interp(np.pi, found, gray) == pytest.approx(118, abs=5)
+    assert (np.diff(found) >= 0).all()
+
+
+def _heldout(excess: float, rng: np.random.Generator, count: int = 400) -> Heldout:
+    """A held-out error whose tiles scatter by a tenth about their mean."""
+    noise = 0.001
+    tiles = (excess + noise) * (1 + 0.1 * rng.normal(size=count)) / count
+    total = float(tiles.sum())
+    return Heldout(total**0.5, noise**0.5, total - noise, tiles, 1.0, ())
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said", "whole"),
+    [
+        (0.2, 1e-5, "recalibrated", True),
+        (0.2, 0.05, "recalibrated", False),  # better, and something else is wrong as well
+        (0.2, 0.2, "not_explained", False),
+        (0.2, 0.4, "not_explained", False),
+        (5e-5, 4e-5, "unchanged", True),  # too little to matter, however sure
+    ],
+)
+def test_the_verdict_asks_whether_it_is_real_and_whether_it_matters(
+    before: float, after: float, said: str, whole: bool
+) -> None:
+    rng = np.random.default_rng(3)
+    one, other = _heldout(before, rng), _heldout(after, rng)
+    assert verdict(one, other) == said and complete(one, other) == whole
+
+
+def test_a_gain_that_few_tiles_make_is_not_believed() -> None:
+    rng = np.random.default_rng(4)
+    before = _heldout(0.2, rng, 16)
+    lucky = before.tiles.copy()
+    lucky[0] *= 0.05
+    after = replace(before, tiles=lucky, excess=float(lucky.sum()) - 0.001)
+    assert verdict(before, after) == "not_explained"
+
+
+def test_grains_use_every_gray_level_and_differ_with_the_seed() -> None:
+    one = grains((120, 160), 2, 0)
+    assert one.shape == (120, 160) and len(np.unique(one)) == 256
+    assert (one != grains((120, 160), 2, 1)).mean() > 0.9
+    path = ideal_path((120, 160), 8e-3)
+    assert path.grid.pitch == PITCH and panel_phase(path, one.astype(np.int64)).shape == (120, 160)
