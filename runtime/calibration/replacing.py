@@ -63,5 +63,5 @@ def restore_bundle(folder: Path) -> None:
         )
     old = read_bundle(kept)
     write_bundle(
-        folder, old.arrays, old.description, old.provenance, old.approximator, replace=True, keep=kept
+        folder, old.arrays, old.description, old.provenance, networks=old.networks, replace=True, keep=kept
     )
