@@ -18,6 +18,7 @@ from typing import Any, NoReturn
 
 from firmware_iface.errors import InputError, nearest
 from runtime.calibration import command as calibration
+from runtime.service import command as service
 
 PROGRAM = "hololoop-runtime"
 DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
@@ -151,6 +152,15 @@ def _parser() -> ArgumentParser:
     )
     calibration.arguments(refit)
     refit.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
+    serve = parts.add_parser(
+        "serve",
+        help="run the headset's service",
+        description=service.SERVE,
+        formatter_class=RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    service.add_options(serve)
+    serve.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
     return parser
 
 
@@ -230,7 +240,11 @@ def show_solve(result: dict[str, Any]) -> None:
         )
 
 
-COMMANDS = {"solve": (run_solve, show_solve), "calibrate": (calibration.run, calibration.show)}
+COMMANDS = {
+    "solve": (run_solve, show_solve),
+    "calibrate": (calibration.run, calibration.show),
+    "serve": (service.run_serve, service.show_serve),
+}
 
 
 def jobs(targets: Sequence[Path], channels: Sequence[str], out: Path) -> list[Job]:

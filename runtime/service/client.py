@@ -1,0 +1,252 @@
+"""What a program uses to show pictures through the service.
+
+with connect("/run/hololoop/service.sock") as headset:
+    headset.clear()
+    headset.arm()
+    while True:
+        timing = headset.wait()
+        headset.begin(timing)
+        slot = headset.slot()
+        slot[:] = picture_for(timing.display_ns)   # linear irradiance, uint16 [C, H, W]
+        headset.end(timing)
+        for outcome in headset.outcomes():
+            ...
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import time
+from collections import deque
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from firmware_iface.errors import InputError
+from runtime.service.link import Link
+from runtime.service.protocol import (
+    HIGHEST,
+    LOWEST,
+    MAGIC,
+    PROTOCOL,
+    Arm,
+    Begin,
+    Capture,
+    Clear,
+    Code,
+    Dark,
+    Done,
+    End,
+    Error,
+    Hello,
+    Shown,
+    State,
+    Status,
+    Timing,
+    Wait,
+    Welcome,
+)
+from runtime.service.protocol import (
+    Ring as RingMessage,
+)
+from runtime.service.ring import Ring, crc32, make_ring, read_sealed
+
+
+class RefusedError(InputError):
+    """The service did not do what was asked; `code` says why (a protocol.Code, or a number of a newer one)."""
+
+    def __init__(self, error: Error) -> None:
+        super().__init__(error.text)
+        self.code = error.code
+
+
+class Lost(NamedTuple):
+    """An accepted frame that came to nothing."""
+
+    frame: int
+    code: int
+    text: str
+
+
+class Client:
+    """A connection to the service. Not for several threads at once.
+
+    shape : (C, H, W) of a picture. Attributes: welcome (what the service said of itself), slots (number).
+    """
+
+    def __init__(self, link: Link, welcome: Welcome, slots: int, timeout_s: float) -> None:
+        self._link, self.welcome, self.slots, self._timeout_s = link, welcome, slots, timeout_s
+        self.shape = (welcome.channels, welcome.height, welcome.width)
+        self._serial = 1
+        self._ring: Ring | None = None
+        self._taken: dict[int, int] = {}  # slot by frame
+        self._drawing: int | None = None
+        self._outcomes: deque[Shown | Lost] = deque()
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the connection; frames that are on their way are not shown."""
+        self._link.close()
+        if self._ring is not None:
+            self._ring.close()
+
+    def fileno(self) -> int:
+        """For selectors: readable when an outcome may have come."""
+        return self._link.fileno()
+
+    def status(self) -> State:
+        """How the headset is."""
+        return self._ask(Status(), State)[0]
+
+    def clear(self) -> None:
+        """First step to light: forget a latched fault. Raises RefusedError while its cause is there."""
+        self._ask(Clear(), Done)
+
+    def arm(self) -> None:
+        """Second step to light. Raises RefusedError without `clear` before it."""
+        self._ask(Arm(), Done)
+
+    def dark(self) -> None:
+        """Lasers off at once, until cleared and armed."""
+        self._ask(Dark(), Done)
+
+    def capture(self) -> np.ndarray:
+        """A picture of the camera that began after this call: counts, uint16 [h, w]."""
+        picture, fd = self._ask(Capture(), None)
+        return read_sealed(fd, (picture.height, picture.width), np.uint16)
+
+    def wait(self) -> Timing:
+        """The next frame, when it may begin."""
+        if self._ring is None:
+            self._open_ring()
+        return self._ask(Wait(), Timing)[0]
+
+    def begin(self, timing: Timing) -> None:
+        """Drawing of the frame begins."""
+        self._ask(Begin(timing.frame), Done)
+
+    def slot(self) -> np.ndarray:
+        """Where to draw the frame that was begun: uint16 [C, H, W], linear irradiance.
+
+        Waits for a slot to become free. Raises InputError where none does.
+        """
+        if self._ring is None:
+            self._open_ring()
+        assert self._ring is not None
+        until = time.monotonic() + self._timeout_s
+        while self._drawing is None:
+            free = set(range(self.slots)) - set(self._taken.values())
+            if free:
+                self._drawing = min(free)
+            elif not self._receive(until):
+                raise InputError(f"no slot became free within {self._timeout_s:g} s: ask for status()")
+        return self._ring.slots[self._drawing]
+
+    def end(self, timing: Timing) -> None:
+        """The frame is drawn; from now on its slot is the service's."""
+        slot = self.slot()
+        assert self._drawing is not None
+        self._taken[timing.frame] = self._drawing
+        try:
+            self._ask(End(timing.frame, self._drawing, crc32(slot)), Done)
+        except BaseException:
+            self._taken.pop(timing.frame, None)
+            raise
+        self._drawing = None
+
+    def show(self, picture: np.ndarray) -> int:
+        """Wait, begin, draw and end in one call; returns the frame's number."""
+        timing = self.wait()
+        self.begin(timing)
+        self.slot()[:] = picture
+        self.end(timing)
+        return timing.frame
+
+    def outcomes(self, timeout_s: float = 0.0) -> Iterator[Shown | Lost]:
+        """What became of accepted frames since it was asked last; waits so long for the first."""
+        until = time.monotonic() + timeout_s
+        while self._receive(time.monotonic()):
+            pass
+        while not self._outcomes and self._receive(until):
+            pass
+        while self._outcomes:
+            yield self._outcomes.popleft()
+
+    @property
+    def in_flight(self) -> set[int]:
+        """Accepted frames without an outcome yet."""
+        return set(self._taken)
+
+    def _open_ring(self) -> None:
+        ring = make_ring(self.slots, self.shape, np.uint16)
+        self._ask(RingMessage(self.slots, ring.slots[0].nbytes), Done, [ring.fd])
+        self._ring = ring
+
+    def _ask(self, message: NamedTuple, answer: type | None, fds: list[int] | None = None) -> tuple[Any, Any]:
+        """Send a request and take what comes until its answer."""
+        serial = self._serial = self._serial % (2**32 - 1) + 1
+        self._link.send(message, serial, fds or [])
+        until = time.monotonic() + self._timeout_s
+        while True:
+            got = self._receive(until)
+            if got is None:
+                raise InputError(
+                    f"the service did not answer {type(message).__name__} within {self._timeout_s:g} s"
+                )
+            found, reply, fd = got
+            if found != serial:
+                continue
+            if isinstance(reply, Error):
+                raise RefusedError(reply)
+            if answer is not None and not isinstance(reply, answer):
+                raise InputError(f"the service answered {type(message).__name__} by {type(reply).__name__}")
+            return reply, fd
+
+    def _receive(self, until: float) -> tuple[int, Any, int | None] | None:
+        """One message, or None at the time `until`; outcomes are noted."""
+        if not select.select([self._link], [], [], max(0.0, until - time.monotonic()))[0]:
+            return None
+        serial, message, fd = self._link.receive()
+        if serial == 0:
+            if isinstance(message, Shown):
+                self._taken.pop(message.frame, None)
+                self._outcomes.append(message)
+            elif isinstance(message, Error):
+                if message.frame == 0:
+                    raise RefusedError(message)
+                self._taken.pop(message.frame, None)
+                self._outcomes.append(Lost(message.frame, message.code, message.text))
+        return serial, message, fd
+
+
+def connect(path: str | os.PathLike[str], slots: int = 3, timeout_s: float = 5.0) -> Client:
+    """Connect to the service at a socket's path.
+
+    slots : of the ring; 3 let one be drawn, one be solved and one wait. timeout_s : for any answer
+    Raises InputError where there is no service, or it speaks no version that is spoken here or refuses.
+    """
+    connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC)
+    try:
+        try:
+            connection.connect(os.fspath(path))
+        except OSError as error:
+            raise InputError(
+                f"there is no service at {path} ({error.strerror}): start hololoop-runtime serve"
+            ) from None
+        client = Client(Link(connection, PROTOCOL), Welcome(0, 0, 0, 0, 0, 0, 0), slots, timeout_s)
+        welcome, _ = client._ask(Hello(MAGIC, LOWEST, HIGHEST), Welcome)
+        return Client(client._link, welcome, slots, timeout_s)
+    except BaseException:
+        connection.close()
+        raise
+
+
+__all__ = ["Client", "Code", "Lost", "RefusedError", "connect"]

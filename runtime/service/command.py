@@ -1,0 +1,77 @@
+"""`hololoop-runtime serve`."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+from typing import Any
+
+SERVE = """Run the service that owns the headset's panel, lasers and camera, until it is stopped.
+
+CONFIG is one TOML file:
+
+  schema = 1
+  bundle = "bundle"                      # from hololoop-trainer export; paths are from this file's folder
+
+  [service]
+  socket = "/run/hololoop/service.sock"  # unless systemd passes one
+  refresh_hz = 60.0                      # pictures a second
+  solve_ms = 12.0                        # time for a pattern
+  stale_limit_ms = 100.0                 # what is older than this is not lit
+  metrics_port = 9464                    # http://127.0.0.1:9464/metrics; 0: none
+  users = [1000]                         # besides root and the service's own user, who may connect
+
+  [panel]
+  kind = "virtual"
+  [lasers]
+  kind = "virtual"
+  power = { green = 0.5 }                # fraction of full while something is shown
+  [camera]                               # may be left out
+  kind = "virtual"
+
+Programs connect as runtime.service.client does in Python; hololoop_service.h, beside it, is for C. The lasers are
+dark until a program clears and arms them, and after every fault until it does so again.
+
+With --dark nothing is served: the lasers are switched off, for ExecStopPost= in the service's unit. Unit files are
+in the folder that `hololoop-runtime serve --units DIR` writes."""
+
+
+def add_options(parser: ArgumentParser) -> None:
+    """The options of `serve`."""
+    parser.add_argument("config", metavar="CONFIG", type=Path, help="the headset's TOML file")
+    only = parser.add_mutually_exclusive_group()
+    only.add_argument("--dark", action="store_true", help="switch the lasers off and stop")
+    only.add_argument(
+        "--units", metavar="DIR", type=Path, help="write systemd's unit files for CONFIG and stop"
+    )
+
+
+def run_serve(args: Namespace) -> dict[str, Any]:
+    """Serve until stopped; returns what `--json` prints."""
+    from firmware_iface.assembled import open_lasers
+    from runtime.service.configuration import read_configuration
+    from runtime.service.supervisor import Supervisor
+
+    configuration = read_configuration(args.config)
+    if args.dark:
+        lasers = open_lasers(configuration.devices["lasers"])
+        lasers.off()
+        lasers.close()
+        return {"dark": True}
+    if args.units is not None:
+        from runtime.service.units import write_units
+
+        return {"units": [str(path) for path in write_units(configuration, args.units)]}
+    supervisor = Supervisor(configuration)
+    supervisor.run()
+    return {"served": supervisor.counts}
+
+
+def show_serve(result: dict[str, Any]) -> None:
+    """What was done, in a line or two."""
+    if "dark" in result:
+        print("the lasers are off")
+    for path in result.get("units", []):
+        print(path)
+    if served := result.get("served"):
+        print(", ".join(f"{count} {name}" for name, count in served.items()))

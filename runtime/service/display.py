@@ -1,0 +1,176 @@
+"""The panel's thread: at every display time it puts the next pattern that is due on the panel.
+
+The panel is written to from here only, so no two frames mix. Patterns are shown in order, one a display time;
+one that the panel did not take is tried again at the next, until it is stale. A panel that is gone is looked
+for until it is back.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
+
+AGAIN_S = 0.02  # between attempts to open the panel
+ASK_S = 0.03  # an idle panel is asked for its status so often
+WAKE_NS = 300_000  # before the transfer begins, for the thread to get going
+DEVICE_ERRORS = (DeviceError, InputError, OSError)
+
+
+class Clock:
+    """The display's times: every `period_ns` since the start. All times are CLOCK_MONOTONIC, ns."""
+
+    def __init__(self, period_ns: int) -> None:
+        self.period_ns = period_ns
+        self.origin_ns = time.monotonic_ns()
+
+    def after(self, now_ns: int) -> int:
+        """The first display time at or after `now_ns`."""
+        return self.origin_ns - (self.origin_ns - now_ns) // self.period_ns * self.period_ns
+
+
+@dataclass(frozen=True)
+class Ready:
+    """A pattern for the panel: gray levels of each colour, uint8 [C, H, W], of job number `job`."""
+
+    job: int
+    display_ns: int
+    gray: np.ndarray
+    crc: int
+    psnr_db: float
+    final: bool
+
+
+class Events(Protocol):
+    """What the display tells; called in its thread."""
+
+    def shown(self, pattern: Ready, at_ns: int, transfer_s: float) -> None:
+        """A pattern is on the panel."""
+
+    def dropped(self, pattern: Ready, reason: str) -> None:
+        """A pattern will never be on the panel."""
+
+    def panel_fault(self, error: Exception) -> None:
+        """The panel did not do something."""
+
+
+class Display(threading.Thread):
+    """Owns the panel.
+
+    open_panel : opens it; called again whenever it was lost
+    clock : display times
+    stale_ns : how long after its display time a pattern may be lit, and the panel be silent
+    """
+
+    def __init__(self, open_panel: Callable[[], Any], clock: Clock, stale_ns: int, events: Events) -> None:
+        super().__init__(name="display", daemon=True)
+        self._open, self._clock, self._stale_ns, self._events = open_panel, clock, stale_ns, events
+        self._lock = threading.Lock()
+        self._waiting: dict[int, Ready] = {}  # by job
+        self._panel: Any = None
+        self._stopping = threading.Event()
+        self.transfer_ns = clock.period_ns // 10  # what a transfer takes, kept up to date
+        self.answered_ns = 0  # when the panel last did what it was asked
+        self.turned_ns = time.monotonic_ns()
+        self.lit_until_ns = 0  # what is on the panel may be lit until then
+
+    @property
+    def open(self) -> bool:
+        """Whether the panel is there."""
+        return self._panel is not None
+
+    def put(self, pattern: Ready) -> None:
+        """Show this at its display time; a job's better pattern replaces its worse one."""
+        with self._lock:
+            self._waiting[pattern.job] = pattern
+
+    def forget(self) -> None:
+        """Show nothing of what waits: whoever wanted it has gone."""
+        with self._lock:
+            self._waiting.clear()
+
+    def stop(self) -> None:
+        """End the thread and close the panel."""
+        self._stopping.set()
+        self.join(2)
+
+    def run(self) -> None:
+        while not self._stopping.is_set():
+            self.turned_ns = time.monotonic_ns()
+            if self._panel is None and not self._opened():
+                self._drop_stale(time.monotonic_ns(), "the panel is gone")
+                self._stopping.wait(AGAIN_S)
+                continue
+            tick = self._clock.after(time.monotonic_ns() + self.transfer_ns + WAKE_NS)
+            self._stopping.wait((tick - self.transfer_ns - WAKE_NS - time.monotonic_ns()) * 1e-9)
+            self._turn(tick)
+        if self._panel is not None:
+            with suppress(*DEVICE_ERRORS):
+                self._panel.close()
+
+    def _turn(self, tick: int) -> None:
+        """What there is to do for one display time."""
+        pattern = self._due(tick)
+        try:
+            if pattern is not None:
+                began = time.monotonic_ns()
+                for field in pattern.gray:
+                    self._panel.show(field)
+                self._shown(pattern, tick, began)
+            elif time.monotonic_ns() - self.answered_ns > ASK_S * 1e9:
+                self._panel.status()
+                self.answered_ns = time.monotonic_ns()
+        except DEVICE_ERRORS as error:
+            self._events.panel_fault(error)
+            if isinstance(error, DeviceGoneError):
+                with suppress(*DEVICE_ERRORS):
+                    self._panel.close()
+                self._panel = None
+            if pattern is not None:
+                self._keep(pattern)
+
+    def _due(self, tick: int) -> Ready | None:
+        """The oldest pattern whose time has come and that is not stale; what is stale is dropped."""
+        self._drop_stale(tick, "it could not be shown before it was stale")
+        with self._lock:
+            due = [p for p in self._waiting.values() if p.display_ns <= tick + self._clock.period_ns // 2]
+            if not due:
+                return None
+            return self._waiting.pop(min(due, key=lambda p: p.display_ns).job)
+
+    def _keep(self, pattern: Ready) -> None:
+        """Try it again at the next display time."""
+        with self._lock:
+            self._waiting.setdefault(pattern.job, pattern)
+
+    def _drop_stale(self, now_ns: int, reason: str) -> None:
+        with self._lock:
+            stale = [p for p in self._waiting.values() if now_ns > p.display_ns + self._stale_ns]
+            for pattern in stale:
+                del self._waiting[pattern.job]
+        for pattern in stale:
+            self._events.dropped(pattern, reason)
+
+    def _shown(self, pattern: Ready, tick: int, began_ns: int) -> None:
+        now = time.monotonic_ns()
+        took = now - began_ns
+        self.transfer_ns = min(int(0.9 * self.transfer_ns + 0.1 * took), self._clock.period_ns // 2)
+        self.answered_ns = now
+        self.lit_until_ns = max(pattern.display_ns, tick) + self._stale_ns
+        self._events.shown(pattern, max(tick, now), took * 1e-9)
+
+    def _opened(self) -> bool:
+        try:
+            self._panel = self._open()
+        except DEVICE_ERRORS as error:
+            self._events.panel_fault(error)
+            return False
+        self.answered_ns = time.monotonic_ns()
+        return True

@@ -1,0 +1,96 @@
+"""What the supervisor and its two child processes say to each other.
+
+supervisor  Targets, Job, Free, Ping      ->  solver    Patterns, Solved, Unsolved, Pong
+supervisor  Take                          ->  camera    Seen (answers Take with the picture), Missing
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from runtime.service.messages import F32, U32, U64, Text, Vocabulary
+
+
+class Ping(NamedTuple):
+    """Asks for a sign of life."""
+
+
+class Pong(NamedTuple):
+    """The loop turns."""
+
+
+class Patterns(NamedTuple):
+    """The solver is ready; comes with the ring that its patterns will be in, uint8 [slots, C, H, W]."""
+
+    slots: U32
+    channels: U32
+    height: U32
+    width: U32
+
+
+class Targets(NamedTuple):
+    """A program's ring, which comes with it."""
+
+    slots: U32
+
+
+class Job(NamedTuple):
+    """Solve the target in a slot of the program's ring; its bytes have this CRC-32."""
+
+    deadline_ns: U64
+    job: U32
+    slot: U32
+    crc: U32
+    reserved: U32 = 0
+
+
+class Solved(NamedTuple):
+    """A pattern for a job: with final = 0 the best so far, and more is to come."""
+
+    job: U32
+    slot: U32
+    crc: U32
+    final: U32
+    psnr_db: F32
+    peak: F32  # irradiance of its brightest pixel over the mean
+    solve_us: U32
+
+
+class Unsolved(NamedTuple):
+    """A job that has no pattern, and why (a protocol.Code)."""
+
+    job: U32
+    code: U32
+    text: Text
+
+
+class Free(NamedTuple):
+    """A pattern's slot may be used again."""
+
+    slot: U32
+
+
+class Seen(NamedTuple):
+    """The camera took a picture."""
+
+    time_ns: U64
+    height: U32
+    width: U32
+    bit_depth: U32
+    exposure_us: U32
+
+
+class Missing(NamedTuple):
+    """The camera is not there or does not deliver, and why."""
+
+    text: Text
+
+
+class Take(NamedTuple):
+    """Send the next picture whole."""
+
+
+SOLVER = Vocabulary(
+    {1: Ping, 2: Pong, 3: Patterns, 4: Targets, 5: Job, 6: Solved, 7: Unsolved, 8: Free},
+)
+CAMERA = Vocabulary({1: Seen, 2: Missing, 3: Take})

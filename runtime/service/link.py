@@ -1,0 +1,82 @@
+"""One end of a SOCK_SEQPACKET connection on which the messages of one vocabulary pass."""
+
+from __future__ import annotations
+
+import array
+import os
+import socket
+import struct
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from runtime.service.messages import LARGEST, ProtocolError, Vocabulary
+
+MOST_FDS = 4  # room for more than any message has, so that too many are seen and closed
+
+
+class Peer(NamedTuple):
+    """Who is at the other end, as the kernel says."""
+
+    pid: int
+    uid: int
+    gid: int
+
+
+class Link:
+    """Sends and receives whole messages, each with at most one file descriptor.
+
+    Sending never waits for the other side on a socket that does not block: a peer that lets its buffer fill
+    up is a BlockingIOError, to be taken as gone.
+    """
+
+    def __init__(self, connection: socket.socket, vocabulary: Vocabulary) -> None:
+        self.connection, self.vocabulary = connection, vocabulary
+
+    def fileno(self) -> int:
+        """For selectors."""
+        return self.connection.fileno()
+
+    def send(self, message: NamedTuple, serial: int = 0, fds: Sequence[int] = ()) -> None:
+        """Send one message. Raises OSError where the other side is gone or does not read."""
+        data = self.vocabulary.pack(message, serial)
+        if fds:
+            socket.send_fds(self.connection, [data], list(fds))
+        else:
+            self.connection.send(data)
+
+    def receive(self) -> tuple[int, Any, int | None]:
+        """Serial, message, and the descriptor that came with it; the caller closes that.
+
+        Raises ProtocolError for what is no message, ConnectionResetError at the end, and on a socket that does
+        not block BlockingIOError where there is nothing yet.
+        """
+        room = socket.CMSG_SPACE(MOST_FDS * 4)
+        data, control, flags, _ = self.connection.recvmsg(LARGEST, room, socket.MSG_CMSG_CLOEXEC)
+        fds = array.array("i")
+        for level, kind, payload in control:
+            if (level, kind) == (socket.SOL_SOCKET, socket.SCM_RIGHTS):
+                fds.frombytes(payload[: len(payload) - len(payload) % fds.itemsize])
+        try:
+            if not data:
+                raise ConnectionResetError("the other side closed the connection")
+            if flags & (socket.MSG_TRUNC | socket.MSG_CTRUNC):
+                raise ProtocolError(f"a message has more than {LARGEST} bytes or {MOST_FDS} descriptors")
+            if len(fds) > 1:
+                raise ProtocolError(f"{len(fds)} descriptors came with one message; one is the most")
+            serial, message = self.vocabulary.unpack(data)
+        except (ProtocolError, ConnectionResetError):
+            for fd in fds:
+                os.close(fd)
+            raise
+        return serial, message, fds[0] if fds else None
+
+    def peer(self) -> Peer:
+        """The credentials of the other side at the time it connected."""
+        size = struct.calcsize("3i")
+        return Peer(
+            *struct.unpack("3i", self.connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size))
+        )
+
+    def close(self) -> None:
+        """Close the connection."""
+        self.connection.close()

@@ -1,0 +1,81 @@
+"""Messages of fixed size as named tuples: what a field's type says is what is on the wire.
+
+A message is an 8-byte header and the fields in their order, little-endian, each on its natural boundary, so
+that a C struct of the same fields has the same bytes:
+
+    u16 code    which message
+    u16 bytes   of the whole message, header included
+    u32 serial  of a request; its answer repeats it; 0 in what nobody asked for
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from typing import Annotated, Any, NamedTuple, get_type_hints
+
+U16 = Annotated[int, "H"]
+U32 = Annotated[int, "I"]
+U64 = Annotated[int, "Q"]
+F32 = Annotated[float, "f"]
+Magic = Annotated[bytes, "8s"]
+Text = Annotated[str, "240s"]
+
+HEADER = struct.Struct("<HHI")
+LARGEST = 512  # bytes of any message; more is not read
+
+
+class ProtocolError(ValueError):
+    """A message that is not one of the protocol's: says what of it is wrong."""
+
+
+class Vocabulary:
+    """The messages that may pass over one link.
+
+    codes : message type by code; fields are annotated with the types above
+    """
+
+    def __init__(self, codes: Mapping[int, type[NamedTuple]]) -> None:
+        self._types = dict(codes)
+        self._codes = {kind: code for code, kind in codes.items()}
+        self._bodies = {kind: struct.Struct("<" + "".join(formats(kind))) for kind in codes.values()}
+        self._texts = {kind: [f == "240s" for f in formats(kind)] for kind in codes.values()}
+
+    def pack(self, message: NamedTuple, serial: int = 0) -> bytes:
+        """The bytes of a message; a text that is too long is cut."""
+        kind = type(message)
+        body = self._bodies[kind]
+        fields = [
+            cut(value) if text else value for value, text in zip(message, self._texts[kind], strict=True)
+        ]
+        return HEADER.pack(self._codes[kind], HEADER.size + body.size, serial) + body.pack(*fields)
+
+    def unpack(self, data: bytes) -> tuple[int, Any]:
+        """The serial and the message in `data`. Raises ProtocolError for anything that is not exactly one."""
+        if len(data) < HEADER.size:
+            raise ProtocolError(f"{len(data)} bytes are no message: a header alone has {HEADER.size}")
+        code, size, serial = HEADER.unpack_from(data)
+        kind = self._types.get(code)
+        if kind is None:
+            raise ProtocolError(f"message code {code} is not known here")
+        body = self._bodies[kind]
+        if not len(data) == size == HEADER.size + body.size:
+            raise ProtocolError(
+                f"{kind.__name__} has {HEADER.size + body.size} bytes; {len(data)} came and {size} were announced"
+            )
+        fields: list[Any] = list(body.unpack_from(data, HEADER.size))
+        for i, text in enumerate(self._texts[kind]):
+            if text:
+                fields[i] = fields[i].split(b"\0", 1)[0].decode("utf-8", "replace")
+        return serial, kind._make(fields)
+
+
+def formats(kind: type[NamedTuple]) -> list[str]:
+    """The struct format of each field of a message type."""
+    hints = get_type_hints(kind, include_extras=True)
+    return [hints[name].__metadata__[0] for name in kind._fields]
+
+
+def cut(text: str) -> bytes:
+    """A text as UTF-8 that fits its field with a closing zero, cut between characters."""
+    return text.encode("utf-8", "replace")[:239].decode("utf-8", "ignore").encode()

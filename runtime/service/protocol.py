@@ -1,0 +1,237 @@
+"""What a program and the service say to each other, version 1, over a Unix socket of type SOCK_SEQPACKET.
+
+    program                                   service
+    Hello (versions it speaks)           ->
+                                         <-   Welcome (the version to speak; the panel's size)
+    Ring, with a sealed memfd            ->
+                                         <-   Done
+    Wait                                 ->
+                                         <-   Timing, when the next frame may begin; with its predicted display time
+    Begin                                ->
+                                         <-   Done
+    (draws into a free slot of the ring)
+    End (slot, CRC-32 of the slot)       ->
+                                         <-   Done: accepted. The slot is the service's
+                                         <-   Shown, or Error with the frame's number: the slot is free again
+
+Every accepted frame ends in exactly one Shown or Error. A request that cannot be done is answered by Error
+with the request's serial. Begin without End before it discards the frame that was begun.
+
+A slot holds linear irradiance, u16 [channels][height][width], 65535 for the brightest. Times are
+CLOCK_MONOTONIC, ns. The ring is made by memfd_create(MFD_ALLOW_SEALING) and sealed with F_SEAL_SHRINK and
+F_SEAL_GROW before it is sent, else it is refused. One program at a time has a ring and so the display; any
+number may ask for Status, Capture and Dark.
+
+Lasers: Clear (forget a latched fault), then Arm. Both are needed, in this order, after every fault and every
+start; nothing else makes light. Dark always works.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum, IntFlag
+from typing import NamedTuple
+
+from runtime.service.messages import F32, U16, U32, U64, Magic, Text, Vocabulary
+
+MAGIC = b"hololoop"
+LOWEST, HIGHEST = 1, 1  # versions spoken here
+MOST_SLOTS = 16
+
+
+class Hello(NamedTuple):
+    """First message of a program: the versions that it speaks."""
+
+    magic: Magic
+    lowest: U16
+    highest: U16
+    reserved: U32 = 0
+
+
+class Welcome(NamedTuple):
+    """The highest version that both speak, and what the display is."""
+
+    version: U16
+    channels: U16
+    height: U32
+    width: U32
+    period_us: U32
+    stale_limit_us: U32  # a pattern is lit no longer than this after its display time
+    most_slots: U32
+
+
+class Ring(NamedTuple):
+    """Comes with the memfd: slots of `slot_bytes`, one after the other."""
+
+    slots: U32
+    slot_bytes: U32
+
+
+class Done(NamedTuple):
+    """The request was done."""
+
+
+class Error(NamedTuple):
+    """A request or, with `frame` above 0, an accepted frame that came to nothing, and why."""
+
+    code: U32
+    frame: U32
+    text: Text
+
+
+class Wait(NamedTuple):
+    """Asks for the next frame."""
+
+
+class Timing(NamedTuple):
+    """The frame to draw: when it will be seen, and when End must have come for that."""
+
+    display_ns: U64
+    submit_by_ns: U64
+    frame: U32
+    period_us: U32
+
+
+class Begin(NamedTuple):
+    """Drawing of a frame begins."""
+
+    frame: U32
+    reserved: U32 = 0
+
+
+class End(NamedTuple):
+    """The frame is drawn, in this slot, with this CRC-32 (zlib's)."""
+
+    frame: U32
+    slot: U32
+    crc: U32
+    reserved: U32 = 0
+
+
+class Shown(NamedTuple):
+    """The frame's pattern was put on the panel; its slot is free."""
+
+    display_ns: U64
+    frame: U32
+    slot: U32
+    psnr_db: F32  # of amplitude, as the calibrated model predicts it
+    flags: U32
+    pattern_crc: U32
+    reserved: U32 = 0
+
+
+class Status(NamedTuple):
+    """Asks how the headset is."""
+
+
+class State(NamedTuple):
+    """How the headset is. Panel, solver and camera are a Part, lasers a Lasers; faults are the controller's bits."""
+
+    time_ns: U64
+    shown: U64
+    late: U64
+    failed: U64
+    lasers: U32
+    laser_faults: U32
+    panel: U32
+    solver: U32
+    camera: U32
+    faults: U32  # of all kinds, since the start
+
+
+class Clear(NamedTuple):
+    """First step to light: forget a latched fault whose cause is gone."""
+
+
+class Arm(NamedTuple):
+    """Second step to light, within 5 s of Clear."""
+
+
+class Dark(NamedTuple):
+    """Lasers off at once; they stay off until Clear and Arm."""
+
+
+class Capture(NamedTuple):
+    """Asks for a picture of the camera."""
+
+
+class Picture(NamedTuple):
+    """Comes with a memfd, sealed against any change: counts, u16 [height][width]."""
+
+    time_ns: U64
+    height: U32
+    width: U32
+    bit_depth: U32
+    exposure_us: U32
+
+
+class Part(IntEnum):
+    """How a device or a process is."""
+
+    ABSENT = 0  # the configuration has none
+    FRESH = 1
+    STALE = 2  # there, but its last sign of life is too old
+    LOST = 3  # gone; it is being looked for
+
+
+class Lasers(IntEnum):
+    """How the lasers are."""
+
+    OFF = 0
+    ARMED = 1  # may emit; nothing fresh to show
+    EMITTING = 2
+    FAULT = 3  # latched
+    LOST = 4  # the safety controller does not answer: it goes dark by itself
+
+
+class Flags(IntFlag):
+    """How a frame was shown."""
+
+    LATE = 1  # after its predicted display time
+    UNFINISHED = 2  # the best pattern so far: its solve had not ended
+
+
+class Code(IntEnum):
+    """Why something was not done."""
+
+    MALFORMED = 1
+    VERSION = 2
+    ORDER = 3
+    RING = 4
+    SLOT = 5
+    TORN = 6
+    BUSY = 7
+    SOLVER = 8
+    PANEL = 9
+    LASERS = 10
+    CAMERA = 11
+    REFUSED = 12
+    STOPPING = 13
+
+
+PROTOCOL = Vocabulary(
+    {
+        1: Hello,
+        2: Welcome,
+        3: Ring,
+        4: Done,
+        5: Error,
+        6: Wait,
+        7: Timing,
+        8: Begin,
+        9: End,
+        10: Shown,
+        11: Status,
+        12: State,
+        13: Clear,
+        14: Arm,
+        15: Dark,
+        16: Capture,
+        17: Picture,
+    }
+)
+
+
+def agreed_version(hello: Hello) -> int | None:
+    """The highest version that both sides speak, or None."""
+    version = min(hello.highest, HIGHEST)
+    return version if version >= max(hello.lowest, LOWEST) else None

@@ -1,0 +1,96 @@
+"""Arrays in memory that two processes share: a ring of equal slots in a sealed memfd.
+
+A memfd that may shrink lets its owner kill the reader (SIGBUS on the missing page), so one without the seals
+is refused. Who may write which slot when is said by messages; the kernel does not know.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import mmap
+import os
+import zlib
+
+import numpy as np
+
+from firmware_iface.errors import InputError
+
+FIXED_SIZE = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW
+UNCHANGEABLE = FIXED_SIZE | fcntl.F_SEAL_WRITE | fcntl.F_SEAL_SEAL
+
+
+class Ring:
+    """Slots of one shape and type.
+
+    slots : array [n, *shape]; read-only where the ring came from another process
+    """
+
+    def __init__(self, fd: int, slots: np.ndarray) -> None:
+        self.fd, self.slots = fd, slots
+
+    def close(self) -> None:
+        """Close the descriptor; the memory goes when the last array on it does."""
+        if self.fd >= 0:
+            os.close(self.fd)
+            self.fd = -1
+
+
+def make_ring(count: int, shape: tuple[int, ...], dtype: type[np.generic]) -> Ring:
+    """A new ring of `count` zeroed slots, writable here, of a size that nobody can change."""
+    slot_bytes = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    fd = os.memfd_create("hololoop-ring", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    try:
+        os.ftruncate(fd, count * slot_bytes)
+        fcntl.fcntl(fd, fcntl.F_ADD_SEALS, FIXED_SIZE | fcntl.F_SEAL_SEAL)
+        memory = mmap.mmap(fd, count * slot_bytes)
+    except BaseException:
+        os.close(fd)
+        raise
+    return Ring(fd, np.frombuffer(memory, dtype).reshape(count, *shape))
+
+
+def open_ring(fd: int, count: int, shape: tuple[int, ...], dtype: type[np.generic]) -> Ring:
+    """Another process's ring, read-only; takes `fd` over.
+
+    Raises InputError, and closes `fd`, where it is no sealed memfd of at least that size.
+    """
+    try:
+        size = count * int(np.prod(shape)) * np.dtype(dtype).itemsize
+        try:
+            seals = fcntl.fcntl(fd, fcntl.F_GET_SEALS)
+        except OSError:
+            raise InputError("the ring is not a memfd: make it with memfd_create and seal it") from None
+        if seals & FIXED_SIZE != FIXED_SIZE:
+            raise InputError("the ring can still shrink or grow: seal it with F_SEAL_SHRINK and F_SEAL_GROW")
+        if (found := os.fstat(fd).st_size) < size:
+            raise InputError(f"the ring has {found} bytes and {count} slots need {size}: make it larger")
+        memory = mmap.mmap(fd, size, prot=mmap.PROT_READ)
+        return Ring(fd, np.frombuffer(memory, dtype).reshape(count, *shape))
+    except BaseException:
+        os.close(fd)
+        raise
+
+
+def sealed_copy(array: np.ndarray) -> int:
+    """A memfd that holds an array's bytes and that nobody can change; the caller closes it."""
+    fd = os.memfd_create("hololoop-picture", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    try:
+        with os.fdopen(os.dup(fd), "wb") as file:
+            file.write(np.ascontiguousarray(array).data)
+        fcntl.fcntl(fd, fcntl.F_ADD_SEALS, UNCHANGEABLE)
+    except BaseException:
+        os.close(fd)
+        raise
+    return fd
+
+
+def read_sealed(fd: int, shape: tuple[int, ...], dtype: type[np.generic]) -> np.ndarray:
+    """The array in another process's memfd, read-only; takes `fd` over. Raises InputError as `open_ring`."""
+    ring = open_ring(fd, 1, shape, dtype)
+    ring.close()
+    return ring.slots[0]
+
+
+def crc32(array: np.ndarray) -> int:
+    """CRC-32 (zlib's) of an array's bytes in C order."""
+    return zlib.crc32(np.ascontiguousarray(array).data)

@@ -1,0 +1,135 @@
+"""The process that turns pictures into patterns: `python -m runtime.service.solver_process FD CONFIGURATION`.
+
+It takes one job at a time, writes each pattern into a slot of its own ring and says so; the supervisor gives
+the slot back when it has taken the pattern.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from firmware_iface.errors import InputError
+from runtime.service.children import child_link
+from runtime.service.configuration import read_configuration
+from runtime.service.inside import (
+    SOLVER,
+    Free,
+    Job,
+    Patterns,
+    Ping,
+    Pong,
+    Solved,
+    Targets,
+    Unsolved,
+)
+from runtime.service.link import Link
+from runtime.service.protocol import Code
+from runtime.service.ring import Ring, crc32, make_ring, open_ring
+from runtime.service.solving import Pattern, light_paths, patterns
+
+SLOTS = 4
+FULL_SCALE = 65535
+
+Solve = Callable[[np.ndarray, int], Iterator[Pattern]]
+
+
+class Worker:
+    """The solver's loop: what came over the link, and what is being done about it."""
+
+    def __init__(self, link: Link, shape: tuple[int, int, int]) -> None:
+        self.link, self.shape = link, shape
+        self.ring = make_ring(SLOTS, shape, np.uint8)
+        self.free = set(range(SLOTS))
+        self.targets: Ring | None = None
+        self.jobs: deque[Job] = deque()
+        link.send(Patterns(SLOTS, *shape), fds=[self.ring.fd])
+
+    def receive(self, wait: bool) -> None:
+        """Take one message, if there is one; with `wait`, when there is one."""
+        if not wait and not select.select([self.link], [], [], 0)[0]:
+            return
+        _, message, fd = self.link.receive()
+        match message:
+            case Ping():
+                self.link.send(Pong())
+            case Free(slot):
+                self.free.add(slot)
+            case Targets(slots) if fd is not None:
+                self.targets = open_ring(fd, slots, self.shape, np.uint16)
+                self.targets.close()
+                self.jobs.clear()
+            case Job():
+                self.jobs.append(message)
+
+    def target(self, job: Job) -> np.ndarray:
+        """The picture of a job, float32 [C, H, W], 0 to 1. Raises InputError where its bytes changed."""
+        if self.targets is None:
+            raise InputError("there is no ring")
+        counts = self.targets.slots[job.slot].copy()  # what is checked is what is used
+        if crc32(counts) != job.crc:
+            raise InputError("the picture in the slot is not the one that was announced: its CRC-32 differs")
+        return counts.astype(np.float32) / FULL_SCALE
+
+    def publish(self, job: Job, pattern: Pattern, began_ns: int) -> None:
+        """Hand a pattern over; waits for a free slot."""
+        while not self.free:
+            self.receive(wait=True)
+        slot = self.free.pop()
+        self.ring.slots[slot] = pattern.gray
+        microseconds = (time.monotonic_ns() - began_ns) // 1000
+        self.link.send(
+            Solved(
+                job.job,
+                slot,
+                crc32(pattern.gray),
+                int(pattern.final),
+                pattern.psnr_db,
+                pattern.peak,
+                min(microseconds, 2**32 - 1),
+            )
+        )
+
+    def run(self, solve: Solve) -> None:
+        """Serve until the supervisor goes."""
+        while True:
+            while not self.jobs:
+                self.receive(wait=True)
+            job = self.jobs.popleft()
+            began = time.monotonic_ns()
+            try:
+                target = self.target(job)
+            except InputError as error:
+                self.link.send(Unsolved(job.job, Code.TORN, str(error)))
+                continue
+            try:
+                for pattern in solve(target, job.deadline_ns):
+                    self.publish(job, pattern, began)
+                    self.receive(wait=False)
+            except InputError as error:
+                self.link.send(Unsolved(job.job, Code.SOLVER, str(error)))
+
+
+def main(fd: str, configuration: str) -> None:
+    """Run the process until its supervisor closes the link."""
+    link = child_link(fd, SOLVER)
+    try:
+        paths = light_paths(read_configuration(configuration).bundle)
+    except InputError as error:
+        link.send(Unsolved(0, Code.SOLVER, str(error)))
+        return
+    worker = Worker(link, (len(paths), *paths[0].grid.shape))
+    worker.run(lambda target, deadline_ns: patterns(paths, target, deadline_ns))
+
+
+if __name__ == "__main__":
+    try:
+        main(*sys.argv[1:3])
+    except ConnectionError:
+        os._exit(0)

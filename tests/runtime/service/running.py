@@ -1,0 +1,109 @@
+"""A running service for tests: its own process, a small virtual headset, a folder that is thrown away."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from runtime.bundle import write_bundle
+from runtime.calibrated import pack_light_paths
+from runtime.service.client import Client, connect
+from tests.runtime.benches import converted, ideal_path
+
+SHAPE = (24, 32)
+DISTANCE_MM = 6.0
+
+BENCH = f"""
+[panel]
+height = {SHAPE[0]}
+width = {SHAPE[1]}
+[propagation]
+distance_mm = {DISTANCE_MM}
+"""
+
+CONFIGURATION = """
+schema = 1
+bundle = "bundle"
+[service]
+socket = "service.sock"
+refresh_hz = 50.0
+solve_ms = 12.0
+stale_limit_ms = 400.0
+[panel]
+kind = "virtual"
+bench = "{folder}/bench.toml"
+[lasers]
+kind = "virtual"
+bench = "{folder}/bench.toml"
+power = {{ green = 0.5 }}
+[camera]
+kind = "virtual"
+bench = "{folder}/bench.toml"
+"""
+
+
+def write_configuration(folder: Path) -> Path:
+    """A bundle, a bench and a configuration in `folder`; returns the configuration's path.
+
+    The limits are wide, so that a busy machine does not look like a fault.
+    """
+    path = converted(ideal_path(SHAPE, DISTANCE_MM * 1e-3), np.float32)
+    records, arrays = pack_light_paths([("green", DISTANCE_MM, 520.0, path)])
+    write_bundle(folder / "bundle", arrays, {"paths": records, "distance_mm": DISTANCE_MM}, {})
+    (folder / "bench.toml").write_text(BENCH)
+    file = folder / "headset.toml"
+    file.write_text(CONFIGURATION.format(folder=folder))
+    return file
+
+
+@contextmanager
+def served(file: Path, **environment: str) -> Iterator[subprocess.Popen[str]]:
+    """The service of a configuration, ready; ends with the block, by SIGTERM."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "runtime.cli", "serve", str(file), "--json"],
+        env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.send_signal(signal.SIGTERM)
+            try:
+                process.wait(10)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        for stream in (process.stdout, process.stderr):
+            if stream is not None:
+                stream.close()
+
+
+def connected(file: Path, within_s: float = 20.0, slots: int = 3) -> Client:
+    """A client of the service of a configuration, once it answers."""
+    until = time.monotonic() + within_s
+    while True:
+        try:
+            return connect(file.parent / "service.sock", slots, timeout_s=within_s)
+        except ValueError:
+            if time.monotonic() > until:
+                raise
+            time.sleep(0.05)
+
+
+def picture(client: Client, seed: int = 0) -> np.ndarray:
+    """A smooth picture of the client's shape, uint16."""
+    channels, height, width = client.shape
+    y, x = np.mgrid[0:height, 0:width]
+    one = 0.5 + 0.4 * np.sin(0.3 * x + 0.2 * y + seed)
+    return np.broadcast_to(65535 * one, client.shape).astype(np.uint16)

@@ -1,0 +1,154 @@
+"""The panel's thread: order, tries again, staleness, a panel that goes and comes back."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from firmware_iface.errors import DeviceError, DeviceGoneError
+from runtime.service.display import Clock, Display, Ready
+
+PERIOD_NS = 5_000_000
+STALE_NS = 100_000_000
+
+
+class Panel:
+    """Notes what it is shown; fails as it is told."""
+
+    def __init__(self) -> None:
+        self.seen: list[int] = []
+        self.failures: list[Exception] = []
+        self.there = True
+        self.opened = 0
+
+    def open(self) -> Panel:
+        if not self.there:
+            raise DeviceGoneError("unplugged")
+        self.opened += 1
+        return self
+
+    def show(self, gray: np.ndarray) -> None:
+        self._fail()
+        self.seen.append(int(gray[0, 0]))
+
+    def status(self) -> dict:
+        self._fail()
+        return {}
+
+    def close(self) -> None:
+        pass
+
+    def _fail(self) -> None:
+        if not self.there:
+            raise DeviceGoneError("unplugged")
+        if self.failures:
+            raise self.failures.pop()
+
+
+class Events:
+    def __init__(self) -> None:
+        self.shown_jobs: list[int] = []
+        self.dropped_jobs: list[int] = []
+        self.faults: list[str] = []
+
+    def shown(self, pattern: Ready, at_ns: int, transfer_s: float) -> None:
+        self.shown_jobs.append(pattern.job)
+
+    def dropped(self, pattern: Ready, reason: str) -> None:
+        self.dropped_jobs.append(pattern.job)
+
+    def panel_fault(self, error: Exception) -> None:
+        self.faults.append(str(error))
+
+
+@pytest.fixture
+def running() -> Iterator[tuple[Panel, Display, Events]]:
+    panel, events = Panel(), Events()
+    display = Display(panel.open, Clock(PERIOD_NS), STALE_NS, events)
+    display.start()
+    yield panel, display, events
+    display.stop()
+
+
+def ready(job: int, in_ns: int, value: int | None = None, final: bool = True) -> Ready:
+    gray = np.full((1, 2, 2), job if value is None else value, np.uint8)
+    return Ready(job, time.monotonic_ns() + in_ns, gray, 0, 30.0, final)
+
+
+def until(condition, within_s: float = 5.0) -> None:
+    end = time.monotonic() + within_s
+    while not condition():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.002)
+
+
+def test_patterns_are_shown_in_order_and_not_before_their_time(running) -> None:
+    panel, display, events = running
+    late = ready(2, 20 * PERIOD_NS)
+    display.put(late)
+    display.put(ready(1, 3 * PERIOD_NS))
+    until(lambda: events.shown_jobs == [1, 2])
+    assert time.monotonic_ns() > late.display_ns - PERIOD_NS
+    assert panel.seen == [1, 2] and not events.dropped_jobs
+
+
+def test_the_best_pattern_by_the_display_time_is_shown(running) -> None:
+    panel, display, events = running
+    display.put(ready(1, 4 * PERIOD_NS, value=7, final=False))
+    display.put(ready(1, 4 * PERIOD_NS, value=9))
+    until(lambda: events.shown_jobs == [1])
+    assert panel.seen == [9]
+
+
+def test_what_the_panel_did_not_take_is_tried_again(running) -> None:
+    panel, display, events = running
+    panel.failures = [DeviceError("short"), DeviceError("garbage")]
+    display.put(ready(1, 0))
+    until(lambda: events.shown_jobs == [1])
+    assert events.faults and panel.opened == 1
+
+
+def test_a_stale_pattern_is_dropped_and_not_shown(running) -> None:
+    panel, display, events = running
+    display.put(ready(1, -2 * STALE_NS))
+    until(lambda: events.dropped_jobs == [1])
+    assert panel.seen == [] and display.lit_until_ns == 0
+
+
+def test_a_panel_that_comes_back_shows_again_and_meanwhile_frames_are_dropped(running) -> None:
+    panel, display, events = running
+    panel.there = False
+    display.put(ready(1, PERIOD_NS))
+    until(lambda: events.dropped_jobs == [1] and not display.open)
+    answered = display.answered_ns
+    panel.there = True
+    until(lambda: display.open)
+    display.put(ready(2, PERIOD_NS))
+    until(lambda: events.shown_jobs == [2])
+    assert display.answered_ns > answered and panel.opened == 2
+
+
+def test_an_idle_panel_is_asked_for_signs_of_life(running) -> None:
+    _, display, _ = running
+    until(lambda: display.answered_ns > 0)
+    before = display.answered_ns
+    until(lambda: display.answered_ns > before)
+
+
+def test_light_is_allowed_for_the_stale_limit_only(running) -> None:
+    _, display, events = running
+    pattern = ready(1, PERIOD_NS)
+    display.put(pattern)
+    until(lambda: events.shown_jobs == [1])
+    assert 0 <= display.lit_until_ns - pattern.display_ns - STALE_NS <= 40 * PERIOD_NS
+
+
+@pytest.mark.parametrize("offset", [-3, 0, 1, 4_999_999, 5_000_000, 123_456_789])
+def test_the_clock_gives_the_first_display_time_that_is_not_before(offset: int) -> None:
+    clock = Clock(PERIOD_NS)
+    tick = clock.after(clock.origin_ns + offset)
+    assert (tick - clock.origin_ns) % PERIOD_NS == 0
+    assert 0 <= tick - (clock.origin_ns + offset) < PERIOD_NS
