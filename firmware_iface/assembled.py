@@ -1,34 +1,105 @@
 """The devices that a configuration names, opened: one table each, one function each.
 
-[panel]                      [lasers]                          [camera]
-kind = "virtual"             kind = "virtual"                  kind = "virtual"
-bench = "virtual:demo"       bench = "virtual:demo"            bench = "virtual:demo"
-                             power = { green = 0.5 }
+[panel]                       a panel board over USB (firmware_iface/panel/PROTOCOL.md)
+kind = "board"
+bus = "virtual:SOCKET"        emulated hardware (firmware_iface.virtual.served); without it, the host's USB
+serial = "HL0001"             where several are attached
+refresh_hz = 60.0             of the panel itself
+
+[lasers]                      three lasers on an I2C bus
+bus = "/dev/i2c-1"            or virtual:SOCKET
+power = { green = 0.5 }       fraction of full while something is shown; other lasers stay dark
+[[lasers.channel]]            calibration of each, in the order of the DAC's outputs; virtual: may be left out
+name = "green"
+wavelength_nm = 520.0
+full_power_uw = 100.0
+threshold_ma = 40.0
+slope_uw_per_ma = 4.0
+
+[camera]
+kind = "virtual"
+bus = "virtual:SOCKET"
+exposure_ms = 10.0
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
-from .errors import InputError, nearest
+from .errors import InputError
+from .virtual.tables import parameter, read_table
 
 Table = Mapping[str, Any]
 
 
+@dataclass(frozen=True)
+class PanelTable:
+    """[panel]"""
+
+    kind: str = parameter("board", "which panel", choices=("board",))
+    bus: str = parameter("usb", "usb, or virtual:SOCKET")
+    serial: str = parameter("", "serial number, where several are attached")
+    refresh_hz: float = parameter(60.0, "of the panel", 10, 1000)
+    timeout_ms: float = parameter(80.0, "longest wait for one transfer", 5, 10000)
+
+
+@dataclass(frozen=True)
+class LasersTable:
+    """[lasers] without power and channel."""
+
+    bus: str = parameter(about="/dev/i2c-N, or virtual:SOCKET")
+
+
+@dataclass(frozen=True)
+class CameraTable:
+    """[camera]"""
+
+    kind: str = parameter("virtual", "which camera", choices=("virtual",))
+    bus: str = parameter("", "virtual:SOCKET")
+    exposure_ms: float = parameter(10.0, "exposure time", 0.01, 10000)
+
+
 def open_panel(table: Table) -> Any:
     """The panel of a configuration's [panel]. Raises InputError or DeviceError."""
-    return _opened("panel", PANELS, table)
+    from .panel import open_board
+    from .panel.board import Timing
+
+    asked = read_table(PanelTable, table, "[panel]")
+    period_us = round(1e6 / asked.refresh_hz)
+    timing = Timing(period_us, light_delay_us=period_us // 4, light_width_us=period_us // 2)
+    backend = None
+    if asked.bus.startswith("virtual:"):
+        from .virtual.served import usb_backend
+
+        backend = usb_backend(asked.bus)
+    return open_board(asked.serial or None, backend=backend, timing=timing, timeout_s=asked.timeout_ms / 1000)
 
 
 def open_lasers(table: Table) -> Any:
     """The lasers of a configuration's [lasers], dark. Raises InputError or DeviceError."""
-    return _opened("lasers", LASERS, table)
+    from .lasers import VIRTUAL_CHANNELS, LaserChannel
+    from .lasers import open_lasers as open_board
+    from .virtual.served import i2c_bus
+
+    asked = read_table(LasersTable, table, "[lasers]", ignore=("power", "channel"))
+    virtual = asked.bus.startswith("virtual:")
+    given = table.get("channel", [])
+    if not isinstance(given, list) or not (given or virtual):
+        raise InputError("[lasers] describes no laser: write [[lasers.channel]] for each")
+    channels = [read_table(LaserChannel, one, f"[[lasers.channel]] {k}") for k, one in enumerate(given)]
+    return open_board(i2c_bus(asked.bus) if virtual else asked.bus, channels or VIRTUAL_CHANNELS)
 
 
 def open_camera(table: Table) -> Any:
     """The camera of a configuration's [camera]. Raises InputError or DeviceError."""
-    return _opened("camera", CAMERAS, table)
+    from .virtual.served import RemoteCamera, reach
+
+    asked = read_table(CameraTable, table, "[camera]")
+    camera = RemoteCamera(reach(asked.bus))
+    camera.exposure_ms = asked.exposure_ms
+    return camera
 
 
 def laser_power(table: Table) -> dict[str, float]:
@@ -42,35 +113,3 @@ def laser_power(table: Table) -> dict[str, float]:
         if isinstance(fraction, bool) or not isinstance(fraction, int | float) or not 0 <= fraction <= 1:
             raise InputError(f"the power of '{channel}' in [lasers] is {fraction!r}; give a fraction, 0 to 1")
     return {channel: float(fraction) for channel, fraction in power.items()}
-
-
-def _opened(part: str, kinds: Mapping[str, Any], table: Table) -> Any:
-    kind = str(table.get("kind", ""))
-    if kind not in kinds:
-        raise InputError(f"[{part}] has kind '{kind}'; {nearest(kind, kinds)}")
-    return kinds[kind](table)
-
-
-def _virtual(part: str) -> Any:
-    def opened(table: Table) -> Any:
-        from .virtual.headset import open_headset
-
-        device = getattr(open_headset(table.get("bench", "virtual:demo")), part)
-        device.status = lambda: {}
-        device.close = lambda: None
-        if part == "lasers":
-            st = [0]
-            device.latch = lambda: st.__setitem__(0, 3)
-            device.disarm = lambda: st.__setitem__(0, 0)
-            device.clear = lambda: st.__setitem__(0, 0)
-            device.arm = lambda: st.__setitem__(0, 1)
-            device.beat = lambda: None
-            device.state = lambda: (st[0], 0)
-        return device
-
-    return opened
-
-
-PANELS = {"virtual": _virtual("panel")}
-LASERS = {"virtual": _virtual("lasers")}
-CAMERAS = {"virtual": _virtual("camera")}

@@ -10,18 +10,22 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 from firmware_iface.errors import DeviceError, InputError
+from firmware_iface.lasers.safety_controller import Fault
 from runtime.service.protocol import Lasers
 
-BEAT_S = 0.02
+BEAT_S, RAMP_STEP_S = 0.020, 0.005
+LOOK_S = 0.1  # a board that is not armed is asked for its state so often
 AGAIN_S = 0.05  # between attempts to open the lasers
 CLEAR_TO_ARM_S = 5.0
 DEVICE_ERRORS = (DeviceError, InputError, OSError)
+STATES = {"off": Lasers.OFF, "armed": Lasers.ARMED, "emit": Lasers.EMITTING, "fault": Lasers.FAULT}
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,9 @@ class Lighting(threading.Thread):
     fresh_until : by name, until when each loop that has to be fresh is (CLOCK_MONOTONIC, ns)
     lit_until_ns : until when what is on the panel may be lit
     fault : called with a kind and a sentence for each fault, in this thread
+
+    Attributes: state and faults (of the safety controller), turned_ns (this loop's own sign of life), level
+    (fraction of full that each channel is at).
     """
 
     def __init__(
@@ -54,12 +61,20 @@ class Lighting(threading.Thread):
         self._open, self._power, self._fresh_until = open_lasers, power, fresh_until
         self._lit_until_ns, self._fault = lit_until_ns, fault
         self._lasers: Any = None
+        self._ramp: Iterator[None] | None = None
         self._requests: list[Request] = []
         self._wake = threading.Event()
         self._stopping = False
         self._cleared_at = -CLEAR_TO_ARM_S
+        self._looked_at = 0.0
         self.state, self.faults = Lasers.LOST, 0
-        self.turned_ns = time.monotonic_ns()  # this loop's own sign of life
+        self.level = dict.fromkeys(power, 0.0)
+        self.turned_ns = time.monotonic_ns()
+
+    @property
+    def armed(self) -> bool:
+        """Whether light is possible."""
+        return self.state in (Lasers.ARMED, Lasers.EMITTING)
 
     def ask(self, what: str, answer: Callable[[str | None], None]) -> None:
         """Ask for "clear", "arm" or "dark"; `answer` is called in this thread."""
@@ -80,45 +95,59 @@ class Lighting(threading.Thread):
                 if self._lasers is None:
                     self._lasers = self._open()
                 self._turn()
+                pause = BEAT_S if self._ramp is None else RAMP_STEP_S
             except DEVICE_ERRORS as error:
                 self._lost(error)
-            self._wake.wait(max(0.0, began + (BEAT_S if self._lasers else AGAIN_S) - time.monotonic()))
+                pause = AGAIN_S
+            self._wake.wait(max(0.0, began + pause - time.monotonic()))
             self._wake.clear()
-        self._darken()
+        self._close()
 
     def _turn(self) -> None:
-        """One beat: requests, freshness, power, state."""
+        """One beat: what was asked, whether all is fresh, the heartbeat, the light."""
         requests, self._requests = self._requests, []
         for request in requests:
             request.answer(self._do(request.what))
+        if not self.armed:
+            if time.monotonic() - self._looked_at >= LOOK_S:
+                self._look()
+            return
         now = time.monotonic_ns()
-        silent = self._silent(now)
-        if silent and self.state in (Lasers.ARMED, Lasers.EMITTING):
-            self._lasers.off()
-            self._lasers.latch()
-            self._fault("silent", f"dark: no sign of life of {', '.join(silent)}")
-        else:
-            self._lasers.beat()
-        lit = self.state in (Lasers.ARMED, Lasers.EMITTING) and not silent and now < self._lit_until_ns()
-        for channel, power in self._power.items():
-            wanted = power if lit else 0.0
-            if self._lasers.power(channel) != wanted:
-                self._lasers.set_power(channel, wanted)
-        self.state, self.faults = self._lasers.state()
+        if silent := self._silent(now):
+            self._lasers.trip()
+            self._fallen("silent", f"dark: no sign of life of {', '.join(silent)}")
+            return
+        try:
+            self._lasers.heartbeat()
+            self._light(now < self._lit_until_ns())
+        except DeviceError as error:  # the driver has darkened everything before it said so
+            self._fallen("lasers", str(error))
 
-    def _silent(self, now_ns: int) -> list[str]:
-        return [name for name, until_ns in self._fresh_until().items() if until_ns < now_ns]
+    def _light(self, wanted: bool) -> None:
+        """Up slowly while something fresh is shown, down at once when it is not."""
+        if not wanted:
+            self._ramp = None
+            if self.state == Lasers.EMITTING:
+                self._lasers.off()
+                self.state = Lasers.ARMED
+        elif self.state == Lasers.ARMED and self._ramp is None:
+            self._ramp = chain.from_iterable(self._lasers.ramp(c, p) for c, p in self._power.items())
+            self.state = Lasers.EMITTING
+        if self._ramp is not None and next(self._ramp, self) is self:
+            self._ramp = None
+        self.level = {channel: self._lasers.power(channel) for channel in self._power}
 
     def _do(self, what: str) -> str | None:
         """Do what was asked; what is wrong, or None."""
         now = time.monotonic()
         try:
             if what == "dark":
-                self._lasers.off()
-                self._lasers.disarm()
+                self._lasers.trip()
+                self._look()
             elif what == "clear":
                 self._lasers.clear()
                 self._cleared_at = now
+                self._look()
             elif now - self._cleared_at > CLEAR_TO_ARM_S:
                 return f"send Clear first, at most {CLEAR_TO_ARM_S:g} s before Arm"
             elif silent := self._silent(time.monotonic_ns()):
@@ -126,24 +155,42 @@ class Lighting(threading.Thread):
             else:
                 self._cleared_at = -CLEAR_TO_ARM_S
                 self._lasers.arm()
+                self.state = Lasers.ARMED
         except DeviceError as error:
+            self._look()
             return str(error)
         return None
 
+    def _silent(self, now_ns: int) -> list[str]:
+        return [name for name, until_ns in self._fresh_until().items() if until_ns < now_ns]
+
+    def _fallen(self, kind: str, text: str) -> None:
+        """The lasers are dark because of this."""
+        self._fault(kind, text)
+        self._look()
+
+    def _look(self) -> None:
+        """What the board says of itself. Raises DeviceError where it says nothing."""
+        self._ramp = None
+        self._looked_at = time.monotonic()
+        status = self._lasers.status()
+        self.state = STATES[status["state"]]
+        self.faults = sum(Fault[name.upper()] for name in status["faults"])
+        self.level = dict(status["power"])
+
     def _lost(self, error: Exception) -> None:
-        """The bus does not work: what can be done is to stop the heartbeat, and to try again from the start."""
+        """The board does not answer: without a heartbeat it goes dark by itself; try again from the start."""
         if self.state != Lasers.LOST:
             self._fault("laser_bus", str(error))
         self.state, self.faults = Lasers.LOST, 0
         requests, self._requests = self._requests, []
         for request in requests:
             request.answer(f"the lasers do not answer: {error}")
-        self._darken()
+        self._close()
 
-    def _darken(self) -> None:
+    def _close(self) -> None:
+        self._ramp = None
         if self._lasers is not None:
-            with suppress(*DEVICE_ERRORS):
-                self._lasers.off()
             with suppress(*DEVICE_ERRORS):
                 self._lasers.close()
             self._lasers = None

@@ -38,6 +38,7 @@ from runtime.service.systemd import Notifier, passed_socket
 PING_NS = 30_000_000
 HAND_OVER_NS = 1_000_000  # from the solver's deadline to the display's having its pattern
 HUNG_NS = 1_000_000_000  # silent so long after it counts as stale, and so dark, the solver is ended
+LOOPS_NS = 1_000_000_000  # a thread that did not turn for so long stops the watchdog's feed
 MOST_SESSIONS = 32
 REPEAT_S = 10.0  # the same fault is written again no sooner
 
@@ -133,7 +134,8 @@ class Supervisor:
             self.notifier.watchdog_s is not None
             and now * 1e-9 >= self.alive_at + self.notifier.watchdog_s / 2
         ):
-            if all(now - loop.turned_ns < 1e9 for loop in (self.lighting, self.display)):
+            loops = (self.lighting, self.display)
+            if self.display.is_alive() and all(now - loop.turned_ns < LOOPS_NS for loop in loops):
                 self.notifier.alive()
             self.alive_at = now * 1e-9
         for key, _ in self.selector.select(0.001 if self._has_waits() else 0.01):

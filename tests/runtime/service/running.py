@@ -13,11 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
+from firmware_iface.virtual.served import Remote
 from runtime.bundle import write_bundle
 from runtime.calibrated import pack_light_paths
 from runtime.service.client import Client, connect
 from tests.runtime.benches import converted, ideal_path
 
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
 SHAPE = (24, 32)
 DISTANCE_MM = 6.0
 
@@ -34,34 +36,67 @@ schema = 1
 bundle = "bundle"
 [service]
 socket = "service.sock"
-refresh_hz = 50.0
-solve_ms = 12.0
-stale_limit_ms = 400.0
+refresh_hz = {refresh_hz}
+solve_ms = {solve_ms}
+stale_limit_ms = {stale_limit_ms}
 [panel]
-kind = "virtual"
-bench = "{folder}/bench.toml"
+bus = "virtual:{folder}/hardware.sock"
+refresh_hz = 1000.0
 [lasers]
-kind = "virtual"
-bench = "{folder}/bench.toml"
+bus = "virtual:{folder}/hardware.sock"
 power = {{ green = 0.5 }}
 [camera]
-kind = "virtual"
-bench = "{folder}/bench.toml"
+bus = "virtual:{folder}/hardware.sock"
 """
 
 
-def write_configuration(folder: Path) -> Path:
+def write_configuration(
+    folder: Path, refresh_hz: float = 50.0, solve_ms: float = 12.0, stale_limit_ms: float = 400.0
+) -> Path:
     """A bundle, a bench and a configuration in `folder`; returns the configuration's path.
 
-    The limits are wide, so that a busy machine does not look like a fault.
+    The limits are wide at first, so that a busy machine does not look like a fault.
     """
     path = converted(ideal_path(SHAPE, DISTANCE_MM * 1e-3), np.float32)
     records, arrays = pack_light_paths([("green", DISTANCE_MM, 520.0, path)])
     write_bundle(folder / "bundle", arrays, {"paths": records, "distance_mm": DISTANCE_MM}, {})
     (folder / "bench.toml").write_text(BENCH)
     file = folder / "headset.toml"
-    file.write_text(CONFIGURATION.format(folder=folder))
+    file.write_text(
+        CONFIGURATION.format(
+            folder=folder, refresh_hz=refresh_hz, solve_ms=solve_ms, stale_limit_ms=stale_limit_ms
+        )
+    )
     return file
+
+
+def reached(path: Path, within_s: float = 20.0) -> Remote:
+    """The emulated hardware at a socket, once it answers."""
+    until = time.monotonic() + within_s
+    while True:
+        try:
+            return Remote(str(path))
+        except OSError:
+            if time.monotonic() > until:
+                raise
+            time.sleep(0.02)
+
+
+@contextmanager
+def hardware(folder: Path, seed: int = 0) -> Iterator[Remote]:
+    """Emulated hardware for the configuration in `folder`, in a process of its own."""
+    socket = folder / "hardware.sock"
+    command = [sys.executable, "-m", "firmware_iface.virtual.served", str(socket)]
+    process = subprocess.Popen(
+        [*command, "--bench", str(folder / "bench.toml"), "--seed", str(seed)], env=ENVIRONMENT
+    )
+    try:
+        remote = reached(socket)
+        yield remote
+        remote.close()
+    finally:
+        process.kill()
+        process.wait()
 
 
 @contextmanager
@@ -69,7 +104,7 @@ def served(file: Path, **environment: str) -> Iterator[subprocess.Popen[str]]:
     """The service of a configuration, ready; ends with the block, by SIGTERM."""
     process = subprocess.Popen(
         [sys.executable, "-m", "runtime.cli", "serve", str(file), "--json"],
-        env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
+        env={**ENVIRONMENT, **environment},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -103,7 +138,7 @@ def connected(file: Path, within_s: float = 20.0, slots: int = 3) -> Client:
 
 def picture(client: Client, seed: int = 0) -> np.ndarray:
     """A smooth picture of the client's shape, uint16."""
-    channels, height, width = client.shape
+    _, height, width = client.shape
     y, x = np.mgrid[0:height, 0:width]
     one = 0.5 + 0.4 * np.sin(0.3 * x + 0.2 * y + seed)
     return np.broadcast_to(65535 * one, client.shape).astype(np.uint16)

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from runtime.service.frames import FrameCalls, OrderError
 
 CALLS = st.lists(
-    st.tuples(st.sampled_from(["wait", "begin", "end", "settle"]), st.integers(0, 4), st.integers(0, 2)), max_size=40
+    st.tuples(st.sampled_from(["wait", "begin", "end", "settle"]), st.integers(0, 4), st.integers(0, 2)),
+    max_size=40,
 )
 
 

@@ -88,7 +88,9 @@ def test_the_c_header_has_the_same_bytes(tmp_path: Path) -> None:
     for code, kind in PROTOCOL._types.items():
         struct = f"struct hololoop_{STRUCTS.get(kind, kind.__name__.lower())}"
         offset = 8
-        lines.append(f"_Static_assert(HOLOLOOP_{kind.__name__.upper()} == {code}, \"code of {kind.__name__}\");")
+        lines.append(
+            f'_Static_assert(HOLOLOOP_{kind.__name__.upper()} == {code}, "code of {kind.__name__}");'
+        )
         for name, form in zip(kind._fields, formats(kind), strict=True):
             lines.append(f'_Static_assert(offsetof({struct}, {name}) == {offset}, "{kind.__name__}.{name}");')
             offset += {"H": 2, "I": 4, "Q": 8, "f": 4, "8s": 8, "240s": 240}[form]
@@ -97,15 +99,31 @@ def test_the_c_header_has_the_same_bytes(tmp_path: Path) -> None:
     names |= {f"NO_{part}": part for part in ("SOLVER", "PANEL", "LASERS", "CAMERA")}
     in_c = {python: c for c, python in names.items()}
     for code in protocol.Code:
-        lines.append(f"_Static_assert(HOLOLOOP_{in_c.get(code.name, code.name)} == {code.value}, \"{code.name}\");")
+        lines.append(
+            f'_Static_assert(HOLOLOOP_{in_c.get(code.name, code.name)} == {code.value}, "{code.name}");'
+        )
     for state in protocol.Lasers:
         lines.append(f'_Static_assert(HOLOLOOP_LASERS_{state.name} == {state.value}, "{state.name}");')
     for part in protocol.Part:
         lines.append(f'_Static_assert(HOLOLOOP_{part.name} == {part.value}, "{part.name}");')
     source = tmp_path / "check.c"
-    source.write_text("\n".join(["#include <stddef.h>", f'#include "{HEADER_FILE}"', *lines, "int main(void) { return 0; }"]))
+    source.write_text(
+        "\n".join(
+            ["#include <stddef.h>", f'#include "{HEADER_FILE}"', *lines, "int main(void) { return 0; }"]
+        )
+    )
     done = subprocess.run(
-        ["cc", "-std=c11", "-Wall", "-Werror", "-pedantic", "-c", str(source), "-o", str(tmp_path / "check.o")],
+        [
+            "cc",
+            "-std=c11",
+            "-Wall",
+            "-Werror",
+            "-pedantic",
+            "-c",
+            str(source),
+            "-o",
+            str(tmp_path / "check.o"),
+        ],
         capture_output=True,
         text=True,
         check=False,

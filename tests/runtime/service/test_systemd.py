@@ -21,7 +21,9 @@ def test_notifications_arrive_as_sd_notify_sends_them(tmp_path: Path) -> None:
     path = tmp_path / "notify"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(path))
-        notifier = Notifier({"NOTIFY_SOCKET": str(path), "WATCHDOG_USEC": "2000000", "WATCHDOG_PID": str(os.getpid())})
+        notifier = Notifier(
+            {"NOTIFY_SOCKET": str(path), "WATCHDOG_USEC": "2000000", "WATCHDOG_PID": str(os.getpid())}
+        )
         assert notifier.watchdog_s == 1.0
         notifier.ready("up")
         notifier.alive()

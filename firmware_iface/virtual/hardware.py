@@ -1,0 +1,90 @@
+"""A headset's hardware, emulated down to the bytes, with a simulated bench between its parts.
+
+What the panel board was sent and what comes out of the laser board make what the camera sees. `served` runs it
+in a process of its own, so that it goes on when the process that drives it dies, as hardware does.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import DeviceError, DeviceGoneError
+from .description import load_bench
+from .faults import Faults
+from .headset import VirtualHeadset
+from .i2c import LaserBoard
+from .usb.board import BoardModel
+
+TICK_S = 0.001
+REMEMBERED = 20000  # changes of light
+
+
+class Hardware:
+    """Panel board, laser board and camera around one simulated bench; key on, interlock closed.
+
+    bench : as `virtual.headset.open_headset` takes it
+
+    Attributes: headset, board (of the panel), lasers (their board), faults (script of each part),
+    light ((time s, µW of all lasers) at each change), whole (CRC-32 of each pattern that the panel displayed).
+    """
+
+    def __init__(self, bench: str, seed: int = 0) -> None:
+        self.headset = VirtualHeadset(load_bench(bench), seed)
+        self.board = BoardModel(self.headset.panel.shape)
+        self.light: deque[tuple[float, float]] = deque([(time.monotonic(), 0.0)], REMEMBERED)
+        self.whole: dict[int, int] = {}
+        self.lasers = LaserBoard(emission=lambda at, power: self.light.append((at, sum(power.values()))))
+        self.lasers.key = self.lasers.interlock = True
+        self._full_uw = {d.name: 1 / d.photodiode_v_per_uw for d in self.lasers.diodes}
+        self.faults = {
+            "panel": self.board.faults,
+            "lasers": self.lasers.bus.faults,
+            "camera": Faults(seed),
+        }
+        self._lock = threading.Lock()
+
+    def run(self) -> None:
+        """Let time pass for the parts, for ever: also with nobody on the bus the dead-man acts and frames appear."""
+        while True:
+            self.lasers.settle()
+            self.board.gray  # noqa: B018 - a period that is over displays what was committed
+            while self.board.shown:
+                _, crc = self.board.shown.popleft()
+                self.whole[crc] = self.whole.get(crc, 0) + 1
+            time.sleep(TICK_S)
+
+    def capture(self, exposure_ms: float) -> NDArray[np.uint16]:
+        """What the camera sees, uint16 counts [h, w]. Raises DeviceError as its faults say."""
+        faults = self.faults["camera"]
+        fault = faults.take("unplug", "hang", "timeout", "late", "garbage", "die")
+        if fault == "unplug":
+            raise DeviceGoneError("the camera is not attached; check its cable.")
+        while fault == "hang" and faults.standing("hang"):
+            time.sleep(TICK_S)
+        if fault == "timeout":
+            raise DeviceError("the camera did not deliver a picture in time.")
+        if fault == "late":
+            time.sleep(faults.late_s)
+        with self._lock:
+            emitted = self.lasers.emitted_uw
+            self.headset.panel.show(self.board.gray)
+            for channel in self.headset.lasers.channels:
+                share = emitted.get(channel, 0.0) / self._full_uw.get(channel, 1.0)
+                self.headset.lasers.set_power(channel, min(1.0, share))
+            self.headset.camera.exposure_ms = exposure_ms
+            counts = self.headset.camera.capture()
+        if fault == "garbage":
+            counts = np.frombuffer(faults.garbled(counts.tobytes()), np.uint16).reshape(counts.shape)
+        return counts
+
+    def light_since(self, since_s: float) -> list[tuple[float, float]]:
+        """What the light was at `since_s`, and each change after it."""
+        self.lasers.settle()
+        changes = list(self.light)
+        first = max((k for k, (at, _) in enumerate(changes) if at <= since_s), default=0)
+        return changes[first:]

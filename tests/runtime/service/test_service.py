@@ -1,0 +1,305 @@
+"""The whole service over emulated hardware: real pyusb, real smbus2, real processes and sockets."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from firmware_iface.virtual.served import Remote
+from runtime.service import protocol
+from runtime.service.client import Client, Lost, RefusedError
+from runtime.service.messages import HEADER
+from runtime.service.protocol import Code, Lasers, Part, Shown
+from tests.runtime.service.running import connected, hardware, picture, served, write_configuration
+
+
+class Headset(NamedTuple):
+    file: Path
+    remote: Remote
+
+
+@pytest.fixture(scope="module")
+def headset(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Headset]:
+    file = write_configuration(tmp_path_factory.mktemp("headset"))
+    with hardware(file.parent) as remote, served(file):
+        connected(file).close()
+        yield Headset(file, remote)
+
+
+@pytest.fixture
+def client(headset: Headset) -> Iterator[Client]:
+    with connected(headset.file) as client:
+        until(lambda: {client.status().panel, client.status().camera} == {Part.FRESH})
+        yield client
+        client.dark()
+
+
+def until(condition: Callable[[], object], within_s: float = 15.0) -> None:
+    end = time.monotonic() + within_s
+    while not condition():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.01)
+
+
+def show(client: Client, frames: int) -> list[Shown | Lost]:
+    """What became of so many frames."""
+    outcomes: list[Shown | Lost] = []
+    for k in range(frames):
+        client.show(picture(client, k))
+        outcomes += client.outcomes()
+    while client.in_flight:
+        outcomes += client.outcomes(5)
+    return outcomes
+
+
+def light_up(client: Client) -> None:
+    client.clear()
+    client.arm()
+    until(lambda: show(client, 3) and client.status().lasers == Lasers.EMITTING)
+    show(client, 12)  # the ramp
+
+
+def emitted_uw(remote: Remote) -> float:
+    return remote.light()[-1][1]
+
+
+def test_every_frame_is_shown_and_what_the_panel_displays_is_what_was_solved(
+    headset: Headset, client: Client
+) -> None:
+    outcomes = show(client, 20)
+    assert [o.frame for o in outcomes] == list(range(1, 21))
+    assert all(isinstance(o, Shown) and o.psnr_db > 10 for o in outcomes)
+    displayed = headset.remote.whole()
+    assert {o.pattern_crc for o in outcomes if isinstance(o, Shown)} <= displayed
+
+
+def test_light_needs_clear_and_arm_and_a_fresh_picture(headset: Headset, client: Client) -> None:
+    show(client, 3)
+    assert emitted_uw(headset.remote) == 0 and client.status().lasers in (Lasers.OFF, Lasers.FAULT)
+    with pytest.raises(RefusedError, match="Clear first"):
+        client.arm()
+    light_up(client)
+    assert emitted_uw(headset.remote) == pytest.approx(50, rel=0.02)
+    until(lambda: emitted_uw(headset.remote) == 0, 3)  # nothing new is shown
+    assert client.status().lasers == Lasers.ARMED
+    show(client, 15)
+    assert emitted_uw(headset.remote) > 0  # without clearing or arming: nothing was wrong
+    client.dark()
+    assert emitted_uw(headset.remote) == 0
+
+
+def test_the_camera_sees_what_the_lasers_light(headset: Headset, client: Client) -> None:
+    dark = client.capture().mean()
+    light_up(client)
+    assert client.capture().mean() > dark + 20
+    show(client, 1)
+
+
+def test_an_open_interlock_is_dark_and_latches(headset: Headset, client: Client) -> None:
+    light_up(client)
+    opened = headset.remote.set_to("interlock", False)
+    assert emitted_uw(headset.remote) == 0
+    assert all(at < opened + 0.02 for at, power in headset.remote.light(opened) if power)
+    until(lambda: client.status().lasers == Lasers.FAULT)
+    with pytest.raises(RefusedError, match="interlock"):
+        client.clear()
+    headset.remote.set_to("interlock", True)
+    show(client, 10)
+    assert emitted_uw(headset.remote) == 0  # closing it is not enough
+    light_up(client)
+    assert emitted_uw(headset.remote) > 0
+
+
+def test_a_panel_that_is_unplugged_is_dark_and_comes_back_without_a_restart(
+    headset: Headset, client: Client
+) -> None:
+    light_up(client)
+    headset.remote.break_part("panel", "unplug")
+    until(lambda: emitted_uw(headset.remote) == 0, 3)
+    lost = show(client, 3)
+    assert lost and all(isinstance(o, Lost) and o.code == Code.PANEL for o in lost)
+    until(lambda: client.status().panel == Part.LOST)
+    headset.remote.mend("panel")
+    until(lambda: client.status().panel == Part.FRESH)
+    light_up(client)
+    assert emitted_uw(headset.remote) > 0
+
+
+@pytest.mark.parametrize("name", ["solver", "camera"])
+def test_a_killed_process_is_dark_and_is_started_again(headset: Headset, client: Client, name: str) -> None:
+    light_up(client)
+    os.kill(child(client, name), signal.SIGKILL)
+    until(lambda: emitted_uw(headset.remote) == 0, 3)
+    until(lambda: getattr(client.status(), name) == Part.FRESH)
+    light_up(client)
+    assert emitted_uw(headset.remote) > 0
+
+
+def child(client: Client, name: str) -> int:
+    """The number of the service's solver or camera process."""
+    service = client._link.peer().pid
+    for pid in Path(f"/proc/{service}/task/{service}/children").read_text().split():
+        if f"{name}_process" in Path(f"/proc/{pid}/cmdline").read_text():
+            return int(pid)
+    raise AssertionError(f"there is no {name} process")
+
+
+def test_a_slot_that_is_written_after_end_is_not_shown(client: Client) -> None:
+    timing = client.wait()
+    client.begin(timing)
+    client.slot()[:] = picture(client)
+    assert client._ring is not None
+    right = protocol.End(timing.frame, 0, 12345)
+    client._taken[timing.frame] = 0
+    client._ask(right, protocol.Done)
+    [outcome] = client.outcomes(5)
+    assert isinstance(outcome, Lost) and outcome.code == Code.TORN
+
+
+def test_one_program_has_the_display_and_others_may_look_and_darken(headset: Headset, client: Client) -> None:
+    light_up(client)
+    with connected(headset.file) as other:
+        with pytest.raises(RefusedError) as refused:
+            other.wait()
+        assert refused.value.code == Code.BUSY
+        assert other.status().shown > 0
+        other.dark()
+    assert emitted_uw(headset.remote) == 0
+
+
+def test_the_display_is_free_when_its_program_goes(headset: Headset, client: Client) -> None:
+    client.show(picture(client))
+    client.close()
+    with connected(headset.file) as other:
+        assert show(other, 2)
+        other.dark()
+    object.__setattr__(client, "dark", lambda: None)
+
+
+def test_frame_calls_out_of_order_are_refused(client: Client) -> None:
+    timing = client.wait()
+    with pytest.raises(RefusedError) as refused:
+        client._ask(protocol.End(timing.frame, 0, 0), protocol.Done)
+    assert refused.value.code == Code.ORDER
+    with pytest.raises(RefusedError) as refused:
+        client._ask(protocol.Begin(77), protocol.Done)
+    assert refused.value.code == Code.ORDER
+    client.begin(timing)
+    with pytest.raises(RefusedError) as refused:
+        client._ask(protocol.End(timing.frame, 9, 0), protocol.Done)
+    assert refused.value.code == Code.SLOT
+
+
+def raw(headset: Headset) -> socket.socket:
+    connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    connection.settimeout(10)
+    connection.connect(str(headset.file.parent / "service.sock"))
+    return connection
+
+
+def test_a_version_that_is_not_spoken_is_refused_with_the_ones_that_are(headset: Headset) -> None:
+    with raw(headset) as connection:
+        connection.send(protocol.PROTOCOL.pack(protocol.Hello(protocol.MAGIC, 7, 9), 1))
+        serial, error = protocol.PROTOCOL.unpack(connection.recv(512))
+        assert (serial, error.code) == (1, Code.VERSION) and "1 to 1" in error.text
+        assert connection.recv(512) == b""
+
+
+def test_random_messages_are_answered_by_errors_and_harm_nobody(headset: Headset, client: Client) -> None:
+    """Seeded: whole garbage, garbage behind a right header, right messages in a wrong order."""
+    rng = np.random.default_rng(5)
+    kinds = protocol.PROTOCOL._bodies
+    for k in range(300):
+        with raw(headset) as connection:
+            for _ in range(rng.integers(1, 5)):
+                code = int(rng.integers(0, 20))
+                body = rng.bytes(int(rng.integers(0, 64)))
+                kind = list(kinds)[int(rng.integers(len(kinds)))]
+                fitting = rng.bytes(kinds[kind].size)
+                data = [
+                    body or b"x",
+                    HEADER.pack(code, 8 + len(body), k) + body,
+                    HEADER.pack(protocol.PROTOCOL._codes[kind], 8 + len(fitting), k + 1) + fitting,
+                    protocol.PROTOCOL.pack(protocol.Hello(protocol.MAGIC, 1, 1), 1),
+                ][int(rng.integers(4))]
+                try:
+                    connection.send(data)
+                except OSError:
+                    break
+    assert len(show(client, 5)) == 5
+
+
+def test_a_passed_pipe_or_unsealed_memory_is_refused_as_a_ring(client: Client) -> None:
+    count, size = client.slots, 2 * int(np.prod(client.shape))
+    reading, writing = os.pipe()
+    loose = os.memfd_create("loose")
+    os.ftruncate(loose, count * size)
+    try:
+        for fds in ([reading], [loose], []):
+            with pytest.raises(RefusedError) as refused:
+                client._ask(protocol.Ring(count, size), protocol.Done, fds)
+            assert refused.value.code == Code.RING
+    finally:
+        for fd in (reading, writing, loose):
+            os.close(fd)
+    assert len(show(client, 2)) == 2
+
+
+def test_sigterm_is_dark_first_and_tells_programs(tmp_path: Path) -> None:
+    file = write_configuration(tmp_path)
+    notify = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    with notify, hardware(tmp_path) as remote:
+        notify.bind(str(tmp_path / "notify"))
+        notify.settimeout(20)
+        with served(file, NOTIFY_SOCKET=str(tmp_path / "notify"), WATCHDOG_USEC="400000") as process:
+            assert notify.recv(500).startswith(b"READY=1")
+            assert notify.recv(500) == b"WATCHDOG=1"
+            with connected(file) as client:
+                until(lambda: client.status().panel == Part.FRESH and client.status().camera == Part.FRESH)
+                light_up(client)
+                client.show(picture(client))
+                assert emitted_uw(remote) > 0
+                process.send_signal(signal.SIGTERM)
+                out, err = process.communicate(timeout=10)
+            assert process.returncode == 0, err
+            assert json.loads(out)["served"]["shown"] > 0
+            assert emitted_uw(remote) == 0
+
+
+def test_a_service_that_is_killed_is_dark_by_the_dead_man_and_can_be_started_again(tmp_path: Path) -> None:
+    file = write_configuration(tmp_path)
+    with hardware(tmp_path) as remote:
+        with served(file) as process, connected(file) as client:
+            until(lambda: client.status().panel == Part.FRESH and client.status().camera == Part.FRESH)
+            light_up(client)
+            assert emitted_uw(remote) > 0
+            killed = time.monotonic()
+            process.kill()
+            process.wait()
+            until(lambda: emitted_uw(remote) == 0, 1)
+            assert max(at for at, _ in remote.light(killed)) < killed + 0.15
+        with served(file), connected(file) as client:
+            until(lambda: client.status().panel == Part.FRESH and client.status().camera == Part.FRESH)
+            light_up(client)
+            assert emitted_uw(remote) > 0
+
+
+def test_a_broken_bundle_ends_the_service_with_a_sentence(tmp_path: Path) -> None:
+    file = write_configuration(tmp_path)
+    arrays = tmp_path / "bundle" / "lightpath.safetensors"
+    data = bytearray(arrays.read_bytes())
+    data[-1] ^= 1
+    arrays.write_bytes(data)
+    with served(file) as process:
+        out, err = process.communicate(timeout=20)
+        assert (process.returncode, out) == (2, "")
+        assert "SHA-256" in err and "Traceback" not in err
