@@ -24,11 +24,12 @@ exposure_ms = 10.0
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from .errors import InputError
+from .errors import InputError, nearest
+from .lasers import VIRTUAL_CHANNELS, LaserChannel
 from .virtual.tables import parameter, read_table
 
 Table = Mapping[str, Any]
@@ -56,9 +57,11 @@ class LasersTable:
 class CameraTable:
     """[camera]"""
 
-    kind: str = parameter("virtual", "which camera", choices=("virtual",))
+    kind: str = parameter("oak", "which camera", choices=("oak", "virtual"))
     bus: str = parameter("", "virtual:SOCKET")
-    exposure_ms: float = parameter(10.0, "exposure time", 0.01, 10000)
+    address: str = parameter("", "IP address, MX ID or USB path")
+    exposure_ms: float = parameter(10.0, "exposure time", 0.001, 10000)
+    frames_per_s: float = parameter(60.0, "pictures a second", 1, 1000)
 
 
 def open_panel(table: Table) -> Any:
@@ -79,27 +82,55 @@ def open_panel(table: Table) -> Any:
 
 def open_lasers(table: Table) -> Any:
     """The lasers of a configuration's [lasers], dark. Raises InputError or DeviceError."""
-    from .lasers import VIRTUAL_CHANNELS, LaserChannel
     from .lasers import open_lasers as open_board
     from .virtual.served import i2c_bus
 
     asked = read_table(LasersTable, table, "[lasers]", ignore=("power", "channel"))
-    virtual = asked.bus.startswith("virtual:")
-    given = table.get("channel", [])
-    if not isinstance(given, list) or not (given or virtual):
-        raise InputError("[lasers] describes no laser: write [[lasers.channel]] for each")
-    channels = [read_table(LaserChannel, one, f"[[lasers.channel]] {k}") for k, one in enumerate(given)]
-    return open_board(i2c_bus(asked.bus) if virtual else asked.bus, channels or VIRTUAL_CHANNELS)
+    bus = i2c_bus(asked.bus) if asked.bus.startswith("virtual:") else asked.bus
+    return open_board(bus, laser_channels(table))
 
 
 def open_camera(table: Table) -> Any:
     """The camera of a configuration's [camera]. Raises InputError or DeviceError."""
+    asked = read_table(CameraTable, table, "[camera]")
+    if asked.kind == "oak":
+        from .camera import open_oak
+
+        return open_oak(
+            asked.address,
+            frames_per_s=asked.frames_per_s,
+            exposure_ms=asked.exposure_ms,
+            timeout_s=1.0,
+            starved_s=0.5,
+        )
     from .virtual.served import RemoteCamera, reach
 
-    asked = read_table(CameraTable, table, "[camera]")
     camera = RemoteCamera(reach(asked.bus))
     camera.exposure_ms = asked.exposure_ms
     return camera
+
+
+def check_tables(tables: Mapping[str, Table]) -> None:
+    """Check [panel], [lasers] and [camera] without opening anything. Raises InputError."""
+    for part, kind, others in (
+        ("panel", PanelTable, ()),
+        ("lasers", LasersTable, ("power", "channel")),
+        ("camera", CameraTable, ()),
+    ):
+        if part in tables:
+            read_table(kind, tables[part], f"[{part}]", ignore=others)
+    laser_channels(tables["lasers"])
+    laser_power(tables["lasers"])
+
+
+def laser_channels(table: Table) -> Sequence[LaserChannel]:
+    """The lasers of [[lasers.channel]]; on an emulated board, where there are none, its own. Raises InputError."""
+    given = table.get("channel", [])
+    if not given and str(table.get("bus")).startswith("virtual:"):
+        return VIRTUAL_CHANNELS
+    if not isinstance(given, list) or not given:
+        raise InputError("[lasers] describes no laser: write [[lasers.channel]] for each")
+    return [read_table(LaserChannel, one, f"[[lasers.channel]] {k}") for k, one in enumerate(given)]
 
 
 def laser_power(table: Table) -> dict[str, float]:
@@ -112,4 +143,10 @@ def laser_power(table: Table) -> dict[str, float]:
     for channel, fraction in power.items():
         if isinstance(fraction, bool) or not isinstance(fraction, int | float) or not 0 <= fraction <= 1:
             raise InputError(f"the power of '{channel}' in [lasers] is {fraction!r}; give a fraction, 0 to 1")
+    names = [channel.name for channel in laser_channels(table)]
+    for channel in power:
+        if channel not in names:
+            raise InputError(
+                f"there is no laser '{channel}' for power in [lasers]; {nearest(channel, names)}"
+            )
     return {channel: float(fraction) for channel, fraction in power.items()}

@@ -18,6 +18,7 @@ from .description import load_bench
 from .faults import Faults
 from .headset import VirtualHeadset
 from .i2c import LaserBoard
+from .oak import OakModel
 from .usb.board import BoardModel
 
 TICK_S = 0.001
@@ -70,6 +71,13 @@ class Hardware:
             raise DeviceError("the camera did not deliver a picture in time.")
         if fault == "late":
             time.sleep(faults.late_s)
+        counts = self.exposed(exposure_ms)
+        if fault == "garbage":
+            counts = np.frombuffer(faults.garbled(counts.tobytes()), np.uint16).reshape(counts.shape)
+        return counts
+
+    def exposed(self, exposure_ms: float) -> NDArray[np.uint16]:
+        """What falls on the camera, uint16 counts [h, w]."""
         with self._lock:
             emitted = self.lasers.emitted_uw
             self.headset.panel.show(self.board.gray)
@@ -77,10 +85,19 @@ class Hardware:
                 share = emitted.get(channel, 0.0) / self._full_uw.get(channel, 1.0)
                 self.headset.lasers.set_power(channel, min(1.0, share))
             self.headset.camera.exposure_ms = exposure_ms
-            counts = self.headset.camera.capture()
-        if fault == "garbage":
-            counts = np.frombuffer(faults.garbled(counts.tobytes()), np.uint16).reshape(counts.shape)
-        return counts
+            return self.headset.camera.capture()
+
+    def attach_oak(self, address: str) -> None:
+        """Let an emulated OAK camera look at the bench, at a loopback address; its faults are the camera's."""
+        shift = self.headset.camera.bit_depth - 10
+
+        def expose(exposure_ms: float, gain: float) -> NDArray[np.uint16]:
+            counts = self.exposed(exposure_ms * gain)
+            return (counts.astype(np.float64) * 2.0**-shift).astype(np.uint16)
+
+        self.oak = OakModel(
+            expose, self.headset.camera.shape, address, frames_per_s=120.0, faults=self.faults["camera"]
+        )
 
     def light_since(self, since_s: float) -> list[tuple[float, float]]:
         """What the light was at `since_s`, and each change after it."""

@@ -255,6 +255,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m firmware_iface.virtual.served", description=__doc__)
     parser.add_argument("socket", help="path of the Unix socket to listen at")
     parser.add_argument("--bench", default="virtual:demo", help="virtual:NAME or a TOML file")
+    parser.add_argument("--oak", metavar="ADDRESS", help="a loopback address to emulate an OAK camera at")
     parser.add_argument("--seed", type=int, default=0, help="of noise and garbage")
     args = parser.parse_args()
     ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # emulated hardware is not to outlive its test
@@ -264,6 +265,8 @@ def main() -> None:
             os.unlink(path)
     BoardServer(hardware.lasers, Path(args.socket + LASERS))
     listener = Listener(args.socket, "AF_UNIX", backlog=16)
+    if args.oak:
+        hardware.attach_oak(args.oak)
     threading.Thread(target=hardware.run, daemon=True).start()
     while True:
         connection = listener.accept()

@@ -12,13 +12,13 @@ import queue
 import sys
 import threading
 import time
-from contextlib import suppress
+from contextlib import closing
 from typing import Any
 
 import numpy as np
 
 from firmware_iface.assembled import open_camera
-from firmware_iface.errors import DeviceError, InputError
+from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
 from runtime.service.children import child_link
 from runtime.service.configuration import read_configuration
 from runtime.service.inside import CAMERA, Missing, Seen, Take
@@ -26,6 +26,7 @@ from runtime.service.link import Link
 from runtime.service.ring import sealed_copy
 
 STARVED_S = 2.0  # beyond the exposure: a library that has delivered nothing for so long has hung
+OPENING_S = 20.0  # a camera on a network takes seconds
 AGAIN_S = 0.2
 SHORTEST_S = 0.010  # from one picture to the next, so that a fast camera does not take a core
 
@@ -54,26 +55,33 @@ def main(fd: str, configuration: str) -> None:
     table = read_configuration(configuration).devices["camera"]
     wanted: queue.SimpleQueue[int] = queue.SimpleQueue()
     threading.Thread(target=_requests, args=(link, wanted), daemon=True).start()
-    watchdog = Watchdog(STARVED_S + 15.0)  # opening a camera over a network takes seconds
+    watchdog = Watchdog(OPENING_S)
     watchdog.start()
     while True:
-        camera: Any = None
         try:
             camera = open_camera(table)
-            watchdog.limit_s = STARVED_S + camera.exposure_ms * 1e-3
-            while True:
-                _picture(link, camera, wanted)
-                watchdog.fed()
-        except (DeviceError, OSError, InputError) as error:
-            if isinstance(error, ConnectionError):
-                raise
+        except (DeviceError, InputError) as error:
             link.send(Missing(str(error)))
-        finally:
-            if camera is not None:
-                with suppress(DeviceError, OSError):
-                    camera.close()
+        else:
+            watchdog.fed()
+            watchdog.limit_s = STARVED_S + camera.exposure_ms * 1e-3
+            with closing(camera):
+                _pictures(link, camera, wanted, watchdog)
         watchdog.fed()
+        watchdog.limit_s = OPENING_S
         time.sleep(AGAIN_S)
+
+
+def _pictures(link: Link, camera: Any, wanted: queue.SimpleQueue[int], watchdog: Watchdog) -> None:
+    """Take pictures until the camera has gone."""
+    while True:
+        try:
+            _picture(link, camera, wanted)
+        except DeviceError as error:
+            link.send(Missing(str(error)))
+            if isinstance(error, DeviceGoneError):
+                return
+        watchdog.fed()
 
 
 def _requests(link: Link, wanted: queue.SimpleQueue[int]) -> None:

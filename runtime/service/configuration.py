@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from firmware_iface.assembled import check_tables
 from firmware_iface.errors import InputError, nearest
 from firmware_iface.virtual.tables import parameter, read_table
 
@@ -89,4 +90,5 @@ def read_configuration(file: str | os.PathLike[str]) -> Configuration:
     for name in ("panel", "lasers"):
         if name not in devices:
             raise InputError(f"{file} has no [{name}]: add it, the service cannot show anything without")
+    check_tables(devices)
     return Configuration(path, path.parent / bundle, timing, frozenset({0, os.getuid(), *users}), devices)

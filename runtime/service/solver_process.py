@@ -124,7 +124,10 @@ def main(fd: str, configuration: str) -> None:
     except InputError as error:
         link.send(Unsolved(0, Code.SOLVER, str(error)))
         return
-    worker = Worker(link, (len(paths), *paths[0].grid.shape))
+    shape = (len(paths), *paths[0].grid.shape)
+    for _ in patterns(paths, np.ones(shape, np.float32), time.monotonic_ns()):
+        pass  # what is made at the first use is made before the first frame
+    worker = Worker(link, shape)
     worker.run(lambda target, deadline_ns: patterns(paths, target, deadline_ns))
 
 

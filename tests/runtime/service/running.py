@@ -46,6 +46,7 @@ refresh_hz = 1000.0
 bus = "virtual:{folder}/hardware.sock"
 power = {{ green = 0.5 }}
 [camera]
+kind = "virtual"
 bus = "virtual:{folder}/hardware.sock"
 """
 

@@ -201,8 +201,8 @@ def test_frame_calls_out_of_order_are_refused(client: Client) -> None:
 
 def raw(headset: Headset) -> socket.socket:
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    connection.settimeout(10)
     connection.connect(str(headset.file.parent / "service.sock"))
+    connection.settimeout(10)
     return connection
 
 
