@@ -9,11 +9,12 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import DeviceError, DeviceGoneError
+from ..errors import DeviceError, DeviceGoneError, InputError
 from .description import load_bench
 from .faults import Faults
 from .headset import VirtualHeadset
@@ -86,6 +87,21 @@ class Hardware:
                 self.headset.lasers.set_power(channel, min(1.0, share))
             self.headset.camera.exposure_ms = exposure_ms
             return self.headset.camera.capture()
+
+    def set_to(self, name: str, value: Any) -> None:
+        """Do something to the laser board: key or interlock (bool), celsius, photodiodes (False: cut), efficiency
+        (of every diode; 1: as calibrated). Raises InputError for another name."""
+        if name in ("key", "interlock", "celsius"):
+            setattr(self.lasers, name, value)
+            return
+        if name not in ("photodiodes", "efficiency"):
+            raise InputError(f"the laser board has no '{name}'.")
+        for k, diode in enumerate(self.lasers.diodes):
+            if name == "photodiodes":
+                self.lasers.break_photodiode(k, not value)
+            else:
+                diode.efficiency = value
+        self.lasers.settle()
 
     def attach_oak(self, address: str) -> None:
         """Let an emulated OAK camera look at the bench, at a loopback address; its faults are the camera's."""

@@ -74,7 +74,7 @@ class Remote:
         return self.ask({"do": "mend", "part": part})[0]
 
     def set_to(self, name: str, value: Any) -> float:
-        """Set `key`, `interlock` or `celsius` of the laser board; the time, monotonic s."""
+        """Set what `Hardware.set_to` knows; the time, monotonic s."""
         return self.ask({"do": "set", "name": name, "to": value})[0]
 
     def light(self, since_s: float = 0.0) -> list[tuple[float, float]]:
@@ -200,9 +200,9 @@ def answer(hardware: Hardware, request: dict[str, Any], data: bytes) -> tuple[An
         case {"do": "mend", "part": part}:
             hardware.faults[part].clear()
             return time.monotonic(), b""
-        case {"do": "set", "name": "key" | "interlock" | "celsius" as name, "to": value}:
+        case {"do": "set", "name": name, "to": value}:
             at = time.monotonic()
-            setattr(hardware.lasers, name, value)
+            hardware.set_to(name, value)
             return at, b""
         case {"do": "light", "since": since}:
             return hardware.light_since(since), b""

@@ -17,7 +17,7 @@ CONFIG is one TOML file:
   socket = "/run/hololoop/service.sock"  # unless systemd passes one
   refresh_hz = 60.0                      # pictures a second
   solve_ms = 12.0                        # time for a pattern
-  stale_limit_ms = 100.0                 # what is older than this is not lit
+  stale_limit_ms = 80.0                  # what is older than this is not lit
   metrics_port = 9464                    # http://127.0.0.1:9464/metrics; 0: none
   users = [1000]                         # besides root and the service's own user, who may connect
 

@@ -34,7 +34,7 @@ class Timing:
     refresh_hz: float = parameter(60.0, "pictures a second", 1, 2000)
     solve_ms: float = parameter(12.0, "time for a pattern, ms", 0.1, 60000)
     stale_limit_ms: float = parameter(
-        100.0, "a pattern, or a sign of life of panel, solver or camera, older than this is dark", 20, 10000
+        80.0, "a pattern, or a sign of life of panel, solver or camera, older than this is dark", 20, 10000
     )
     metrics_port: int = parameter(0, "of http://127.0.0.1/metrics; 0: none", 0, 65535)
     socket: str = parameter("/run/hololoop/service.sock", "path of the Unix socket")

@@ -19,7 +19,7 @@ from runtime.service import protocol
 from runtime.service.client import Client, Lost, RefusedError
 from runtime.service.messages import HEADER
 from runtime.service.protocol import Code, Lasers, Part, Shown
-from tests.runtime.service.running import connected, hardware, picture, served, write_configuration
+from tests.campaigns.headset import connected, hardware, picture, served, write_configuration
 
 
 class Headset(NamedTuple):

@@ -14,7 +14,7 @@ from firmware_iface.errors import InputError
 from runtime.service.configuration import read_configuration
 from runtime.service.systemd import Notifier, passed_socket
 from runtime.service.units import write_units
-from tests.runtime.service.running import write_configuration
+from tests.campaigns.headset import write_configuration
 
 
 def test_notifications_arrive_as_sd_notify_sends_them(tmp_path: Path) -> None:

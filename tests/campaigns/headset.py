@@ -1,9 +1,10 @@
-"""A running service for tests: its own process, a small virtual headset, a folder that is thrown away."""
+"""A small headset for tests and campaigns: configuration, emulated hardware, service, client."""
 
 from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -46,16 +47,20 @@ refresh_hz = 1000.0
 bus = "virtual:{folder}/hardware.sock"
 power = {{ green = 0.5 }}
 [camera]
-kind = "virtual"
-bus = "virtual:{folder}/hardware.sock"
+{camera}
 """
 
 
 def write_configuration(
-    folder: Path, refresh_hz: float = 50.0, solve_ms: float = 12.0, stale_limit_ms: float = 400.0
+    folder: Path,
+    refresh_hz: float = 50.0,
+    solve_ms: float = 12.0,
+    stale_limit_ms: float = 400.0,
+    oak: str | None = None,
 ) -> Path:
     """A bundle, a bench and a configuration in `folder`; returns the configuration's path.
 
+    oak : loopback address of an emulated OAK camera; none: the camera without a link
     The limits are wide at first, so that a busy machine does not look like a fault.
     """
     path = converted(ideal_path(SHAPE, DISTANCE_MM * 1e-3), np.float32)
@@ -63,9 +68,16 @@ def write_configuration(
     write_bundle(folder / "bundle", arrays, {"paths": records, "distance_mm": DISTANCE_MM}, {})
     (folder / "bench.toml").write_text(BENCH)
     file = folder / "headset.toml"
+    camera = f'kind = "virtual"\nbus = "virtual:{folder}/hardware.sock"'
+    if oak:
+        camera = f'kind = "oak"\naddress = "{oak}"\nframes_per_s = 100.0'
     file.write_text(
         CONFIGURATION.format(
-            folder=folder, refresh_hz=refresh_hz, solve_ms=solve_ms, stale_limit_ms=stale_limit_ms
+            folder=folder,
+            refresh_hz=refresh_hz,
+            solve_ms=solve_ms,
+            stale_limit_ms=stale_limit_ms,
+            camera=camera,
         )
     )
     return file
@@ -84,15 +96,14 @@ def reached(path: Path, within_s: float = 20.0) -> Remote:
 
 
 @contextmanager
-def hardware(folder: Path, seed: int = 0) -> Iterator[Remote]:
+def hardware(folder: Path, seed: int = 0, oak: str | None = None) -> Iterator[Remote]:
     """Emulated hardware for the configuration in `folder`, in a process of its own."""
-    socket = folder / "hardware.sock"
-    command = [sys.executable, "-m", "firmware_iface.virtual.served", str(socket)]
-    process = subprocess.Popen(
-        [*command, "--bench", str(folder / "bench.toml"), "--seed", str(seed)], env=ENVIRONMENT
-    )
+    path = folder / "hardware.sock"
+    command = [sys.executable, "-m", "firmware_iface.virtual.served", str(path)]
+    command += ["--bench", str(folder / "bench.toml"), "--seed", str(seed)]
+    process = subprocess.Popen([*command, "--oak", oak] if oak else command, env=ENVIRONMENT)
     try:
-        remote = reached(socket)
+        remote = reached(path)
         yield remote
         remote.close()
     finally:
@@ -143,3 +154,11 @@ def picture(client: Client, seed: int = 0) -> np.ndarray:
     y, x = np.mgrid[0:height, 0:width]
     one = 0.5 + 0.4 * np.sin(0.3 * x + 0.2 * y + seed)
     return np.broadcast_to(65535 * one, client.shape).astype(np.uint16)
+
+
+def knock(file: Path, messages: list[bytes]) -> None:
+    """Send the service of a configuration messages of whatever kind, and go."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
+        connection.connect(str(file.parent / "service.sock"))
+        for message in messages:
+            connection.send(message)

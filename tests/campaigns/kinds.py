@@ -1,0 +1,181 @@
+"""Every kind of fault of the campaign: how it is made, whether it demands darkness, how it is over."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+
+from runtime.service.client import Lost
+from runtime.service.protocol import PROTOCOL, Begin, Code, Done, End
+from tests.campaigns.headset import knock
+from tests.campaigns.lane import Lane
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of fault.
+
+    weight : how often, of all. strike : makes the fault; when, monotonic s. dark : light is not allowed after it.
+    heal : takes the cause away, or nothing. shows : the program goes on showing meanwhile (it would wait otherwise).
+    arm : light comes back only after Clear and Arm
+    """
+
+    name: str
+    weight: float
+    strike: Callable[[Lane], float]
+    dark: bool
+    heal: Callable[[Lane], object] = lambda lane: None
+    shows: bool = True
+    arm: bool = True
+
+
+def _part(part: str, kind: str, weight: float, dark: bool, count: int | None = 1) -> Kind:
+    lasting = count is None
+    return Kind(
+        f"{part} {kind.replace('_', ' ')}",
+        weight,
+        lambda lane: lane.remote.break_part(part, kind, count),
+        dark,
+        lambda lane: lane.remote.mend(part),
+        shows=not (part == "lasers" and lasting),
+    )
+
+
+def _board(name: str, setting: str, bad: object, good: object, weight: float) -> Kind:
+    return Kind(
+        name,
+        weight,
+        lambda lane: lane.remote.set_to(setting, bad),
+        True,
+        lambda lane: lane.remote.set_to(setting, good),
+    )
+
+
+def _child(name: str, what: str, number: int, weight: float, dark: bool) -> Kind:
+    return Kind(
+        what,
+        weight,
+        lambda lane: lane.signal_child(name, number),
+        dark,
+        (lambda lane: lane.signal_child(name, signal.SIGCONT))
+        if number == signal.SIGSTOP
+        else lambda lane: None,
+        shows=False,
+    )
+
+
+def _late_solver(lane: Lane) -> float:
+    """The solver gets no time for four frames."""
+    at = lane.signal_child("solver", signal.SIGSTOP)
+    time.sleep(0.04)
+    lane.signal_child("solver", signal.SIGCONT)
+    return at
+
+
+def _service_killed(lane: Lane) -> float:
+    at = time.monotonic()
+    lane.end_service(signal.SIGKILL)
+    return at
+
+
+def _service_again(lane: Lane) -> None:
+    try:
+        lane.client.status()
+    except OSError:  # so the program knows that what was on its way is lost
+        lane.service = lane.start_service()
+        lane.reconnect()
+        return
+    raise AssertionError("a service that was killed answered")
+
+
+def _service_stopped(lane: Lane) -> float:
+    at = time.monotonic()
+    lane.service.send_signal(signal.SIGSTOP)
+    return at
+
+
+def _program_gone(lane: Lane) -> float:
+    at = time.monotonic()
+    lane.client.close()
+    return at
+
+
+def _program_pauses(lane: Lane) -> float:
+    at = time.monotonic()
+    return at
+
+
+def _torn_slot(lane: Lane) -> float:
+    """A slot that is not what End announced: the frame must come back as torn, and never be seen."""
+    client, at = lane.client, time.monotonic()
+    timing = client.wait()
+    client._ask(Begin(timing.frame), Done)
+    client.slot()[:] = lane.pictures[0]
+    number = client._drawing
+    assert number is not None
+    client._taken[timing.frame], client._drawing = number, None
+    client._ask(End(timing.frame, number, 0xDEAD), Done)
+    lane.accepted += 1
+    end = time.monotonic() + 2
+    while time.monotonic() < end:
+        for outcome in lane.take(0.1):
+            if outcome.frame == timing.frame:
+                assert isinstance(outcome, Lost) and outcome.code == Code.TORN
+                return at
+    raise AssertionError("a torn frame had no outcome")
+
+
+def _garbage_program(lane: Lane) -> float:
+    """Another program says what is no message."""
+    at = time.monotonic()
+    with suppress(OSError):
+        knock(lane.file, [b"\xff" * 64, PROTOCOL.pack(Begin(1), 1)[:-1]])
+    return at
+
+
+KINDS = (
+    _part("panel", "timeout", 8, False),
+    _part("panel", "stall", 8, False),
+    _part("panel", "short_write", 8, False),
+    _part("panel", "garbage", 8, False),
+    _part("panel", "late", 3, False),
+    _part("panel", "hang", 3, True, None),
+    _part("panel", "unplug", 4, True, None),
+    _part("lasers", "nack", 6, True),
+    _part("lasers", "timeout", 6, True),
+    _part("lasers", "stall", 6, True),
+    _part("lasers", "short_write", 6, True),
+    _part("lasers", "garbage", 5, True, 6),
+    _part("lasers", "late", 3, True),
+    _part("lasers", "hang", 3, True, None),
+    _part("lasers", "unplug", 4, True, None),
+    _board("interlock opened", "interlock", False, True, 3),
+    _board("key turned off", "key", False, True, 3),
+    _board("photodiode cut", "photodiodes", False, True, 2),
+    _board("laser three times too bright", "efficiency", 3.0, 1.0, 3),
+    _part("camera", "timeout", 2, False),
+    _part("camera", "late", 1.5, True),
+    _part("camera", "garbage", 1.5, False),
+    _part("camera", "hang", 1.5, True, None),
+    _part("camera", "unplug", 1.5, True, None),
+    _child("camera", "camera process killed", signal.SIGKILL, 0.7, True),
+    _child("solver", "solver process killed", signal.SIGKILL, 0.7, True),
+    _child("solver", "solver process hangs", signal.SIGSTOP, 1, True),
+    Kind("late frames", 3, _late_solver, False),
+    Kind("service killed", 0.4, _service_killed, True, _service_again, shows=False),
+    Kind(
+        "service hangs",
+        1,
+        _service_stopped,
+        True,
+        lambda lane: lane.service.send_signal(signal.SIGCONT),
+        shows=False,
+    ),
+    Kind("program gone", 1, _program_gone, True, Lane.reconnect, shows=False, arm=False),
+    Kind("program pauses", 2, _program_pauses, True, shows=False, arm=False),
+    Kind("torn slot", 3, _torn_slot, False),
+    Kind("garbage from a program", 3, _garbage_program, False),
+)

@@ -1,0 +1,156 @@
+"""One headset under test: emulated hardware, the service over it, a program that shows pictures without pause."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import ExitStack, suppress
+from pathlib import Path
+
+import numpy as np
+
+from firmware_iface.virtual.served import Remote
+from runtime.service.client import Client, Lost, RefusedError
+from runtime.service.protocol import Lasers, Part, Shown
+from tests.campaigns.headset import ENVIRONMENT, connected, hardware, picture, write_configuration
+from tests.campaigns.service import noted
+
+PICTURES = 16
+REFRESH_HZ, SOLVE_MS, STALE_MS = 100.0, 3.0, 80.0
+RECOVERY_S = 20.0
+
+
+class Lane:
+    """A running headset in a folder of its own.
+
+    oak : loopback address of an emulated OAK camera, or none for the camera without a link
+
+    Attributes: remote (the hardware), client, service (the process), accepted, shown and lost (numbers of frames).
+    """
+
+    def __init__(self, folder: Path, seed: int, oak: str | None = None) -> None:
+        self.folder, self.seed = folder, seed
+        self.file = write_configuration(folder, REFRESH_HZ, SOLVE_MS, STALE_MS, oak)
+        self.accepted = self.shown = self.lost = 0
+        self._stack = ExitStack()
+        self.remote: Remote = self._stack.enter_context(hardware(folder, seed, oak))
+        self.service = self.start_service()
+        self.client: Client = connected(self.file)
+        self.pictures = [picture(self.client, k) for k in range(PICTURES)]
+        self._next = 0
+
+    def close(self) -> None:
+        """End everything."""
+        with suppress(OSError):
+            self.client.close()
+        self.end_service(signal.SIGTERM)
+        self._stack.close()
+
+    # --- the service
+
+    def start_service(self) -> subprocess.Popen[bytes]:
+        """Start it, as systemd does after each end."""
+        with (self.folder / "service.log").open("ab") as log:
+            command = [sys.executable, "-m", "tests.campaigns.service", str(self.file)]
+            return subprocess.Popen(command, env=ENVIRONMENT, stderr=log)
+
+    def end_service(self, number: int) -> None:
+        """Send it a signal that ends it, and wait."""
+        self.service.send_signal(number)
+        self.service.wait(20)
+
+    def child(self, name: str) -> int:
+        """The number of the service's "solver" or "camera" process; 0 while there is none."""
+        with suppress(OSError):
+            for pid in Path(f"/proc/{self.service.pid}/task/{self.service.pid}/children").read_text().split():
+                if f" {name}_process" in _words(pid) or (
+                    name == "solver" and "campaigns.service" in _words(pid)
+                ):
+                    return int(pid)
+        return 0
+
+    def signal_child(self, name: str, number: int) -> float:
+        """Send a child process a signal; the time, monotonic s."""
+        at = time.monotonic()
+        if pid := self.child(name):
+            with suppress(ProcessLookupError):
+                os.kill(pid, number)
+        return at
+
+    # --- the program
+
+    def frame(self) -> None:
+        """Show one picture and take what has become of earlier ones."""
+        self._next = (self._next + 1) % PICTURES
+        try:
+            self.client.show(self.pictures[self._next])
+            self.accepted += 1
+        except RefusedError:  # the solver is being started again
+            time.sleep(0.002)
+        self.take()
+
+    def take(self, within_s: float = 0.0) -> list[Shown | Lost]:
+        """Outcomes since the last time."""
+        outcomes = list(self.client.outcomes(within_s))
+        self.shown += sum(isinstance(o, Shown) for o in outcomes)
+        self.lost += sum(isinstance(o, Lost) for o in outcomes)
+        return outcomes
+
+    def reconnect(self) -> None:
+        """A new program in place of the one that went."""
+        with suppress(OSError):
+            self.client.close()
+        self.client = connected(self.file)
+
+    def unanswered(self, within_s: float = 5.0) -> int:
+        """How many accepted frames have no outcome, once there was time for one."""
+        end = time.monotonic() + within_s
+        while self.client.in_flight and time.monotonic() < end:
+            self.take(0.05)
+        return len(self.client.in_flight)
+
+    # --- the light
+
+    def lit(self) -> bool:
+        """Whether any laser emits."""
+        return self.remote.light(time.monotonic())[-1][1] > 0
+
+    def dark_since(self, at_s: float) -> float | None:
+        """When the light went out for good after `at_s`, monotonic s; None while there is some."""
+        changes = self.remote.light(at_s)
+        if changes[-1][1] > 0:
+            return None
+        return max(at_s, changes[-1][0])
+
+    def light_up(self, arm: bool = True) -> bool:
+        """Bring the headset to light, as a program does; whether that succeeded. arm: clear and arm where needed."""
+        end = time.monotonic() + RECOVERY_S
+        while time.monotonic() < end:
+            state = self.client.status()
+            parts = {state.panel, state.solver, state.camera}
+            if state.lasers == Lasers.EMITTING and parts == {Part.FRESH} and self.lit():
+                return True
+            if arm and parts == {Part.FRESH} and state.lasers in (Lasers.OFF, Lasers.FAULT):
+                with suppress(RefusedError):
+                    self.client.clear()
+                    self.client.arm()
+            self.frame()
+        return False
+
+    def torn(self) -> int:
+        """How many different images the panel has displayed that are no pattern of the solver's."""
+        blank = np.zeros(self.client.shape[1:], np.uint8)
+        return len(self.remote.whole() - noted(self.folder) - {_crc(blank)})
+
+
+def _words(pid: str) -> str:
+    return Path(f"/proc/{pid}/cmdline").read_text().replace("\0", " ").replace("runtime.service.", " ")
+
+
+def _crc(gray: np.ndarray) -> int:
+    from runtime.service.ring import crc32
+
+    return crc32(gray)
