@@ -163,7 +163,7 @@ class Display(threading.Thread):
         took = now - began_ns
         self.transfer_ns = min(int(0.9 * self.transfer_ns + 0.1 * took), self._clock.period_ns // 2)
         self.answered_ns = now
-        self.lit_until_ns = max(pattern.display_ns, tick) + self._stale_ns
+        self.lit_until_ns = pattern.display_ns + self._stale_ns
         self._events.shown(pattern, max(tick, now), took * 1e-9)
 
     def _opened(self) -> bool:
