@@ -69,6 +69,7 @@ def test_faults_are_the_errors_that_adapters_give(bench: Bench, kind: str, numbe
     with pytest.raises(OSError) as raised:
         bench.bus.write_byte_data(0x20, 0x0A, 1)
     assert raised.value.errno == number
+    bench.board.bus.faults.clear()  # what is unplugged stays so until it is plugged in
     bench.bus.write_byte_data(0x20, 0x0A, 1)
 
 
