@@ -148,9 +148,7 @@ def test_a_swap_that_fails_half_way_is_undone(tmp_path: Path, monkeypatch: pytes
 
 
 @pytest.mark.parametrize("at_once", [True, False])
-def test_what_is_replaced_can_be_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at_once: bool
-) -> None:
+def test_what_is_replaced_can_be_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at_once: bool) -> None:
     """The last one only, whether the system exchanges names at once or not."""
     if not at_once:
         monkeypatch.setattr(files, "_exchange", lambda one, other: False)
@@ -176,7 +174,9 @@ def test_a_killed_replacement_leaves_a_whole_folder(tmp_path: Path) -> None:
     path = tmp_path / "set"
     for wait in (0.0, 0.003, 0.011, 0.023):
         with subprocess.Popen(
-            [sys.executable, "-c", script, str(path)], stdout=subprocess.PIPE, cwd=Path(files.__file__).parents[1]
+            [sys.executable, "-c", script, str(path)],
+            stdout=subprocess.PIPE,
+            cwd=Path(files.__file__).parents[1],
         ) as writer:
             assert writer.stdout is not None
             for _ in range(3):

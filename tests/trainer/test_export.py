@@ -233,7 +233,9 @@ def test_a_trained_network_goes_in_as_onnx(tmp_path: Path) -> None:
     assert set(bundle.networks) == {APPROXIMATOR, GRADIENT, ADAPTERS}
     assert bundle.provenance["network"]["steps"] == 3
     given = torch.rand(1, 1, HEIGHT, WIDTH)
-    (found,) = onnxruntime.InferenceSession(bundle.networks[APPROXIMATOR]).run(None, {"irradiance": given.numpy()})
+    (found,) = onnxruntime.InferenceSession(bundle.networks[APPROXIMATOR]).run(
+        None, {"irradiance": given.numpy()}
+    )
     assert np.abs(found - network(given).detach().numpy()).max() < 1e-6
     (tmp_path / "b" / GRADIENT).write_bytes(b"another")
     with pytest.raises(InputError, match="SHA-256"):
@@ -241,7 +243,9 @@ def test_a_trained_network_goes_in_as_onnx(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("shape", "channels"), [((8, 8), ["green"]), ((HEIGHT, WIDTH), ["red"])])
-def test_a_network_of_another_bench_is_refused(tmp_path: Path, shape: tuple[int, int], channels: list[str]) -> None:
+def test_a_network_of_another_bench_is_refused(
+    tmp_path: Path, shape: tuple[int, int], channels: list[str]
+) -> None:
     write_approximator(tmp_path / "n.safetensors", disturbed("compact", shape, 2, 1), {"channels": channels})
     with pytest.raises(InputError, match="trained"):
         export_bundle(Model(bench()), None, tmp_path / "b", network=tmp_path / "n.safetensors")
