@@ -50,6 +50,10 @@ MISSING = {
 }
 
 
+class LatchedError(DeviceError):
+    """The safety controller has latched a fault and is dark; clear() and arm() once the cause is gone."""
+
+
 class Lasers:
     """The lasers of one board, opened dark and not armed.
 
@@ -175,9 +179,11 @@ class Lasers:
             self._fractions[k] = float(fraction)
             return
         with self._dark_on_failure():
-            if self.parts.controller.state() not in (State.ARMED, State.EMIT):
-                raise DeviceError("the lasers are not armed; arm() them first.")
+            self._raise_latched()
+            armed = self.parts.controller.state() in (State.ARMED, State.EMIT)
             self._select(k)
+        if not armed:
+            raise DeviceError("the lasers are not armed; arm() them first.")
         self._fractions[k] = float(fraction)
         start = max(
             start, min(end, self._lasers[k].code(1e-9))
@@ -271,7 +277,7 @@ class Lasers:
 
     def _raise_latched(self) -> None:
         if self.parts.controller.state() is State.FAULT:
-            raise DeviceError(f"the safety controller has switched the lasers off: {self._latched()}.")
+            raise LatchedError(f"the safety controller has switched the lasers off: {self._latched()}.")
 
     def _latched(self) -> str:
         return ", ".join(f.name.lower() for f in self.parts.controller.faults() if f.name)
@@ -316,7 +322,7 @@ class Lasers:
                 f"the laser board does not answer ({error.strerror or error}), so the lasers were switched off; "
                 "check its power and its bus, then clear() and arm()."
             ) from error
-        except InputError:
+        except (InputError, LatchedError):
             self._go_dark(Command.OFF)
             raise
         except BaseException:

@@ -104,9 +104,7 @@ class I2cBus:
                         reply = part.read(message.length)
                         replies.append(self.faults.garbled(reply) if fault == "garbage" else reply)
                     else:
-                        part.write(
-                            message.data[: len(message.data) // 2] if fault == "short_write" else message.data
-                        )
+                        part.write(self._as_it_arrives(message.data, fault))
                 self._note(message, replies)
         except NackError:
             raise failure(errno.EREMOTEIO) from None
@@ -117,6 +115,11 @@ class I2cBus:
         if fault == "short_write" and any(m.data for m in messages):
             raise failure(errno.EREMOTEIO)
         return replies
+
+    def _as_it_arrives(self, data: bytes, fault: str | None) -> bytes:
+        if fault == "garbage":
+            return self.faults.garbled(data)
+        return data[: len(data) // 2] if fault == "short_write" else data
 
     def _answering(self, message: Message) -> list[Part]:
         if message.address == GENERAL_CALL and message.data is not None:
