@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from trainer.commands.screen import Screen, plain
-from trainer.numbers import parameters
 
 
 def test_colour_is_for_terminals_and_no_color_turns_it_off(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -46,14 +45,3 @@ def test_numbers_are_made_plain() -> None:
         {"a": np.float32(0.5), "b": np.arange(2), "c": float("inf"), "d": (1, None, True), "e": Path("x")}
     )
     assert found == {"a": 0.5, "b": [0, 1], "c": None, "d": [1, None, True], "e": "x"}
-
-
-def test_parameters_are_said_with_their_error_and_unit_once() -> None:
-    given = {
-        "offset_mm": {"value": 0.20312, "error": 0.0012, "unit": "mm"},
-        "gain": {"value": {"red": 1.5}, "error": None, "unit": "1"},
-        "terms_rad": {"value": [1.0] * 8, "error": None, "unit": "rad"},
-    }
-    said = [f"{p.name} {p.text}" for p in parameters(given)]
-    assert said[:2] == ["offset 0.2031 ± 0.0012 mm", "gain, red 1.50"]
-    assert said[2].startswith("terms 8 terms, together 2.83 rad")
