@@ -50,13 +50,15 @@ class Approximator:
             self._backward = Session(gradient, "approximator_gradient.onnx")
             given = dict(adapters or {})
             _check(self._backward, {"irradiance", "target", *given}, {"loss", "gradient"}, whole)
-            room = {
+            room: dict[str, np.ndarray] = {
                 name: np.zeros(given[name.removeprefix("gradient.")].shape, np.float32)
                 for name in self._backward.outputs
                 if name.startswith("gradient.")
             }
             self._adapter_gradients = {name.removeprefix("gradient."): a for name, a in room.items()}
-            self._adapters = {n: np.ascontiguousarray(a, np.float32) for n, a in given.items()}
+            self._adapters = {n: np.array(a, np.float32) for n, a in given.items()}
+            if "corrected" in self._backward.outputs:  # with the adapters as they are now
+                room["corrected"] = self._corrected
             self._backward.bind(
                 irradiance=self._irradiance, target=self._target, loss=self._loss, gradient=self._slope,
                 **self._adapters, **room,
@@ -66,6 +68,16 @@ class Approximator:
     def has_gradient(self) -> bool:
         """Whether `look` can be called."""
         return self._backward is not None
+
+    @property
+    def adapters(self) -> dict[str, np.ndarray]:
+        """The weights that may be refined, by name, to be written in place; `look` takes them, `correct` does not."""
+        return self._adapters if self._backward is not None else {}
+
+    @property
+    def refinable(self) -> bool:
+        """Whether `look` takes adapters, gives their gradients and fills `corrected` with what they make."""
+        return bool(self.adapters) and "corrected" in getattr(self._backward, "outputs", ())
 
     def correct(self) -> None:
         """Fill `corrected` from `irradiance`."""

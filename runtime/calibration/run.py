@@ -22,8 +22,8 @@ from runtime.calibration.fit import Base, Estimate, Fitted, Shot, chi_squared, f
 from runtime.calibration.patterns import GRAINS, HELD_OUT, grains, grating, proof_picture
 from runtime.calibration.response import SWEEP, Sweep, best_period, fitted_response, measured_sweep
 from runtime.calibration.taking import Headset, Noise, Taker
-from runtime.calibration.view import View, sampler
-from runtime.registration import dot_pattern, dots_of, find_homography, panel_points, resample
+from runtime.calibration.view import View, on_panel, sampler
+from runtime.registration import dot_pattern, dots_of, find_homography, panel_points
 from runtime.solver import quality, solve
 
 ORDERS = ((4, 2), (8, 4), (12, 6))  # of wavefront and beam, one fit after the other
@@ -273,12 +273,6 @@ def _pictures(
         edge = tuple(slice(n // 16, n - n // 16) for n in light.shape)
         seen[name] = (light, quality(np.maximum(light[edge], 0), target[edge]).psnr_db)
     return seen
-
-
-def on_panel(signal: np.ndarray, view: View, shape: tuple[int, int]) -> np.ndarray:
-    """A capture on the panel's pixels, float32 [H, W], without stray light and the camera's own unevenness."""
-    stray = view.stray / (1 + view.stray) * float(signal.mean())
-    return resample((signal - stray) / view.evenness(), view.matrix(shape), shape)
 
 
 def _power(base: Base, taken: Taken, estimate: Estimate) -> tuple[float, float]:

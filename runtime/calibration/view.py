@@ -15,7 +15,7 @@ from scipy.sparse import csr_matrix
 from runtime.fft import irfft2, rfft2
 from runtime.legendre import edge_to_edge, legendre_maps
 from runtime.lightpath import FINE, Grid, image_frequencies
-from runtime.registration import panel_points
+from runtime.registration import panel_points, resample
 
 SENSITIVITY_ORDER = 2  # of the camera's own fall-off
 TERMS = 5  # of that order
@@ -78,6 +78,12 @@ class View:
 def sensitivity_maps(shape: tuple[int, int]) -> np.ndarray:
     """The maps that `View.sensitivity` has a term for: float64 [TERMS, h, w]."""
     return legendre_maps(*edge_to_edge(shape), SENSITIVITY_ORDER)
+
+
+def on_panel(signal: np.ndarray, view: View, shape: tuple[int, int]) -> np.ndarray:
+    """A capture [h, w] on the panel's pixels, float32 [H, W], without stray light and the camera's unevenness."""
+    stray = view.stray / (1 + view.stray) * float(signal.mean())
+    return resample((signal - stray) / view.evenness(), view.matrix(shape), shape)
 
 
 def sampler(view: View, grid: Grid, finer: int = 2) -> Sampler:

@@ -1,7 +1,7 @@
 """An approximator as ONNX, with two entry points, which onnxruntime alone evaluates on the headset.
 
     approximator.onnx           irradiance -> corrected
-    approximator_gradient.onnx  irradiance, target, adapters -> loss, gradient, gradient.ADAPTER for each adapter
+    approximator_gradient.onnx  irradiance, target, adapters -> loss, corrected, gradient, gradient.ADAPTER for each
 
 The second is the whole way forward and back as one graph of plain operations: the network and torch's own gradient
 of it are traced together into ATen operations, with decompositions for those that ONNX lacks, so network and
@@ -67,7 +67,7 @@ def onnx_files(network: Approximator) -> dict[str, bytes]:
     with _quiet():
         forward = _saved(network, (irradiance,), ["irradiance"], ["corrected"])
         graph = _traced(joint, arguments)
-        names = ["loss", "gradient", *(f"gradient.{name}" for name in adapters)]
+        names = ["loss", "corrected", "gradient", *(f"gradient.{name}" for name in adapters)]
         gradient = _saved(graph, arguments, ["irradiance", "target", *adapters], names)
     return {APPROXIMATOR: forward, GRADIENT: gradient, ADAPTERS: safetensors.torch.save(adapters)}
 
@@ -79,7 +79,7 @@ def _frozen(network: Approximator) -> Approximator:
 
 
 def joint_gradient(network: Approximator, names: Sequence[str]) -> Callable[..., tuple[Tensor, ...]]:
-    """(irradiance, target, adapters) to (loss, gradient over irradiance, gradients over adapters)."""
+    """(irradiance, target, adapters) to (loss, corrected, gradient over irradiance, gradients over adapters)."""
 
     def joint(irradiance: Tensor, target: Tensor, *weights: Tensor) -> tuple[Tensor, ...]:
         x = irradiance.detach().requires_grad_(True)
@@ -87,7 +87,7 @@ def joint_gradient(network: Approximator, names: Sequence[str]) -> Callable[...,
         with torch.enable_grad():
             corrected = torch.func.functional_call(network, dict(zip(names, adapters, strict=True)), (x,))
             loss = _Penalty.apply(corrected, target)
-            return (loss, *torch.autograd.grad(loss, [x, *adapters]))
+            return (loss, corrected.detach(), *torch.autograd.grad(loss, [x, *adapters]))
 
     return joint
 

@@ -1,0 +1,197 @@
+"""A displayed picture gets better by what a camera sees of it; it stops, goes back, logs, and lets lasers be."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import safetensors.numpy
+
+from firmware_iface.errors import InputError
+from firmware_iface.virtual import BenchDescription, VirtualHeadset
+from firmware_iface.virtual.defects import make_defect
+from runtime.approximator import Approximator
+from runtime.bundle import ADAPTERS, APPROXIMATOR, GRADIENT
+from runtime.calibration.view import View
+from runtime.lightpath import LightPath
+from runtime.refinement import Eye, Refinement, refine
+from runtime.refinement.refine import HOLD_OUT, _to_step
+from runtime.solver import solve
+from tests.runtime.benches import ideal_path, scene
+
+SHAPE, DISTANCE_MM = (64, 80), 8.0
+
+
+@pytest.fixture(scope="module")
+def files() -> dict[str, bytes]:
+    """A small approximator as the trainer exports it, before any training: the identity."""
+    torch = pytest.importorskip("torch")
+    from trainer.networks.approximator import Approximator as Network
+    from trainer.networks.approximator import Architecture
+    from trainer.networks.onnx_files import onnx_files
+
+    torch.manual_seed(0)
+    return onnx_files(Network(Architecture("compact", 8, SHAPE, 1)))
+
+
+@pytest.fixture
+def approximator(files: dict[str, bytes]) -> Approximator:
+    adapters = safetensors.numpy.load(files[ADAPTERS])
+    return Approximator((1, *SHAPE), files[APPROXIMATOR], files[GRADIENT], adapters)
+
+
+@pytest.fixture(scope="module")
+def path() -> LightPath:
+    return ideal_path(SHAPE, DISTANCE_MM * 1e-3, dtype=np.float32)
+
+
+@pytest.fixture(scope="module")
+def start(path: LightPath) -> np.ndarray:
+    return np.asarray(solve(path, scene(SHAPE), 20).phase).reshape(1, *SHAPE)
+
+
+def lit_headset(*defects: str) -> VirtualHeadset:
+    """A bench with hidden defects, its laser on."""
+    bench = BenchDescription(defects=tuple(make_defect(kind) for kind in defects))
+    headset = VirtualHeadset(bench.resized(*SHAPE, DISTANCE_MM), seed=2)
+    headset.lasers.set_power("green", 0.8)
+    headset.camera.exposure_ms = 25.0
+    return headset
+
+
+def eye(headset: VirtualHeadset) -> Eye:
+    return Eye(headset.panel, headset.camera, View(SHAPE), 64.0)
+
+
+@pytest.mark.parametrize(
+    ("defect", "better_db"), [("phase_response", 6.0), ("zero_order", 4.0), ("ghost", 2.0)]
+)
+def test_the_displayed_picture_gets_better(
+    approximator: Approximator, path: LightPath, start: np.ndarray, defect: str, better_db: float
+) -> None:
+    """Judged by the true irradiance without the camera's noise, not by the pictures that were learned from."""
+    from runtime.solver import quality
+
+    headset = lit_headset(defect)
+    target = scene(SHAPE)[None]
+    state = Refinement([path], approximator, target, start)
+    before = quality(headset.true_irradiance(state.gray[0], "green"), target[0]).psnr_db
+    steps = refine(state, eye(headset), 30)
+    after = quality(headset.true_irradiance(headset.panel.gray, "green"), target[0]).psnr_db
+    assert after > before + better_db
+    np.testing.assert_array_equal(headset.panel.gray, state.gray[0])  # the best is what stays on the panel
+    assert max(s.psnr_db for s in steps) > steps[0].psnr_db + better_db
+
+
+def test_the_adapters_learn_what_a_camera_sees(
+    approximator: Approximator, path: LightPath, start: np.ndarray
+) -> None:
+    """A perfect bench: the pattern hardly moves, and D comes nearer to captures that it never learned from."""
+    state = Refinement([path], approximator, scene(SHAPE)[None], start)
+    steps = refine(state, eye(lit_headset("ghost")), 13)
+    held = [s for s in steps if s.held_out]
+    assert [s.number for s in held] == [1, 4, 7, 10, 13]
+    assert all(s.heldout == held[0].heldout for s in steps[:HOLD_OUT])
+    assert 0 < steps[1].drift < steps[-1].drift
+
+
+def test_it_stops_where_the_held_out_error_rises_and_keeps_the_best(
+    approximator: Approximator, path: LightPath, start: np.ndarray
+) -> None:
+    """Somebody walks through the light, except when a capture is held out: what is learned then is wrong."""
+    headset = lit_headset()
+    look, taken = eye(headset), 0
+
+    def see(gray: np.ndarray) -> np.ndarray:
+        nonlocal taken
+        taken += 1
+        seen = look(gray)
+        return seen if taken < 8 or (taken - 1) % HOLD_OUT == 0 else np.roll(seen, 17, axis=2)
+
+    state = Refinement([path], approximator, scene(SHAPE)[None], start)
+    steps = refine(state, see, 60)
+    assert steps[-1].stopped == "the held-out error rises" and 10 <= len(steps) < 40
+    assert all(s.stopped is None for s in steps[:-1])
+    worst = max(s.drift for s in steps)
+    assert steps[-1].drift < worst  # put back to where held-out captures were predicted best
+    with pytest.raises(InputError, match="held-out error rises"):
+        state.take(np.ones((1, *SHAPE)))
+
+
+def test_it_can_be_rolled_back(approximator: Approximator, path: LightPath, start: np.ndarray) -> None:
+    before = {name: weights.copy() for name, weights in approximator.adapters.items()}
+    state = Refinement([path], approximator, scene(SHAPE)[None], start)
+    first = state.gray
+    refine(state, eye(lit_headset("ghost")), 5)
+    assert any((approximator.adapters[n] != w).any() for n, w in before.items())
+    state.rollback()
+    assert state.stopped is None
+    np.testing.assert_array_equal(state.gray, first)
+    for name, weights in before.items():
+        np.testing.assert_array_equal(approximator.adapters[name], weights)
+    assert state.take(np.ones((1, *SHAPE), np.float32)).number == 6  # the log goes on
+
+
+def test_every_capture_is_a_line_of_the_drift_log(
+    approximator: Approximator, path: LightPath, start: np.ndarray
+) -> None:
+    log = io.StringIO()
+    state = Refinement([path], approximator, scene(SHAPE)[None], start, log)
+    steps = refine(state, eye(lit_headset()), 4)
+    lines = [json.loads(line) for line in log.getvalue().splitlines()]
+    assert [line["number"] for line in lines] == [1, 2, 3, 4]
+    assert lines[2]["drift"] == steps[2].drift and lines[0]["held_out"] and not lines[1]["held_out"]
+
+
+def test_it_never_moves_the_laser(approximator: Approximator, path: LightPath, start: np.ndarray) -> None:
+    headset = lit_headset("ghost")
+    asked: list[str] = []
+
+    def refuse(name: str) -> Callable[..., None]:
+        return lambda *given: asked.append(name)
+
+    for name in ("set_power", "off"):
+        setattr(headset.lasers, name, refuse(name))
+    looker = eye(headset)
+    refine(Refinement([path], approximator, scene(SHAPE)[None], start), looker, 6)
+    assert asked == [] and headset.lasers.power("green") == 0.8 and headset.camera.exposure_ms == 25.0
+    assert not any(value is headset.lasers for value in vars(looker).values())
+
+
+def test_where_camera_and_model_agree_the_gradient_is_the_models(
+    approximator: Approximator, path: LightPath, start: np.ndarray
+) -> None:
+    """The captured picture takes the place of the simulated one: given the simulated one, it is plain descent."""
+    from runtime.lightpath import irradiance, irradiance_and_pullback, pixel_irradiance
+    from runtime.refinement.refine import STEP, _amplitude, _matched
+
+    target = scene(SHAPE)[None]
+    state = Refinement([path], approximator, target, start)
+    light = pixel_irradiance(path, irradiance(path, start[0].astype(np.float32)))
+    state.take(7.5 * light[None])  # any scale
+    image, pullback = irradiance_and_pullback(path, start[0].astype(np.float32))
+    simulated = pixel_irradiance(path, image)
+    simulated /= simulated.mean()
+    made = _amplitude(simulated)
+    slope = (made - _amplitude(_matched(target[0], simulated))) / made  # D is the identity
+    wanted = start[0] - STEP * _to_step(path, pullback)(slope.astype(np.float32))
+    moved = np.angle(np.exp(1j * (state.phase[0] - wanted)))
+    # 255 steps of a 256th of a turn leave a gap: phases in it are held at its nearer edge
+    assert np.abs(moved).max() < 1.01 * np.pi / 256 and np.quantile(np.abs(moved), 0.9) < 1e-4
+    assert np.abs(wanted - start[0]).max() > 0.1
+
+
+def test_what_does_not_fit_is_said(
+    files: dict[str, bytes], approximator: Approximator, path: LightPath, start: np.ndarray
+) -> None:
+    target = scene(SHAPE)[None]
+    with pytest.raises(InputError, match="no adapters"):
+        Refinement([path], Approximator((1, *SHAPE), files[APPROXIMATOR]), target, start)
+    with pytest.raises(InputError, match="one size"):
+        Refinement([path], approximator, target[:, :-1], start)
+    state = Refinement([path], approximator, target, start)
+    with pytest.raises(InputError, match="captured picture"):
+        state.take(np.ones(SHAPE))
