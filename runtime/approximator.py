@@ -12,8 +12,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import safetensors.numpy
+from safetensors import SafetensorError
 
 from firmware_iface.errors import InputError
+from runtime.bundle import ADAPTERS, APPROXIMATOR, GRADIENT, Bundle
 from runtime.sessions import Session
 
 EPSILON = 1e-3  # under the square roots of the loss that is in the gradient's network
@@ -95,6 +98,21 @@ class Approximator:
     def adapter_gradients(self) -> dict[str, np.ndarray]:
         """The loss's gradient over each adapter, of the last `look`; the arrays are written again by the next."""
         return self._adapter_gradients if self._backward is not None else {}
+
+
+def approximator_of(bundle: Bundle, shape: tuple[int, int, int]) -> Approximator | None:
+    """The approximator in a bundle, for irradiance [C, H, W] of a shape; without one D is the identity: None."""
+    if APPROXIMATOR not in bundle.networks:
+        return None
+    adapters = {}
+    if ADAPTERS in bundle.networks:
+        try:
+            adapters = safetensors.numpy.load(bundle.networks[ADAPTERS])
+        except (SafetensorError, KeyError, ValueError, TypeError) as error:
+            raise InputError(
+                f"{ADAPTERS} cannot be read as arrays: {error}; export the bundle again"
+            ) from error
+    return Approximator(shape, bundle.networks[APPROXIMATOR], bundle.networks.get(GRADIENT), adapters)
 
 
 def _check(session: Session, inputs: set[str], outputs: set[str], shape: tuple[int, ...]) -> None:

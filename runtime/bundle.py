@@ -125,7 +125,9 @@ def read_bundle(
         contents[name] = data
     for name in NETWORKS:
         if name not in contents and (folder / name).exists():
-            raise InputError(f"{folder / name} is not listed in {MANIFEST}; remove it or export the bundle again")
+            raise InputError(
+                f"{folder / name} is not listed in {MANIFEST}; remove it or export the bundle again"
+            )
     arrays = _read_arrays(folder / ARRAYS, contents[ARRAYS])
     _check_required(folder / ARRAYS, arrays, required)
     approximator = contents.get(APPROXIMATOR)

@@ -16,6 +16,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
+import numpy as np
+
 from firmware_iface.errors import InputError, nearest
 from runtime.calibration import command as calibration
 from runtime.service import command as service
@@ -41,9 +43,19 @@ examples:
   hololoop-runtime solve bundle/ picture.png --out pattern.png
   hololoop-runtime solve bundle/ a.png b.png --out patterns/ --iterations 40
   hololoop-runtime solve bundle/ photo.png --fit --channel green --plane 30 --out pattern.png
+  hololoop-runtime solve bundle/ frame.png --deadline-ms 50 --out pattern.png --json
 
-amplitude PSNR is of what the calibrated model says that the pattern shows; more iterations never make it
-worse, and 20 are usually within a few dB of what can be reached."""
+in Python:
+  from runtime.solver import Solver
+  solver = Solver(load_light_path(read_bundle("bundle/"), "green"))   # once
+  panel.show(solver.solve(target, deadline_ms=50).gray)               # each picture; or solver.frame(...)
+
+amplitude PSNR is of what the calibrated model says that the pattern shows, zero-padded and on a grid twice as fine
+as the panel's, whatever the solver computed on; more iterations or time never make it worse, and 20 iterations are
+usually within a few dB of what can be reached."""
+
+SOLVERS = ("default", "double_phase", "gerchberg_saxton", "adam")
+PENALTIES = ("amplitude", "irradiance", "l1")
 
 
 @dataclass(frozen=True)
@@ -131,8 +143,23 @@ def _parser() -> ArgumentParser:
         "--iterations",
         metavar="N",
         type=_whole(0, 100000),
-        default=20,
-        help="steps a pattern (default 20; 0: double phase alone)",
+        help="steps a pattern (default 20, or as many as the deadline allows; 0: double phase alone)",
+    )
+    solve.add_argument(
+        "--deadline-ms",
+        metavar="T",
+        type=_milliseconds,
+        help="from picture to pattern; the best pattern so far is given (this machine is measured first)",
+    )
+    solve.add_argument("--solver", choices=SOLVERS, default="default", help="how (default: memoryless BFGS)")
+    solve.add_argument(
+        "--penalty", choices=PENALTIES, default="amplitude", help="of what error (default: squared amplitude)"
+    )
+    solve.add_argument(
+        "--grid",
+        choices=("panel", "fine"),
+        help="irradiance computed once a pixel, or twice an axis: four times the work, for irises that pass more "
+        "than three quarters of the panel's band (default: by that, and panel with a deadline)",
     )
     solve.add_argument("--channel", metavar="C", help="compute this channel only (default: all)")
     solve.add_argument(
@@ -177,6 +204,16 @@ def _whole(low: int, high: int) -> Callable[[str], int]:
     return read
 
 
+def _milliseconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0):
+        raise ArgumentTypeError(f"{text!r} is not a time in ms")
+    return value
+
+
 def _millimetres(text: str) -> float:
     try:
         value = float(text)
@@ -189,45 +226,63 @@ def _millimetres(text: str) -> float:
 
 def run_solve(args: Namespace) -> dict[str, Any]:
     """Compute and write the patterns, picture by picture; returns what `--json` prints."""
-    import time
-
-    from runtime.bundle import read_bundle
+    from runtime.approximator import approximator_of
+    from runtime.bundle import INITIALISER, read_bundle
     from runtime.calibrated import bundle_channels, load_light_path, plane_of
-    from runtime.solver import solve
+    from runtime.solver import Solver
 
     bundle = read_bundle(args.bundle)
-    colour = len(bundle_channels(bundle)) > 1
-    channels = bundle_channels(bundle) if args.channel is None else [args.channel]
+    every = bundle_channels(bundle)
+    channels = every if args.channel is None else [args.channel]
     paths = {c: load_light_path(bundle, c, args.plane) for c in channels}
     planned = jobs(args.targets, channels, args.out)
     shape = next(iter(paths.values())).grid.shape
+    d = approximator_of(bundle, (len(every), *shape))
+    if d is not None and len(channels) < len(every):
+        raise InputError("the bundle's approximator sees all channels together: leave --channel out")
+    # A colour is solved on its own, unless an approximator sees them all.
+    groups = [channels] if d is not None else [[c] for c in channels]
+    grid = args.grid or (None if args.deadline_ms is None else "panel")
+    solvers = [
+        Solver(
+            [paths[c] for c in group], method=args.solver, penalty=args.penalty, grid=grid,
+            approximator=d, initialiser=bundle.networks.get(INITIALISER),
+        )
+        for group in groups
+    ]  # fmt: skip
+    out = {(job.target, job.channel): job.out for job in planned}
+    iterations = 20 if args.iterations is None and args.deadline_ms is None else args.iterations
     patterns = []
-    with _progress(sum(args.iterations + 1 for _ in planned)) as tick:
-        pictures: dict[Path, Any] = {}
-        for job in planned:
-            if job.target not in pictures:
-                pictures = {job.target: _planes(job.target, shape, channels, args.fit, colour)}
-            started = time.perf_counter()
-            solution = solve(
-                paths[job.channel],
-                pictures[job.target][job.channel],
-                args.iterations,
-                progress=partial(tick, job.out.name),
-            )
-            write_gray(job.out, solution.gray)
-            patterns.append(
-                {
-                    "target": str(job.target),
-                    "channel": job.channel,
-                    "plane_mm": plane_of(bundle, job.channel, args.plane),
-                    "phase": str(job.out),
-                    "psnr_db": round(solution.quality.psnr_db, 4),
-                    "nrmse": round(solution.quality.nrmse, 6),
-                    "scale": solution.quality.scale,
-                    "iterations": args.iterations,
-                    "seconds": round(time.perf_counter() - started, 4),
-                }
-            )
+    with _progress(
+        None if iterations is None else (iterations + 1) * len(args.targets) * len(groups)
+    ) as tick:
+        for target in args.targets:
+            pictures = _planes(target, shape, channels, args.fit, len(every) > 1)
+            for solver, group in zip(solvers, groups, strict=True):
+                names = [out[target, c] for c in group]
+                solution = solver.solve(
+                    np.stack([pictures[c] for c in group]) if len(group) > 1 else pictures[group[0]],
+                    iterations,
+                    deadline_ms=args.deadline_ms,
+                    progress=partial(tick, names[0].name),
+                )
+                grays = solution.gray if len(group) > 1 else solution.gray[None]
+                for channel, name, gray, quality in zip(group, names, grays, solution.qualities, strict=True):
+                    write_gray(name, gray)
+                    patterns.append(
+                        {
+                            "target": str(target),
+                            "channel": channel,
+                            "plane_mm": plane_of(bundle, channel, args.plane),
+                            "phase": str(name),
+                            "psnr_db": round(quality.psnr_db, 4),
+                            "expected_psnr_db": round(solution.expected_psnr_db, 4),
+                            "nrmse": round(quality.nrmse, 6),
+                            "scale": quality.scale,
+                            "iterations": solution.iterations,
+                            "seconds": round(solution.milliseconds / 1e3, 4),
+                        }
+                    )
     return {"bundle": str(args.bundle), "patterns": patterns}
 
 
@@ -305,7 +360,7 @@ def write_gray(path: Path, gray: Any) -> None:
 
 
 @contextmanager
-def _progress(steps: int) -> Iterator[Callable[[str, int, float], None]]:
+def _progress(steps: int | None) -> Iterator[Callable[[str, int, float], None]]:
     """A callback (pattern, steps done, dB) for each step; a moving bar on stderr if that is a terminal."""
     if not sys.stderr.isatty():
         yield lambda name, done, psnr: None

@@ -1,7 +1,7 @@
 """A first phase from a small network, so that two or three iterations suffice.
 
-`initialiser.onnx` in a bundle: `target` [1, 1, H, W], amplitude with a mean square of 1, to `phase` [1, 2, H, W],
-cosine and sine (of any common length) at the panel.
+`initialiser.onnx` in a bundle: `target` [1, 1, H, W], amplitude with a mean square of 1, to `phase`
+[1, 2, H, W], cosine and sine (of any common length) at the panel.
 """
 
 from __future__ import annotations

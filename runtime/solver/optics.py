@@ -25,9 +25,10 @@ Array = Any
 Window = list[tuple[slice, slice]]  # a part of the image, and where it is on the period
 
 
-def carries_irradiance(path: LightPath) -> bool:
-    """Whether one sample a pixel is enough for irradiance: the iris passes half of the panel's band or less."""
-    return all(4 * edge <= n + 4 for edge, n in zip(path.grid.band, path.grid.padded, strict=True))
+def aliases(path: LightPath, fine: int) -> bool:
+    """Whether the iris passes more frequencies than the image's samples tell apart."""
+    grid = path.grid
+    return any(2 * edge + 1 > fine * n for edge, n in zip(grid.band, grid.padded, strict=True))
 
 
 class Optics:
@@ -43,8 +44,7 @@ class Optics:
         xp, grid = backend.xp, path.grid
         if path.far_field is not None:
             raise InputError("patterns for the far field are not computed: use angular_spectrum or fresnel")
-        aliased = any(2 * edge + 1 > fine * n for edge, n in zip(grid.band, grid.padded, strict=True))
-        if aliased and path.crosstalk is not None:
+        if path.crosstalk is not None and aliases(path, fine):
             raise InputError("with crosstalk and all of the panel's band open, use the fine grid")
         real, pair = path.response.dtype, path.source.dtype
         self.backend, self.shape = backend, grid.shape

@@ -51,8 +51,11 @@ class Amplitude:
 
     @staticmethod
     def curvature(scale: float, light: float, rms_error: float) -> float:
-        """About the second derivative over |z|, from the mean of the light: what a first step is divided by."""
-        return 2 * scale**2
+        """About the second derivative over a pixel's phase, which a first step is divided by; light: its mean.
+
+        A change of phase moves the field sideways as often as along itself, so it is half of that over |z|.
+        """
+        return scale**2
 
 
 class Smooth(Amplitude):
@@ -74,7 +77,7 @@ class Smooth(Amplitude):
 
     @staticmethod
     def curvature(scale: float, light: float, rms_error: float) -> float:
-        return scale**2 / max(rms_error, ROUNDING)
+        return scale**2 / (2 * max(rms_error, ROUNDING))
 
 
 class Irradiance(Amplitude):
@@ -100,7 +103,7 @@ class Irradiance(Amplitude):
 
     @staticmethod
     def curvature(scale: float, light: float, rms_error: float) -> float:
-        return 8 * scale**2 * light
+        return 4 * scale**2 * light
 
 
 PENALTIES: dict[str, type[Amplitude]] = {"amplitude": Amplitude, "irradiance": Irradiance, "l1": Smooth}

@@ -16,7 +16,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -32,7 +32,7 @@ from runtime.solver.method import METHODS, Method
 from runtime.solver.objective import Objective, needs_fine_grid
 from runtime.solver.penalty import PENALTIES
 from runtime.solver.quality import Quality, quality, shown
-from runtime.solver.start import Start, is_cut, motion_between, shifted
+from runtime.solver.start import Start, entering, is_cut, motion_between, shifted
 
 Progress = Callable[[int, float], None]
 GRIDS = ("panel", "fine")
@@ -48,7 +48,8 @@ class Solution:
 
     gray: uint8 [C, H, W] or [H, W]. phase: what was asked of the panel before rounding, rad. psnr_db: amplitude PSNR
     before rounding, at the start and after each iteration, on the solver's own grid. milliseconds: from the
-    target to the gray levels. Both arrays are the solver's own, and are written again by its second next solve.
+    target to the gray levels. Both arrays are the solver's own: `gray` is written again by its second next
+    solve, `phase` by the next.
     """
 
     gray: np.ndarray
@@ -69,7 +70,10 @@ class Solution:
 
     @cached_property
     def qualities(self) -> tuple[Quality, ...]:
-        """Of the gray levels, through the whole padded light path on the fine grid, a colour and plane each."""
+        """Of the gray levels, through the whole padded light path on the fine grid, a colour and plane each.
+
+        Computed when first asked for. Raises InputError where the arrays have been written again by then.
+        """
         return self._judge()
 
     @property
@@ -81,13 +85,13 @@ class Solution:
 class Solver:
     """Solves for one light path, for several colours (a list of them) or for stacks of planes (a list of lists).
 
-    levels: gray levels that may be used. method, penalty: by name; options: of the method. grid: "panel" computes
-    irradiance once a pixel, "fine" twice an axis, about four times the work and needed where the iris passes
-    more than half of the panel's band; none: by that rule. region: [H, W], which pixels count, or how much;
-    light is free to go to the others. approximator: D, a plane a colour. through: "gradient" sees through D at
-    each iteration, "predistorted" gives the optics a target that D makes right. initialiser: a network in ONNX
-    from a target's amplitude to a first phase. Raises InputError for names that are not there and for paths
-    that do not fit together.
+    levels: gray levels that may be used. method, penalty: by name; options: of the method. grid: "panel"
+    computes irradiance once a pixel, "fine" twice an axis, about four times the work, which pays where the iris
+    passes more than three quarters of the panel's band and there is time; none: by that rule. region: [H, W],
+    which pixels count, or how much; light is free to go to the others. approximator: D, a plane a colour.
+    through: "gradient" sees through D at each iteration, "predistorted" gives the optics a target that D makes
+    right. initialiser: a network in ONNX from a target's amplitude to a first phase. Raises InputError for names
+    that are not there and for paths that do not fit together.
     """
 
     def __init__(
@@ -135,7 +139,10 @@ class Solver:
         self.phases = [xp.zeros(whole, real) for _ in range(3)]
         self.grays = [np.zeros(whole, np.uint8) for _ in range(2)]
         self.amplitude = np.zeros(self.shape, real)
-        self.before: np.ndarray | None = None
+        self.before = np.zeros(self.shape, real)
+        self.solved = 0
+        self.follows = False  # whether `best` is of the picture in `before`
+        self.best = self.phases[0]
         self.begin, self.step, self.finish = Pace(), Pace(), Pace()
 
     def solve(
@@ -160,6 +167,7 @@ class Solver:
         if deadline_ms is not None and not self.step.known:
             self.rehearse(targets)
         begun = time.perf_counter()
+        self.follows = False
         phase = self.phases[0]
         if start is None:
             self._aim(targets)
@@ -188,28 +196,29 @@ class Solver:
             self.rehearse(targets)
         begun = time.perf_counter()
         picture = targets[0, 0]
-        cold = self.before is None
-        if self.before is None:
-            self.before = np.zeros(self.shape, self.amplitude.dtype)
-        elif motion is None:
+        if self.follows and motion is None:
             motion = motion_between(self.before, picture)
-        if not cold and motion is not None and is_cut(self.before, picture, motion):
-            cold = True
-        self.before[...] = picture
+        warm = self.follows and motion is not None and not is_cut(self.before, picture, motion)
         self._aim(targets)
-        if cold or motion is None:
-            self._cold(targets, self.phases[0])
+        if warm and motion is not None:
+            first = next(k for k, phase in enumerate(self.phases) if phase is not self.best)
+            shifted(self.best, motion, self.phases[first])
+            self.phases[0], self.phases[first] = self.phases[first], self.phases[0]
+            if any(motion):
+                other = next(phase for phase in self.phases if phase is not self.phases[0])
+                self._cold(targets, other)
+                for part in entering(motion, self.shape):
+                    self.phases[0][part] = other[part]
         else:
-            shifted(self.best, motion, self.phases[0] if self.best is not self.phases[0] else self.phases[1])
-            if self.best is self.phases[0]:
-                self.phases[0], self.phases[1] = self.phases[1], self.phases[0]
+            self._cold(targets, self.phases[0])
+        self.before[...] = picture
+        self.follows = True
         return self._improve(targets, begun, iterations, deadline_ms, None)
 
     def rehearse(self, target: np.ndarray | None = None) -> None:
         """Measure how long the start, an iteration and the rounding take on this machine."""
         targets = self._checked(np.ones(self.shape) if target is None else target)
-        before, self.before = self.before, None
-        kept = self.phases[0].copy() if before is not None else None
+        kept = self.best.copy() if self.follows else None
         for _ in range(2):  # the first touches memory for the first time and is not counted
             self.begin, self.step, self.finish = Pace(), Pace(), Pace()
             begun = time.perf_counter()
@@ -217,8 +226,7 @@ class Solver:
             self._cold(targets, self.phases[0])
             self._improve(targets, begun, 3, None, None)
         if kept is not None:
-            self.before, self.phases[0][...] = before, kept
-            self.best = self.phases[0]
+            self.best[...] = kept
 
     def _improve(
         self,
@@ -265,10 +273,9 @@ class Solver:
         gray, phase = self.grays[0], self.on.to_host(self.best)
         if len(gray) == 1:
             gray, phase = gray[0], phase[0]
-        patterns = self.grays[0]
-        return Solution(
-            gray, phase, tuple(history), 1e3 * (done - begun), lambda: self._judged(patterns, targets)
-        )
+        self.solved += 1
+        judge = partial(self._judged, self.grays[0], targets, self.solved)
+        return Solution(gray, phase, tuple(history), 1e3 * (done - begun), judge)
 
     def _aim(self, targets: np.ndarray) -> None:
         if self.approximator is not None and self.through == "predistorted":
@@ -290,7 +297,11 @@ class Solver:
             if drive.bounded:
                 phase[...] = self.on.xp.asarray(drive.held(self.on.to_host(phase)))
 
-    def _judged(self, patterns: np.ndarray, targets: np.ndarray) -> tuple[Quality, ...]:
+    def _judged(self, patterns: np.ndarray, targets: np.ndarray, number: int) -> tuple[Quality, ...]:
+        if self.solved > number + 1:
+            raise InputError(
+                "the pattern has been written again: ask for its quality before the second next solve"
+            )
         light = np.stack(
             [[shown(p, gray) for p in stack] for stack, gray in zip(self.stacks, patterns, strict=True)]
         )

@@ -39,6 +39,8 @@ class Start:
             self.over_source = xp.asarray(
                 (np.conj(path.source) / np.maximum(np.abs(path.source), tiny) ** 2).astype(pair)
             )
+        leak = self.optics.panel.leak
+        self.unmodulated = None if leak is None else leak * self.over_source
         self.ramp = [
             _turns(cycles, n, pair) for cycles, n in zip(middle_of(path), (height, width), strict=True)
         ]
@@ -58,14 +60,14 @@ class Start:
         some = xp.abs(wave[::LOOKED_AT, ::LOOKED_AT]).ravel()
         rank = min(some.size - 1, int(LOUD * some.size))
         loud = 1 / max(float(xp.partition(some, rank)[rank]), 1e-30)
-        leak, over = self.optics.panel.leak, self.over_source
+        unmodulated = self.unmodulated
 
         def work(worker: int, rows: slice) -> None:
             part, new = self.objective.part[worker][: rows.stop - rows.start], phase[rows]
             here = wave[rows]
             here *= loud
-            if leak is not None:
-                here -= leak[rows] * over[rows]
+            if unmodulated is not None:
+                here -= unmodulated[rows]
             xp.abs(here, out=part)
             xp.minimum(part, 1, out=part)
             xp.arccos(part, out=part)
@@ -131,6 +133,17 @@ def shifted(before: Array, motion: tuple[int, int], out: Array) -> None:
     ):
         for to, of in ((slice(dx, None), slice(0, width - dx)), (slice(0, dx), slice(width - dx, None))):
             out[..., to_rows, to] = before[..., from_rows, of]
+
+
+def entering(motion: tuple[int, int], shape: tuple[int, int]) -> list[tuple[Any, ...]]:
+    """The parts of a panel [..., H, W] where content that moves by (down, right) comes in."""
+    parts: list[tuple[Any, ...]] = []
+    for axis, (step, count) in enumerate(zip(motion, shape, strict=True)):
+        if step:
+            width = min(abs(step), count)
+            edge = slice(0, width) if step > 0 else slice(count - width, count)
+            parts.append((..., edge, slice(None)) if axis == 0 else (..., edge))
+    return parts
 
 
 def motion_between(before: np.ndarray, after: np.ndarray) -> tuple[int, int]:

@@ -71,8 +71,8 @@ def test_compensates_what_the_ideal_pattern_suffers_from(ideal: LightPath, name:
     }
     true = converted(replace(ideal, **changes[name]), np.float32)
     target = scene(SHAPE, 1)
-    told = solve(true, target, 25)
-    untold = quality_of(true, solve(ideal, target, 25).gray, target)
+    told = solve(true, target, 50)
+    untold = quality_of(true, solve(ideal, target, 50).gray, target)
     assert told.quality.psnr_db > untold.psnr_db + 2
     assert told.quality.nrmse < 0.8 * untold.nrmse
 
