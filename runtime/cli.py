@@ -19,6 +19,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from firmware_iface.errors import InputError, nearest
+from runtime.benchmark import command as benchmark
 from runtime.calibration import command as calibration
 from runtime.service import command as service
 
@@ -188,6 +189,16 @@ def _parser() -> ArgumentParser:
     )
     service.add_options(serve)
     serve.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
+    measure = parts.add_parser(
+        "benchmark",
+        help="measure the solver on this machine",
+        description=benchmark.ABOUT,
+        formatter_class=RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    measure.add_argument(
+        "--json", action="store_true", help="print one JSON object on stdout and nothing else"
+    )
     return parser
 
 
@@ -299,6 +310,7 @@ COMMANDS = {
     "solve": (run_solve, show_solve),
     "calibrate": (calibration.run, calibration.show),
     "serve": (service.run_serve, service.show_serve),
+    "benchmark": (benchmark.run, benchmark.show),
 }
 
 

@@ -47,6 +47,11 @@ def irfft2(x: Array, shape: tuple[int, int]) -> Array:
     return array_namespace(x).fft.irfftn(x, s=shape, axes=(-2, -1))
 
 
+def has_ducc() -> bool:
+    """Whether ducc0 is there; SciPy does its work otherwise."""
+    return _ducc is not None
+
+
 def into(x: np.ndarray, out: np.ndarray, axis: int, forward: bool, threads: int) -> None:
     """DFT of complex `x` [n, m] along an axis, written to `out` (which may be x); neither way is scaled."""
     if _ducc is not None:

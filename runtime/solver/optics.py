@@ -64,6 +64,7 @@ class Optics:
         height, width = (fine * n + 2 * first for n in grid.shape)
         self.at_pixels = tuple(slice(first, first + fine * n, fine) for n in grid.shape)
         self.down, self.across = _window(first, height, padded[0]), _window(first, width, padded[1])
+        self.dark = slice(width - first, padded[1] - first)  # of the period: what the window leaves out
         self.fields = [xp.zeros((height, width), pair) for _ in transfers]
         # Where one buffer can be both, the pupil multiplies in place.
         self.in_place = fine == 1 and len(transfers) == 1 and path.crosstalk is None
@@ -151,19 +152,13 @@ class Optics:
                 self.backend.rows_fft(row, row, False)
                 for here, there in self.across:
                     fields[rows, here] = row[:, there]
-                z, total = fields[rows], light[rows]
-                if mode == 0:
-                    xp.multiply(z.real, z.real, out=total)
-                    if weight != 1:
-                        total *= weight
-                else:
-                    xp.multiply(z.real, z.real, out=part)
-                    part *= weight
-                    total += part
-                xp.multiply(z.imag, z.imag, out=part)
+                here_light = light[rows] if mode == 0 else part
+                xp.abs(fields[rows], out=here_light)
+                here_light *= here_light
                 if weight != 1:
-                    part *= weight
-                total += part
+                    here_light *= weight
+                if mode > 0:
+                    light[rows] += part
 
             self.backend.over_rows(len(fields), self.strip, work)
 
@@ -186,7 +181,7 @@ class Optics:
             ) -> None:
                 count = rows.stop - rows.start
                 row, part = self.row[worker][:count], self.part[worker][:count]
-                row[...] = 0
+                row[:, self.dark] = 0
                 if over is not None:
                     xp.multiply(over[rows], twice, out=part)
                 for here, there in self.across:

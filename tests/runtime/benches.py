@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from runtime.lightpath import LightPath, band_frequencies, grid_for
-from runtime.propagation import band_limit, transfer_function
+from runtime import ideal
+from runtime.lightpath import LightPath
 
 PITCH, WAVELENGTH = 8e-6, 520e-9
 ARRAYS = (
@@ -31,21 +31,7 @@ def ideal_path(
     dtype: type = np.float64,
 ) -> LightPath:
     """A perfect panel of 256 levels under a uniform beam, with a square iris, by the angular spectrum."""
-    grid = grid_for(shape, PITCH, WAVELENGTH, distance, half_width)
-    fy, fx = band_frequencies(grid, np.zeros((), np.float64))
-    limits = tuple(band_limit(WAVELENGTH, distance, n * PITCH) for n in grid.padded)
-    edge = half_width / (2 * PITCH) * (1 + 1e-9)
-    passed = (np.abs(fy)[:, None] <= edge) & (np.abs(fx)[None, :] <= edge)
-    transfer = transfer_function(
-        fy[:, None], fx[None, :], WAVELENGTH, distance, (limits[0], limits[1]), "angular_spectrum"
-    )
-    path = LightPath(
-        grid=grid,
-        response=2 * np.pi * np.arange(256) / 256,
-        source=np.ones(shape, np.complex128),
-        transfers=(passed * transfer)[None],
-        weights=np.ones(1),
-    )
+    path = ideal.ideal_path(shape, PITCH, WAVELENGTH, distance, half_width)
     return converted(path, dtype)
 
 

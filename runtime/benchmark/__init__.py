@@ -1,0 +1,1 @@
+"""What the solver does on this machine: `hololoop-runtime benchmark`."""
