@@ -51,6 +51,9 @@ class LasersTable:
     """[lasers] without power and channel."""
 
     bus: str = parameter(about="/dev/i2c-N, or virtual:SOCKET")
+    mrad_per_pixel: float = parameter(
+        0.0, "angle of a panel pixel's image at the eye; 0: one spot is assumed", 0, 100
+    )
 
 
 @dataclass(frozen=True)
@@ -121,6 +124,11 @@ def check_tables(tables: Mapping[str, Table]) -> None:
             read_table(kind, tables[part], f"[{part}]", ignore=others)
     laser_channels(tables["lasers"])
     laser_power(tables["lasers"])
+
+
+def mrad_per_pixel(table: Table) -> float:
+    """The angle of a pixel at the eye, for the prediction of bright spots; 0: none is to be made."""
+    return read_table(LasersTable, table, "[lasers]", ignore=("power", "channel")).mrad_per_pixel
 
 
 def laser_channels(table: Table) -> Sequence[LaserChannel]:

@@ -32,7 +32,11 @@ class Child:
         self._process: subprocess.Popen[bytes] | None = None
         self._pause_s = PAUSE_S
         self._started = 0.0
-        self.start_at = 0.0  # when to start it, monotonic s; for a running one meaningless
+        self._start_at = 0.0
+
+    def due(self, now_s: float) -> bool:
+        """Whether it is not running and it is time to start it."""
+        return self.link is None and now_s >= self._start_at
 
     def start(self) -> Link:
         """Start the process; returns the link to it."""
@@ -62,13 +66,8 @@ class Child:
         now = time.monotonic()
         if now - self._started > SETTLED_S:
             self._pause_s = PAUSE_S
-        self.start_at = now + self._pause_s
+        self._start_at = now + self._pause_s
         self._pause_s = min(2 * self._pause_s, LONGEST_PAUSE_S)
-
-    @property
-    def pid(self) -> int:
-        """The process's number, 0 while it is not running."""
-        return self._process.pid if self._process else 0
 
 
 def child_link(fd: str, vocabulary: Vocabulary) -> Link:

@@ -37,6 +37,7 @@ class Timing:
         80.0, "a pattern, or a sign of life of panel, solver or camera, older than this is dark", 20, 10000
     )
     metrics_port: int = parameter(0, "of http://127.0.0.1/metrics; 0: none", 0, 65535)
+    channel: str = parameter("", "colour to show, where the bundle has several")
     socket: str = parameter("/run/hololoop/service.sock", "path of the Unix socket")
 
 

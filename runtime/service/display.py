@@ -38,7 +38,7 @@ class Clock:
 
 @dataclass(frozen=True)
 class Ready:
-    """A pattern for the panel: gray levels of each colour, uint8 [C, H, W], of job number `job`."""
+    """A pattern for the panel: gray levels of each colour, uint8 [C, H, W]; dark: not to be lit."""
 
     job: int
     display_ns: int
@@ -46,6 +46,7 @@ class Ready:
     crc: int
     psnr_db: float
     final: bool
+    dark: bool = False
 
 
 class Events(Protocol):
@@ -163,7 +164,7 @@ class Display(threading.Thread):
         took = now - began_ns
         self.transfer_ns = min(int(0.9 * self.transfer_ns + 0.1 * took), self._clock.period_ns // 2)
         self.answered_ns = now
-        self.lit_until_ns = pattern.display_ns + self._stale_ns
+        self.lit_until_ns = 0 if pattern.dark else pattern.display_ns + self._stale_ns
         self._events.shown(pattern, max(tick, now), took * 1e-9)
 
     def _opened(self) -> bool:

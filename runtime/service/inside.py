@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from runtime.service.messages import F32, U32, U64, Text, Vocabulary
+from runtime.service.messages import F32, U32, U64, Shares, Text, Vocabulary
 
 
 class Ping(NamedTuple):
@@ -44,16 +44,19 @@ class Job(NamedTuple):
     reserved: U32 = 0
 
 
+FINAL, DARK = 1, 2  # flags of Solved: no better pattern is to come; the picture is black
+
+
 class Solved(NamedTuple):
-    """A pattern for a job: with final = 0 the best so far, and more is to come."""
+    """A pattern for a job."""
 
     job: U32
     slot: U32
     crc: U32
-    final: U32
+    flags: U32
     psnr_db: F32
-    peak: F32  # irradiance of its brightest pixel over the mean
     solve_us: U32
+    shares: Shares  # of its light in its brightest spots (eye_safety.spot_shares); zeros where it is not predicted
 
 
 class Unsolved(NamedTuple):

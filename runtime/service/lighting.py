@@ -8,6 +8,7 @@ heartbeat ends and the controller darkens the lasers by itself.
 
 from __future__ import annotations
 
+import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -67,6 +68,7 @@ class Lighting(threading.Thread):
         self._stopping = False
         self._cleared_at = -CLEAR_TO_ARM_S
         self._looked_at = 0.0
+        self._expected: tuple[float, ...] = ()
         self.state, self.faults = Lasers.LOST, 0
         self.level = dict.fromkeys(power, 0.0)
         self.turned_ns = time.monotonic_ns()
@@ -80,6 +82,17 @@ class Lighting(threading.Thread):
         """Ask for "clear", "arm" or "dark"; `answer` is called in this thread."""
         self._requests.append(Request(what, answer))
         self._wake.set()
+
+    def expect(self, shares: bytes, then: Callable[[], None]) -> None:
+        """Say what light the next pattern is predicted to make, and what to do when the power is right for it.
+
+        shares : 13 float32, from eye_safety.spot_shares; zeros: not predicted, and taken to be one spot
+        """
+        if not any(shares) or not self.armed:
+            then()
+            return
+        self._expected = struct.unpack("<13f", shares)
+        self.ask("expect", lambda wrong: then())
 
     def stop(self) -> None:
         """Dark at once, then end the thread."""
@@ -141,7 +154,9 @@ class Lighting(threading.Thread):
         """Do what was asked; what is wrong, or None."""
         now = time.monotonic()
         try:
-            if what == "dark":
+            if what == "expect":
+                self._lasers.expect(dict.fromkeys(self._power, self._expected))
+            elif what == "dark":
                 self._lasers.trip()
                 self._look()
             elif what == "clear":
@@ -156,7 +171,7 @@ class Lighting(threading.Thread):
                 self._cleared_at = -CLEAR_TO_ARM_S
                 self._lasers.arm()
                 self.state = Lasers.ARMED
-        except DeviceError as error:
+        except (DeviceError, InputError) as error:
             self._look()
             return str(error)
         return None

@@ -26,12 +26,9 @@ class RequestError(Exception):
         self.code, self.text = code, text
 
 
-@dataclass
+@dataclass(frozen=True)
 class FrameJob:
-    """An accepted frame on its way: whose, where its picture is, when it is to be seen.
-
-    Times are CLOCK_MONOTONIC, ns; solving_ns is 0 until the solver has it
-    """
+    """An accepted frame on its way: whose, where its picture is, when it is to be seen (CLOCK_MONOTONIC, ns)."""
 
     job: int
     session: Session
@@ -40,14 +37,13 @@ class FrameJob:
     crc: int
     display_ns: int
     accepted_ns: int
-    solving_ns: int = 0
 
 
 class Session:
     """A program that is connected.
 
     Attributes: version (None before Hello), ring (of the one that has the display), calls, waiting (serial of
-    a Wait that is not answered yet), display_ns (of the latest frame given), displays (display time by frame)
+    a Wait that is not answered yet), display_ns (of the latest frame given), closed (the program is to go)
     """
 
     def __init__(self, link: Link) -> None:
@@ -58,11 +54,13 @@ class Session:
         self.calls = FrameCalls()
         self.waiting: int | None = None
         self.display_ns = 0
-        self.displays: dict[int, int] = {}
+        self._displays: dict[int, int] = {}
         self.closed = False
 
     def send(self, message: NamedTuple, serial: int = 0, fd: int | None = None) -> None:
         """Send, or give the session up where the program is gone or does not read."""
+        if self.closed:
+            return
         try:
             self.link.send(message, serial, [] if fd is None else [fd])
         except OSError:
@@ -97,8 +95,37 @@ class Session:
             raise RequestError(Code.RING, str(error)) from None
         self.slots = message.slots
 
+    def wait(self, serial: int) -> None:
+        """The program waits for its next frame. Raises RequestError out of order."""
+        with self._in_order():
+            self.calls.check_wait()
+        if self.waiting is not None:
+            raise RequestError(Code.ORDER, "a Wait is not answered yet")
+        self.waiting = serial
+
+    def next_frame(self, display_ns: int) -> int:
+        """The number of the frame that is to be seen then."""
+        frame = self.calls.wait()
+        self.display_ns = display_ns
+        recent = {f: at for f, at in self._displays.items() if f >= frame - 1}
+        self._displays = recent | {frame: display_ns}
+        return frame
+
+    def begin(self, frame: int) -> None:
+        """Drawing begins. Raises RequestError out of order."""
+        with self._in_order():
+            self.calls.begin(frame)
+
+    def end(self, message: protocol.End) -> int:
+        """The frame is drawn; returns when it is to be seen. Raises RequestError out of order."""
+        with self._in_order():
+            if message.slot >= self.slots:
+                raise RequestError(Code.SLOT, f"there is no slot {message.slot}: the ring has {self.slots}")
+            self.calls.end(message.frame, message.slot)
+        return self._displays[message.frame]
+
     @contextmanager
-    def in_order(self) -> Iterator[None]:
+    def _in_order(self) -> Iterator[None]:
         """Turns a frame call out of order into the answer to it."""
         if self.ring is None:
             raise RequestError(Code.ORDER, "send Ring before frame calls")
@@ -106,11 +133,6 @@ class Session:
             yield
         except OrderError as error:
             raise RequestError(Code.ORDER, str(error)) from None
-
-    def check_slot(self, slot: int) -> None:
-        """Raises RequestError for a slot that the ring does not have."""
-        if slot >= self.slots:
-            raise RequestError(Code.SLOT, f"there is no slot {slot}: the ring has {self.slots}")
 
     def fail(self, frame: int, code: Code, text: str) -> None:
         """An accepted frame came to nothing."""

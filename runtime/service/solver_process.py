@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import select
+import struct
 import sys
 import time
 from collections import deque
@@ -19,6 +20,8 @@ from firmware_iface.errors import InputError
 from runtime.service.children import child_link
 from runtime.service.configuration import read_configuration
 from runtime.service.inside import (
+    DARK,
+    FINAL,
     SOLVER,
     Free,
     Job,
@@ -32,7 +35,7 @@ from runtime.service.inside import (
 from runtime.service.link import Link
 from runtime.service.protocol import Code
 from runtime.service.ring import Ring, crc32, make_ring, open_ring
-from runtime.service.solving import Pattern, light_paths, patterns
+from runtime.service.solving import Pattern, open_solver
 
 SLOTS = 4
 FULL_SCALE = 65535
@@ -84,17 +87,10 @@ class Worker:
         slot = self.free.pop()
         self.ring.slots[slot] = pattern.gray
         microseconds = (time.monotonic_ns() - began_ns) // 1000
-        self.link.send(
-            Solved(
-                job.job,
-                slot,
-                crc32(pattern.gray),
-                int(pattern.final),
-                pattern.psnr_db,
-                pattern.peak,
-                min(microseconds, 2**32 - 1),
-            )
-        )
+        flags = FINAL * pattern.final | DARK * pattern.dark
+        shares = struct.pack("<13f", *pattern.shares) if pattern.shares else bytes(52)
+        took_us = min(microseconds, 2**32 - 1)
+        self.link.send(Solved(job.job, slot, crc32(pattern.gray), flags, pattern.psnr_db, took_us, shares))
 
     def run(self, solve: Solve) -> None:
         """Serve until the supervisor goes."""
@@ -120,15 +116,14 @@ def main(fd: str, configuration: str) -> None:
     """Run the process until its supervisor closes the link."""
     link = child_link(fd, SOLVER)
     try:
-        paths = light_paths(read_configuration(configuration).bundle)
+        asked = read_configuration(configuration)
+        solver = open_solver(asked)
     except InputError as error:
         link.send(Unsolved(0, Code.SOLVER, str(error)))
         return
-    shape = (len(paths), *paths[0].grid.shape)
-    for _ in patterns(paths, np.ones(shape, np.float32), time.monotonic_ns()):
+    for _ in solver.patterns(np.ones(solver.shape, np.float32), time.monotonic_ns()):
         pass  # what is made at the first use is made before the first frame
-    worker = Worker(link, shape)
-    worker.run(lambda target, deadline_ns: patterns(paths, target, deadline_ns))
+    Worker(link, solver.shape).run(solver.patterns)
 
 
 if __name__ == "__main__":

@@ -5,61 +5,77 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
+from firmware_iface.assembled import mrad_per_pixel
+from firmware_iface.errors import InputError
+from firmware_iface.lasers.eye_safety import spot_shares
 from runtime.bundle import read_bundle
 from runtime.calibrated import bundle_channels, load_light_path
-from runtime.lightpath import LightPath, irradiance, panel_phase, pixel_irradiance
-from runtime.solver import solve
-
-STEPS_AT_MOST = 40
+from runtime.lightpath import LightPath
+from runtime.service.configuration import Configuration
+from runtime.solver import Solution, Solver, shown
 
 
 @dataclass(frozen=True)
 class Pattern:
-    """Gray levels for every colour, uint8 [C, H, W], and what the calibrated model says that they show.
+    """Gray levels for each colour, uint8 [C, H, W], and what the calibrated model says that they show.
 
-    psnr_db : of amplitude, of the worst colour. peak : irradiance of the brightest pixel over the mean.
-    final : nothing better is to come by the deadline
+    psnr_db : of amplitude. final : nothing better is to come by the deadline. dark : the picture is black, and
+    no pattern shows that. shares : of the light in its brightest spots (eye_safety.spot_shares), if asked for
     """
 
     gray: np.ndarray
     psnr_db: float
-    peak: float
     final: bool
+    dark: bool = False
+    shares: tuple[float, ...] = ()
 
 
-def light_paths(bundle: Path) -> list[LightPath]:
-    """The light path of each colour of a bundle, in its order. Raises InputError for a broken one."""
-    read = read_bundle(bundle)
-    return [load_light_path(read, channel) for channel in bundle_channels(read)]
+class PatternSolver:
+    """Solves for one light path, frame after frame.
 
-
-def patterns(paths: list[LightPath], target: np.ndarray, deadline_ns: int) -> Iterator[Pattern]:
-    """Ever better patterns for a target irradiance [C, H, W]; the last one by the deadline (monotonic, ns).
-
-    The first costs least and always comes. Raises InputError for a target that cannot be shown.
+    mrad_per_pixel : angle of a pixel at the eye, where the light of each pattern is to be predicted; 0: it is not
+    shape : (1, H, W)
     """
-    began = time.monotonic_ns()
-    first = [solve(path, plane, 0) for path, plane in zip(paths, target, strict=True)]
-    each_ns = time.monotonic_ns() - began
-    steps = min(STEPS_AT_MOST, (deadline_ns - time.monotonic_ns()) // max(each_ns, 1) - 1)
-    yield _pattern(paths, first, final=steps < 1)
-    if steps >= 1:
-        better = [
-            solve(path, plane, int(steps), start=solution.phase)
-            for path, plane, solution in zip(paths, target, first, strict=True)
-        ]
-        yield _pattern(paths, better, final=True)
+
+    def __init__(self, path: LightPath, mrad_per_pixel: float = 0.0) -> None:
+        self.shape = (1, *path.grid.shape)
+        self._path, self._mrad = path, mrad_per_pixel
+        self._solver = Solver(path)
+
+    def patterns(self, target: np.ndarray, deadline_ns: int) -> Iterator[Pattern]:
+        """Ever better patterns for a target irradiance [1, H, W]; the last one by the deadline (monotonic, ns).
+
+        The first, which begins with the frame before, always comes. Raises InputError for a target that
+        cannot be shown.
+        """
+        if not target.any():
+            yield Pattern(np.zeros(self.shape, np.uint8), 0.0, final=True, dark=True)
+            return
+        first = self._solver.frame(target[0], 0)
+        left_ms = (deadline_ns - time.monotonic_ns()) * 1e-6
+        enough = left_ms > first.milliseconds  # what beginning once more costs
+        yield self._pattern(first, final=not enough)
+        if enough:
+            better = self._solver.solve(target[0], deadline_ms=left_ms, start=first.phase)
+            yield self._pattern(better, final=True)
+
+    def _pattern(self, solution: Solution, final: bool) -> Pattern:
+        shares: tuple[float, ...] = ()
+        if self._mrad:
+            shares = spot_shares(shown(self._path, solution.gray), self._mrad)
+        return Pattern(solution.gray[None], solution.expected_psnr_db, final, shares=shares)
 
 
-def _pattern(paths: list[LightPath], solutions: list, final: bool) -> Pattern:
-    gray = np.stack([solution.gray for solution in solutions])
-    light = [
-        pixel_irradiance(path, irradiance(path, panel_phase(path, s.gray.astype(np.int64))))
-        for path, s in zip(paths, solutions, strict=True)
-    ]
-    peak = max(float(plane.max() / max(plane.mean(), 1e-30)) for plane in light)
-    return Pattern(gray, min(s.quality.psnr_db for s in solutions), peak, final)
+def open_solver(configuration: Configuration) -> PatternSolver:
+    """The solver for a configuration's bundle and colour. Raises InputError where they do not fit."""
+    bundle = read_bundle(configuration.bundle)
+    channel = configuration.timing.channel or None
+    if channel is None and len(bundle_channels(bundle)) > 1:
+        raise InputError(
+            f'{configuration.bundle} has several colours and one is shown: write channel = "NAME" in [service], '
+            f"one of {', '.join(bundle_channels(bundle))}"
+        )
+    return PatternSolver(load_light_path(bundle, channel), mrad_per_pixel(configuration.devices["lasers"]))

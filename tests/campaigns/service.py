@@ -46,5 +46,5 @@ if __name__ == "__main__":
             os._exit(0)
     else:
         supervisor = Supervisor(read_configuration(sys.argv[1]))
-        supervisor.solver.module = "tests.campaigns.service"
+        supervisor.pipeline.solver.module = "tests.campaigns.service"
         supervisor.run()

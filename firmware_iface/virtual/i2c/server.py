@@ -7,6 +7,7 @@ import json
 import socket
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from .board import LaserBoard
@@ -51,7 +52,7 @@ class BoardServer:
             threading.Thread(target=self._serve, args=(connection,), daemon=True).start()
 
     def _serve(self, connection: socket.socket) -> None:
-        with connection:
+        with connection, suppress(ConnectionError):  # the process at the other end may be killed
             while packet := connection.recv(PACKET):
                 try:
                     if self._ended.is_set():
