@@ -104,8 +104,9 @@ class LaserBoard:
             if self.bus.faults.standing("unplug"):
                 self._power_on()
             self.thermometer.settle()
-            self.converter.settle()
             self.controller.settle()
+            self.converter.settle()  # after the limiter has come this far
+            self.controller.settle()  # and ALERT with it
             emitted = {d.name: self.power_uw(k) for k, d in enumerate(self.diodes)}
             if emitted == self._emitted:
                 return
