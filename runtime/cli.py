@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from firmware_iface.errors import InputError, nearest
+from firmware_iface.errors import DeviceError, InputError, nearest
 from runtime.benchmark import command as benchmark
 from runtime.calibration import command as calibration
 from runtime.service import command as service
@@ -79,7 +79,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
     try:
         return _main(sys.argv[1:] if argv is None else list(argv))
-    except InputError as error:
+    except (DeviceError, InputError) as error:
         return _stopped(str(error), BAD_INPUT)
     except KeyboardInterrupt:
         return _stopped("interrupted; what was finished is there, and nothing is half written", INTERRUPTED)

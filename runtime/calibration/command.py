@@ -29,7 +29,11 @@ def arguments(parser: ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("bundle", metavar="BUNDLE", type=Path, help="the bundle that the headset uses")
     what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("--headset", metavar="SPEC", help="virtual:NAME, or the TOML file of a virtual bench")
+    what.add_argument(
+        "--headset",
+        metavar="SPEC",
+        help="a service's configuration, virtual:NAME, or a virtual bench's TOML file",
+    )
     what.add_argument("--restore", action="store_true", help="put back the bundle that was last replaced")
     parser.add_argument(
         "--plane", metavar="MM", type=float, help="plane that the camera sees (default: the bundle's)"
@@ -41,8 +45,8 @@ def arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> dict[str, Any]:
     """Calibrate, report, and replace the bundle where that is right; returns what `--json` prints."""
-    from firmware_iface.virtual import open_headset
     from runtime.bundle import read_bundle
+    from runtime.calibration.devices import open_devices
     from runtime.calibration.numbers import numbers
     from runtime.calibration.replacing import previous, replace_bundle, restore_bundle
     from runtime.calibration.report import write_report
@@ -52,8 +56,8 @@ def run(args: Namespace) -> dict[str, Any]:
         restore_bundle(args.bundle)
         return {"verdict": "restored", "bundle": str(args.bundle), "previous": str(previous(args.bundle))}
     bundle = read_bundle(args.bundle)
-    with _progress() as say:
-        found = calibrate(open_headset(args.headset, args.seed), bundle, args.plane, args.seed, say)
+    with open_devices(args.headset, args.seed) as devices, _progress() as say:
+        found = calibrate(devices, bundle, args.plane, args.seed, say)
     replaced = found.verdict == "recalibrated" and not args.check
     result: dict[str, Any] = {
         "bundle": str(args.bundle),

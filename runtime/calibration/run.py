@@ -17,11 +17,12 @@ from firmware_iface.errors import InputError
 from runtime.bundle import Bundle
 from runtime.calibrated import bundle_channels, bundle_paths, load_light_path, plane_of
 from runtime.calibration.check import Heldout, complete, heldout_errors, verdict
+from runtime.calibration.devices import Devices
 from runtime.calibration.drift import Drift, drifted
 from runtime.calibration.fit import Base, Estimate, Fitted, Shot, chi_squared, fit, gain_of, predicted
 from runtime.calibration.patterns import GRAINS, HELD_OUT, grains, grating, proof_picture
 from runtime.calibration.response import SWEEP, Sweep, best_period, fitted_response, measured_sweep
-from runtime.calibration.taking import Headset, Noise, Taker
+from runtime.calibration.taking import Noise, Taker
 from runtime.calibration.view import View, on_panel, sampler
 from runtime.registration import dot_pattern, dots_of, find_homography, panel_points
 from runtime.solver import quality, solve
@@ -77,7 +78,7 @@ class Calibration:
 
 
 def calibrate(
-    headset: Headset,
+    devices: Devices,
     bundle: Bundle,
     plane_mm: float | None = None,
     seed: int = 0,
@@ -93,26 +94,26 @@ def calibrate(
     bases = {c: Base(load_light_path(bundle, c, plane_mm), _wavelength(bundle, c)) for c in channels}
     shape = next(iter(bases.values())).path.grid.shape
     plane = plane_of(bundle, channels[0], plane_mm)
-    if tuple(headset.panel.shape) != shape:
+    if tuple(devices.panel.shape) != shape:
         raise InputError(
             f"the bundle is for a panel of {shape[0]} x {shape[1]} and this one has "
-            f"{' x '.join(map(str, headset.panel.shape))} pixels: use the bundle of this headset"
+            f"{' x '.join(map(str, devices.panel.shape))} pixels: use the bundle of this headset"
         )
     for channel in channels:
-        if channel not in headset.lasers.channels:
+        if channel not in devices.lasers.channels:
             raise InputError(f"the headset has no laser '{channel}', which the bundle is for: check both")
-    if hasattr(headset, "move_to_plane"):
-        headset.move_to_plane(plane)
+    if devices.focus:
+        devices.focus(plane)
     started = time.perf_counter()
     many = len(channels) * (len(GRAINS) + len(HELD_OUT) + len(SWEEP) + 6) + 1
-    taker = Taker(headset, lambda what: say(0.25 * min(taker.taken / many, 1), f"showing: {what}"))
+    taker = Taker(devices, lambda what: say(0.25 * min(taker.taken / many, 1), f"showing: {what}"))
     try:
         black, floor = taker.darkness()
         taken = {c: _taken(taker, c, bases[c], black, floor, seed) for c in channels}
-        headset.lasers.off()
+        devices.lasers.off()
         captured = time.perf_counter()
         known = _known_view(bundle)
-        view = _start_view(taken[channels[0]], known, shape, tuple(headset.camera.shape))
+        view = _start_view(taken[channels[0]], known, shape, tuple(devices.camera.shape))
         found, sweeps = _refit(bases, taken, view, lambda d, w: say(0.25 + 0.6 * d, f"fitting: {w}"))
         say(0.86, "checking against held-out patterns")
         heldout = [shot for t in taken.values() for shot in t.heldout]
@@ -123,7 +124,7 @@ def calibrate(
             say(0.92, f"showing the picture again: {channel}")
             pictures[channel] = _pictures(taker, channel, bases[channel], taken[channel], found.estimate)
     finally:
-        headset.lasers.off()
+        devices.lasers.off()
     done = time.perf_counter()
     return Calibration(
         verdict(before, after),
@@ -170,7 +171,7 @@ def _taken(taker: Taker, channel: str, base: Base, black: float, floor: float, s
         exposure,
         noise,
     )
-    taker.headset.lasers.off()
+    taker.devices.lasers.off()
     return result
 
 
@@ -264,9 +265,9 @@ def _pictures(
     path = drifted(base.path, channel, base.wavelength_nm, estimate.drift)
     gray = solve(path, target, SOLVING).gray
     taker.light(channel)
-    taker.headset.camera.exposure_ms = taken.exposure_ms
+    taker.devices.camera.exposure_ms = taken.exposure_ms
     after = taker.shot(channel, gray, taken.noise, f"{channel}, picture")
-    taker.headset.lasers.off()
+    taker.devices.lasers.off()
     seen = {}
     for name, shot in (("before", taken.heldout[-1]), ("after", after)):
         light = on_panel(shot.signal, estimate.view, base.path.grid.shape)

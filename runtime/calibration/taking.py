@@ -8,32 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 import numpy as np
 
 from firmware_iface.errors import InputError
+from runtime.calibration.devices import Devices
 from runtime.calibration.fit import Shot
 
-POWER = 1.0  # of what the safety controller lets the laser give
 AIM, BRIGHTEST = 0.7, 0.999  # this share of full scale for this quantile of a picture
 SHORTEST_MS, LONGEST_MS = 0.02, 1000.0
 DARK = 2  # pictures without lasers
 
 Said = Callable[[str], None]
-
-
-class Headset(Protocol):
-    """What is needed of a headset: its panel, lasers and camera."""
-
-    @property
-    def panel(self) -> Any: ...
-
-    @property
-    def lasers(self) -> Any: ...
-
-    @property
-    def camera(self) -> Any: ...
 
 
 @dataclass(frozen=True)
@@ -53,14 +39,14 @@ class Noise:
 class Taker:
     """Takes captures of one colour after another; lasers are on only while it does."""
 
-    def __init__(self, headset: Headset, said: Said) -> None:
-        self.headset, self.said = headset, said
+    def __init__(self, devices: Devices, said: Said) -> None:
+        self.devices, self.said = devices, said
         self.taken = 0
-        self.top = float(2**headset.camera.bit_depth - 1)
+        self.top = float(2**devices.camera.bit_depth - 1)
 
     def darkness(self) -> tuple[float, float]:
         """Black level (counts) and the variance of a picture without light. Raises InputError if it is not dark."""
-        self.headset.lasers.off()
+        self.devices.lasers.off()
         self.said("dark pictures")
         first, second = (self._picture() for _ in range(DARK))
         black = float((first + second).mean() / 2)
@@ -73,15 +59,14 @@ class Taker:
 
     def light(self, channel: str) -> None:
         """Switch one laser on, and all others off."""
-        self.headset.lasers.off()
-        self.headset.lasers.set_power(channel, POWER)
+        self.devices.light(channel)
 
     def expose(self, gray: np.ndarray, black: float) -> float:
         """Set and return the exposure, ms, at which a pattern just does not saturate. Raises InputError if dark."""
-        camera = self.headset.camera
+        camera = self.devices.camera
         self.said("exposure")
         for _ in range(8):
-            self.headset.panel.show(gray)
+            self.devices.panel.show(gray)
             bright = float(np.quantile(self._picture(), BRIGHTEST)) - black
             room = self.top - black
             if bright < 0.9 * room:
@@ -107,7 +92,7 @@ class Taker:
 
     def noise(self, gray: np.ndarray, black: float, floor: float) -> Noise:
         """The camera's noise, from two pictures of one pattern (their brightness may differ a little)."""
-        self.headset.panel.show(gray)
+        self.devices.panel.show(gray)
         self.said("noise")
         first, second = (self._picture() - black for _ in range(2))
         second = second * (first.sum() / second.sum())
@@ -118,7 +103,7 @@ class Taker:
 
     def shot(self, channel: str, gray: np.ndarray, noise: Noise, what: str) -> Shot:
         """One capture of a pattern."""
-        self.headset.panel.show(gray)
+        self.devices.panel.show(gray)
         self.said(what)
         counts = self._picture()
         signal = counts - np.float32(noise.black)
@@ -135,7 +120,7 @@ class Taker:
 
     def _picture(self) -> np.ndarray:
         self.taken += 1
-        return np.asarray(self.headset.camera.capture()).astype(np.float32)
+        return np.asarray(self.devices.camera.capture()).astype(np.float32)
 
 
 def _softened(signal: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ from firmware_iface.virtual import BenchDescription, VirtualHeadset
 from firmware_iface.virtual.defects import make_defect
 from runtime.bundle import write_bundle
 from runtime.calibrated import pack_light_paths
+from runtime.calibration.devices import Devices
 from runtime.calibration.fit import Base
 from runtime.legendre import edge_to_edge
 from tests.runtime.benches import ideal_path
@@ -25,6 +26,10 @@ def drifted_bench(*defects: str, shape: tuple[int, int] = SHAPE, **parameters: f
 
 def headset(bench: BenchDescription, seed: int = 1) -> VirtualHeadset:
     return VirtualHeadset(bench, seed)
+
+
+def devices(headset: VirtualHeadset) -> Devices:
+    return Devices(headset.panel, headset.lasers, headset.camera, {}, headset.move_to_plane)
 
 
 def base(shape: tuple[int, int] = SHAPE) -> Base:

@@ -26,7 +26,7 @@ from runtime.calibration.taking import Taker
 from runtime.calibration.view import View, sampler
 from runtime.lightpath import irradiance, panel_phase, pixel_irradiance
 from tests.runtime.benches import PITCH, ideal_path, random_path
-from tests.runtime.calibration.drifting import WAVELENGTH_NM, base, drifted_bench, headset
+from tests.runtime.calibration.drifting import WAVELENGTH_NM, base, devices, drifted_bench, headset
 
 SMALL = (40, 52)
 
@@ -131,7 +131,7 @@ def test_a_sweep_of_gratings_gives_a_hidden_response() -> None:
     shape = (64, 80)
     bench = drifted_bench("phase_response", shape=shape)
     device, one, still = headset(bench), base(shape), Estimate(Drift(), View(shape))
-    taker = Taker(device, lambda what: None)
+    taker = Taker(devices(device), lambda what: None)
     black, floor = taker.darkness()
     taker.light("green")
     taker.expose(grains(shape, 4, 0), black)
@@ -152,7 +152,7 @@ def test_the_cameras_noise_is_measured_without_its_data_sheet() -> None:
     shape = (64, 80)
     device = headset(drifted_bench(shape=shape))
     camera = device.description.camera
-    taker = Taker(device, lambda what: None)
+    taker = Taker(devices(device), lambda what: None)
     black, floor = taker.darkness()
     taker.light("green")
     exposure = taker.expose(grains(shape, 4, 0), black)

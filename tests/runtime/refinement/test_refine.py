@@ -180,8 +180,8 @@ def test_where_camera_and_model_agree_the_gradient_is_the_models(
     wanted = start[0] - STEP * _to_step(path, pullback)(slope.astype(np.float32))
     moved = np.angle(np.exp(1j * (state.phase[0] - wanted)))
     # 255 steps of a 256th of a turn leave a gap: phases in it are held at its nearer edge
-    assert np.abs(moved).max() < 1.01 * np.pi / 256 and np.quantile(np.abs(moved), 0.9) < 1e-4
-    assert np.abs(wanted - start[0]).max() > 0.1
+    assert np.abs(moved).max() < 1.01 * np.pi / 256 and np.quantile(np.abs(moved), 0.9) < 1e-3
+    assert np.abs(wanted - start[0]).max() > 0.05
 
 
 def test_what_does_not_fit_is_said(

@@ -1,0 +1,84 @@
+"""The devices that a calibration or a refinement uses, real or virtual, opened by one name."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from firmware_iface.errors import InputError
+
+FULL = 1.0  # power where nothing else is said: all that the safety controller lets a laser give
+
+
+@dataclass(frozen=True)
+class Devices:
+    """Panel, lasers and camera of a headset.
+
+    power: fraction of full of each colour while it is lit; FULL where it is not named. focus: puts the camera's focus
+    to a plane, mm from the panel; none: it stays where it is.
+    """
+
+    panel: Any
+    lasers: Any
+    camera: Any
+    power: Mapping[str, float] = field(default_factory=dict)
+    focus: Callable[[float], None] | None = None
+
+    def light(self, channel: str) -> None:
+        """One laser on, all others off."""
+        self.lasers.off()
+        self.lasers.set_power(channel, self.power.get(channel, FULL))
+
+
+@contextmanager
+def open_devices(spec: str, seed: int = 0) -> Iterator[Devices]:
+    """The devices of `virtual:NAME`, of a virtual bench's TOML file, or of a service's configuration; dark at the end.
+
+    With a configuration, the lasers are armed, in a guard process that goes dark when this one ends in any way. Raises
+    InputError, and DeviceError where a device fails or a fault is latched (which a person has to clear).
+    """
+    tables = _configured(spec)
+    if tables is None:
+        from firmware_iface.virtual import open_headset
+
+        headset = open_headset(spec, seed)
+        yield Devices(headset.panel, headset.lasers, headset.camera, {}, headset.move_to_plane)
+        return
+    from firmware_iface.assembled import laser_channels, laser_power, open_camera, open_panel
+    from firmware_iface.lasers.guard import open_guarded_lasers
+    from firmware_iface.virtual.served import i2c_bus
+
+    for name in ("panel", "lasers", "camera"):
+        if name not in tables:
+            raise InputError(
+                f"{spec} has no [{name}]: a calibration needs the panel, the lasers and the camera"
+            )
+    bus = str(tables["lasers"].get("bus"))
+    with ExitStack() as stack:
+        camera = stack.enter_context(closing(open_camera(tables["camera"])))
+        panel = stack.enter_context(closing(open_panel(tables["panel"])))
+        bus = i2c_bus(bus) if bus.startswith("virtual:") else bus
+        lasers = stack.enter_context(closing(open_guarded_lasers(bus, laser_channels(tables["lasers"]))))
+        lasers.arm()
+        stack.enter_context(lasers.beating())
+        stack.callback(lasers.off)
+        yield Devices(panel, lasers, camera, laser_power(tables["lasers"]))
+
+
+def _configured(spec: str) -> dict[str, Any] | None:
+    """The devices' tables of a service's configuration; None for a virtual bench."""
+    if spec.startswith("virtual:") or not Path(spec).is_file():
+        return None
+    try:
+        tables = tomllib.loads(Path(spec).read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError):
+        return None  # which opening it as a bench will say
+    if "lasers" not in tables:
+        return None
+    from runtime.service.configuration import read_configuration
+
+    return read_configuration(spec).devices
