@@ -169,6 +169,7 @@ def test_where_camera_and_model_agree_the_gradient_is_the_models(
     from runtime.refinement.refine import STEP, _amplitude, _matched
 
     target = scene(SHAPE)[None]
+    start = start + np.random.default_rng(0).normal(0, 0.5, start.shape).astype(np.float32)
     state = Refinement([path], approximator, target, start)
     light = pixel_irradiance(path, irradiance(path, start[0].astype(np.float32)))
     state.take(7.5 * light[None])  # any scale
