@@ -4,7 +4,7 @@ from runtime.solver.drive import DriveRange
 from runtime.solver.method import METHODS
 from runtime.solver.penalty import PENALTIES
 from runtime.solver.quality import Quality, quality, quality_of, shown
-from runtime.solver.solve import Solution, Solver, solve
+from runtime.solver.solver import Solution, Solver, solve
 from runtime.solver.start import motion_between
 
 __all__ = [

@@ -2,7 +2,7 @@
 
 A method has `begin(objective)`, called for each picture, and `step(phase, out)`, which writes the phase that
 follows [C, H, W] to `out`. All are in place. What they have in common (the start, the best pattern met, the
-deadline) is in `runtime.solver.solve`.
+deadline) is in `runtime.solver.solver`.
 """
 
 from __future__ import annotations
