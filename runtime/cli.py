@@ -56,6 +56,7 @@ as the panel's, whatever the solver computed on; more iterations or time never m
 usually within a few dB of what can be reached."""
 
 SOLVERS = ("default", "double_phase", "gerchberg_saxton", "adam")
+PATIENT = 25  # iterations
 PENALTIES = ("amplitude", "irradiance", "l1")
 
 
@@ -253,16 +254,19 @@ def run_solve(args: Namespace) -> dict[str, Any]:
         raise InputError("the bundle's approximator sees all channels together: leave --channel out")
     # A colour is solved on its own, unless an approximator sees them all.
     groups = [channels] if d is not None else [[c] for c in channels]
+    iterations = 20 if args.iterations is None and args.deadline_ms is None else args.iterations
     grid = args.grid or (None if args.deadline_ms is None else "panel")
+    # Pre-distorting the target gets further at first, seeing through the approximator in the end (for twice the time).
+    patient = d is not None and d.has_gradient and iterations is not None and iterations > PATIENT
     solvers = [
         Solver(
             [paths[c] for c in group], method=args.solver, penalty=args.penalty, grid=grid,
-            approximator=d, initialiser=bundle.networks.get(INITIALISER),
+            approximator=d, through="gradient" if patient else "predistorted",
+            initialiser=bundle.networks.get(INITIALISER),
         )
         for group in groups
     ]  # fmt: skip
     out = {(job.target, job.channel): job.out for job in planned}
-    iterations = 20 if args.iterations is None and args.deadline_ms is None else args.iterations
     patterns = []
     with _progress(
         None if iterations is None else (iterations + 1) * len(args.targets) * len(groups)

@@ -58,6 +58,7 @@ class Objective:
         self.part = [xp.empty((self.strip, path.grid.shape[1]), real) for _ in range(backend.threads)]
         self.power = [float(np.mean(np.abs(stack[0].source) ** 2)) for stack in stacks]
         self.floor: list[float] = []
+        self.looks = 0
         self.scale = [1.0] * len(stacks)
         self.loss, self.squared_error, self.peak = math.inf, math.inf, 1.0
 
@@ -121,6 +122,8 @@ class Objective:
 
     def curvature(self, colour: int) -> float:
         """About the loss's second derivative over a pixel's phase, for a path that loses no light."""
+        if self.approximator is not None:
+            return self.power[colour] / self.mean_light[colour]
         rms = math.sqrt(self.squared_error)
         bend = self.penalty.curvature(self.scale[colour], self.mean_light[colour], rms)
         return bend * self.power[colour] * len(self.optics[colour])
@@ -152,21 +155,22 @@ class Objective:
             xp.multiply(light, 1 / self.mean_light[c], out=light)
             d.irradiance[c] = self.backend.to_host(light)
             self.scale[c] = _root_scale(light, wanted)
-        if first:
-            # D's own scale against the optics' is measured once a picture; then it follows that of the light.
+        self.looks = 1 if first else self.looks + 1
+        if self.looks & (self.looks - 1) == 0:
+            # D's scale over the light's changes ever more slowly: it is measured at looks 1, 2, 4, 8 ... only.
             d.correct()
             self.through = [
                 _root_scale(xp.asarray(d.corrected[c]), self.wanted[c, 0]) / self.scale[c]
                 for c in range(self.shape[0])
             ]
-        for c in range(self.shape[0]):
-            share = 1 / max(self.scale[c] * self.through[c], 1e-15) ** 2
-            np.multiply(self.backend.to_host(self.wanted[c, 0]), share, out=d.target[c])
+        units = [max(self.scale[c] * self.through[c], 1e-15) ** 2 for c in range(self.shape[0])]
+        for c, unit in enumerate(units):
+            np.multiply(self.backend.to_host(self.wanted[c, 0]), 1 / unit, out=d.target[c])
         loss = d.look()
         for c in range(self.shape[0]):
             self.light[c, 0] = xp.asarray(d.slope[c])
             self.light[c, 0] *= 1 / self.mean_light[c]
-        self.loss = self.squared_error = loss / self.pixels
+        self.loss = self.squared_error = loss / self.pixels * float(np.mean(units))
         return self.loss
 
 

@@ -169,12 +169,11 @@ class Solver:
         begun = time.perf_counter()
         self.follows = False
         phase = self.phases[0]
+        optics_targets = self._aim(targets)
         if start is None:
-            self._aim(targets)
-            self._cold(targets, phase)
+            self._cold(optics_targets, phase)
         else:
             phase[...] = self.on.xp.asarray(np.reshape(start, phase.shape))
-            self._aim(targets)
         return self._improve(targets, begun, iterations, deadline_ms, progress)
 
     def frame(
@@ -199,18 +198,18 @@ class Solver:
         if self.follows and motion is None:
             motion = motion_between(self.before, picture)
         warm = self.follows and motion is not None and not is_cut(self.before, picture, motion)
-        self._aim(targets)
+        optics_targets = self._aim(targets)
         if warm and motion is not None:
             first = next(k for k, phase in enumerate(self.phases) if phase is not self.best)
             shifted(self.best, motion, self.phases[first])
             self.phases[0], self.phases[first] = self.phases[first], self.phases[0]
             if any(motion):
                 other = next(phase for phase in self.phases if phase is not self.phases[0])
-                self._cold(targets, other)
+                self._cold(optics_targets, other)
                 for part in entering(motion, self.shape):
                     self.phases[0][part] = other[part]
         else:
-            self._cold(targets, self.phases[0])
+            self._cold(optics_targets, self.phases[0])
         self.before[...] = picture
         self.follows = True
         return self._improve(targets, begun, iterations, deadline_ms, None)
@@ -222,8 +221,7 @@ class Solver:
         for _ in range(2):  # the first touches memory for the first time and is not counted
             self.begin, self.step, self.finish = Pace(), Pace(), Pace()
             begun = time.perf_counter()
-            self._aim(targets)
-            self._cold(targets, self.phases[0])
+            self._cold(self._aim(targets), self.phases[0])
             self._improve(targets, begun, 3, None, None)
         if kept is not None:
             self.best[...] = kept
@@ -277,10 +275,13 @@ class Solver:
         judge = partial(self._judged, self.grays[0], targets, self.solved)
         return Solution(gray, phase, tuple(history), 1e3 * (done - begun), judge)
 
-    def _aim(self, targets: np.ndarray) -> None:
-        if self.approximator is not None and self.through == "predistorted":
-            targets = predistorted(self.approximator, targets)
-        self.objective.aim(targets)
+    def _aim(self, targets: np.ndarray) -> np.ndarray:
+        """Point the objective at targets; returns those that the optics should show."""
+        shown_by_optics = targets
+        if self.approximator is not None:
+            shown_by_optics = predistorted(self.approximator, targets)
+        self.objective.aim(shown_by_optics if self.through == "predistorted" else targets)
+        return shown_by_optics
 
     def _cold(self, targets: np.ndarray, phases: Any) -> None:
         for c, (drive, start, phase) in enumerate(zip(self.drives, self.starts, phases, strict=True)):
