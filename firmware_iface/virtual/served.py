@@ -15,6 +15,7 @@ import errno
 import json
 import os
 import signal
+import sys
 import threading
 import time
 from contextlib import suppress
@@ -33,6 +34,7 @@ from .usb.device import Gone, Nak, Stall
 
 PREFIX = "virtual:"
 LASERS = ".i2c"  # the laser board's bus has a socket of its own beside SOCKET
+SWITCH_S = 0.0002  # Python's 5 ms before a thread gives way are long on a bus
 USB_FAILURES = {failure.__name__: failure for failure in (Gone, Nak, Stall)}
 
 
@@ -259,6 +261,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of noise and garbage")
     args = parser.parse_args()
     ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # emulated hardware is not to outlive its test
+    sys.setswitchinterval(SWITCH_S)
     hardware = Hardware(args.bench, args.seed)
     for path in (args.socket, args.socket + LASERS):
         with suppress(FileNotFoundError):

@@ -78,6 +78,7 @@ class Display(threading.Thread):
         self._panel: Any = None
         self._stopping = threading.Event()
         self.transfer_ns = clock.period_ns // 10  # what a transfer takes, kept up to date
+        self.taken_ns = 0  # display time that has a pattern
         self.answered_ns = 0  # when the panel last did what it was asked
         self.turned_ns = time.monotonic_ns()
         self.lit_until_ns = 0  # what is on the panel may be lit until then
@@ -121,6 +122,7 @@ class Display(threading.Thread):
         pattern = self._due(tick)
         try:
             if pattern is not None:
+                self.taken_ns = tick
                 began = time.monotonic_ns()
                 for field in pattern.gray:
                     self._panel.show(field)

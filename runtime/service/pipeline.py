@@ -111,7 +111,8 @@ class Pipeline:
         """
         period = self.clock.period_ns
         lead = self._solve_ns + self.display.transfer_ns + WAKE_NS + HAND_OVER_NS
-        after_others = self.clock.after(now_ns - min(HAND_OVER_NS, period // 4)) + len(self._jobs) * period
+        free = max(self.clock.after(now_ns), self.display.taken_ns + period)  # display time
+        after_others = free + len(self._jobs) * period
         busy_until = self._running.display_ns if self._running else 0
         display = self.clock.after(max(now_ns + lead, after_others, busy_until + 1, session.display_ns + 1))
         if self._waiting or now_ns < display - lead - period:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import sys
 import time
 from contextlib import suppress
 from functools import partial
@@ -32,6 +33,7 @@ from runtime.service.systemd import Notifier, passed_socket
 
 MOST_SESSIONS = 32
 TURN_S, TURN_WAITED_S = 0.010, 0.001  # of the loop; the shorter while a program waits for a frame
+SWITCH_S = 0.0005  # Python's 5 ms before a thread gives way would make a frame late
 LOOPS_NS = 1_000_000_000  # a thread that did not turn for so long stops the watchdog's feed
 
 
@@ -61,6 +63,7 @@ class Supervisor:
         listener = passed_socket() or _listening(self.configuration)
         if self.configuration.timing.metrics_port:
             self.metrics.serve(self.configuration.timing.metrics_port)
+        sys.setswitchinterval(SWITCH_S)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: self.loop.later(self._stop))
         self.lighting.start()

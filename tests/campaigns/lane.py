@@ -15,7 +15,7 @@ import numpy as np
 from firmware_iface.virtual.served import Remote
 from runtime.service.client import Client, Lost, RefusedError
 from runtime.service.protocol import Lasers, Part, Shown
-from tests.campaigns.headset import ENVIRONMENT, connected, hardware, picture, write_configuration
+from tests.campaigns.headset import ENVIRONMENT, URGENT, connected, hardware, picture, write_configuration
 from tests.campaigns.service import noted
 
 PICTURES = 16
@@ -28,13 +28,19 @@ class Lane:
 
     oak : loopback address of an emulated OAK camera, or none for the camera without a link
 
-    Attributes: remote (the hardware), client, service (the process), accepted, shown and lost (numbers of frames).
+    Attributes: remote (the hardware), client, service (the process), accepted, shown and lost (numbers of frames),
+    latest (number of the frame that was accepted last), outcomes (those that were taken last).
     """
 
-    def __init__(self, folder: Path, seed: int, oak: str | None = None) -> None:
+    def __init__(
+        self, folder: Path, seed: int, oak: str | None = None, refresh_hz: float = REFRESH_HZ
+    ) -> None:
         self.folder, self.seed = folder, seed
-        self.file = write_configuration(folder, REFRESH_HZ, SOLVE_MS, STALE_MS, oak)
+        solve_ms = min(SOLVE_MS, 600 / refresh_hz)
+        self.file = write_configuration(folder, refresh_hz, solve_ms, STALE_MS, oak)
         self.accepted = self.shown = self.lost = 0
+        self.outcomes: list[Shown | Lost] = []
+        self.latest = 0
         self._stack = ExitStack()
         self.remote: Remote = self._stack.enter_context(hardware(folder, seed, oak))
         self.service = self.start_service()
@@ -54,7 +60,7 @@ class Lane:
     def start_service(self) -> subprocess.Popen[bytes]:
         """Start it, as systemd does after each end."""
         with (self.folder / "service.log").open("ab") as log:
-            command = [sys.executable, "-m", "tests.campaigns.service", str(self.file)]
+            command = [*URGENT, sys.executable, "-m", "tests.campaigns.service", str(self.file)]
             return subprocess.Popen(command, env=ENVIRONMENT, stderr=log)
 
     def end_service(self, number: int) -> None:
@@ -86,7 +92,7 @@ class Lane:
         """Show one picture and take what has become of earlier ones."""
         self._next = (self._next + 1) % PICTURES
         try:
-            self.client.show(self.pictures[self._next])
+            self.latest = self.client.show(self.pictures[self._next])
             self.accepted += 1
         except RefusedError:  # the solver is being started again
             time.sleep(0.002)
@@ -94,10 +100,10 @@ class Lane:
 
     def take(self, within_s: float = 0.0) -> list[Shown | Lost]:
         """Outcomes since the last time."""
-        outcomes = list(self.client.outcomes(within_s))
-        self.shown += sum(isinstance(o, Shown) for o in outcomes)
-        self.lost += sum(isinstance(o, Lost) for o in outcomes)
-        return outcomes
+        self.outcomes = list(self.client.outcomes(within_s))
+        self.shown += sum(isinstance(o, Shown) for o in self.outcomes)
+        self.lost += sum(isinstance(o, Lost) for o in self.outcomes)
+        return self.outcomes
 
     def reconnect(self) -> None:
         """A new program in place of the one that went."""
