@@ -7,7 +7,7 @@ laser's power is the only thing that changes the gain.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.errors import InputError, nearest
+from runtime.devices import Devices, open_devices
 from trainer.bench_file import Bench, Camera, read_bench
 from trainer.capture_writer import CaptureWriter
 from trainer.patterns import Pattern, choose_patterns, default_count
@@ -86,14 +87,43 @@ def capture_from(
     channels: Sequence[str] | None = None,
     seed: int = 0,
     progress: Progress | None = None,
+    devices: Path | None = None,
 ) -> Taken:
     """A capture set from the bench that `spec` names: `virtual:NAME`, or the TOML file of a virtual bench.
 
-    Raises InputError for an unknown bench, channel or plane, or a folder that holds something already.
+    devices : a service's configuration; its panel, lasers and camera are used, and `spec` is the bench's bench.toml
+    Raises InputError for an unknown bench, channel or plane, a folder that holds something already, or devices that
+    are not what bench.toml says; DeviceError (an InputError) where a device fails.
     """
-    headset, bench, own_planes = open_bench(spec, seed)
-    planes = tuple(planes_mm) if planes_mm else own_planes
-    return capture_set(headset, bench, folder, patterns, planes, channels, seed, progress)
+    if devices is None:
+        headset, bench, own_planes = open_bench(spec, seed)
+        planes = tuple(planes_mm) if planes_mm else own_planes
+        return capture_set(headset, bench, folder, patterns, planes, channels, seed, progress)
+    bench = read_bench(Path(spec))
+    with open_devices(str(devices), seed) as opened:
+        _check_devices(opened, bench)
+        if opened.focus is None and len(set(planes_mm or ())) > 1:
+            raise InputError("--planes: this camera does not focus by itself; capture one plane at a time")
+        return capture_set(
+            opened, bench, folder, patterns, planes_mm or (), channels, seed, progress, power=opened.power
+        )
+
+
+def _check_devices(devices: Devices, bench: Bench) -> None:
+    """Raises InputError where the devices are not those of bench.toml."""
+    for what, has, said in (
+        ("panel is (rows, columns)", devices.panel.shape, bench.panel.shape),
+        ("camera's picture is (rows, columns)", devices.camera.shape, bench.camera.shape),
+        ("camera's bit depth is", devices.camera.bit_depth, bench.camera.bit_depth),
+    ):
+        if has != said:
+            raise InputError(f"the {what} {has} and bench.toml says {said}: correct bench.toml")
+    for channel in bench.channels:
+        if channel.name not in devices.lasers.channels:
+            known = ", ".join(devices.lasers.channels)
+            raise InputError(
+                f"bench.toml has a channel '{channel.name}' and the lasers are {known}: correct one"
+            )
 
 
 def open_bench(spec: str, seed: int = 0) -> tuple[Any, Bench, tuple[float, ...]]:
@@ -119,9 +149,11 @@ def capture_set(
     seed: int = 0,
     progress: Progress | None = None,
     choose: Choose | None = None,
+    power: Mapping[str, float] | None = None,
 ) -> Taken:
     """Show patterns on a bench, capture them, and write the set.
 
+    power : of a laser while it is on, fraction of full; full where it is not named
     patterns : how many for each colour and plane; the first is shown twice, for the noise
     choose : gives the patterns of a colour and plane instead
     """
@@ -154,7 +186,7 @@ def capture_set(
         for channel in chosen:
             shown = [(p, choose(channel, p)) for p in planes]
             headset.lasers.off()
-            headset.lasers.set_power(channel, 1.0)
+            headset.lasers.set_power(channel, (power or {}).get(channel, 1.0))
             try:
                 exposures[channel] = _expose(headset, bench.camera, shown, channel, say)
                 for plane, several in shown:
@@ -223,7 +255,8 @@ def _expose(
             "and try again"
         )
     factor = AIM * camera.full_scale / bright
-    wanted = min(max(exposure * factor, EXPOSURES_MS[0]), EXPOSURES_MS[1])
+    longest = min(EXPOSURES_MS[1], headset.camera.longest_exposure_ms)
+    wanted = min(max(exposure * factor, EXPOSURES_MS[0]), longest)
     exposure = float(f"{wanted:.3g}")
     headset.camera.exposure_ms = exposure
     return exposure

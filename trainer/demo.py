@@ -2,24 +2,31 @@
 
 A headset with three hidden effects is captured and explained; pictures are then shown with patterns computed
 for the ideal model, for the explained one, and by an oracle that knows the true bench, which is as good as it
-gets.
+gets. They are shown through the drivers of a real headset, on emulated hardware: the panel over USB (pyusb), the
+lasers over I2C (smbus2, safety controller and heartbeat included), the camera over its link (depthai).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import importlib.util
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from firmware_iface.errors import InputError
-from firmware_iface.virtual import VirtualHeadset, load_bench
+from firmware_iface.virtual import VirtualHeadset, open_headset
+from firmware_iface.virtual.served import PREFIX, running
 from runtime.bundle import read_bundle
 from runtime.calibrated import load_light_path
 from runtime.cli import write_gray
+from runtime.devices import Devices, driven
 from runtime.files import whole_file
 from runtime.solver import Quality, quality, solve
 from runtime.targets import decode_srgb, encode_srgb, fit_area
@@ -33,8 +40,7 @@ from trainer.shown import Shown, with_display
 
 Progress = Callable[[float, str], None]
 
-BENCH = "virtual:demo"
-QUICK_SHAPE, QUICK_DISTANCE_MM = (144, 192), 18.0
+BENCH, QUICK_BENCH = "virtual:demo", "virtual:small_demo"
 PICTURES = ("astronaut", "coffee")  # not among those that are captured
 ITERATIONS, ORACLE_ITERATIONS = 100, 60
 SHOTS = 4  # pictures of the camera that are averaged
@@ -66,7 +72,9 @@ def run_demo(
 
     say = progress or (lambda done, what: None)
     _make_empty(folder)
-    headset, bench = _bench(quick)
+    spec = QUICK_BENCH if quick else BENCH
+    headset = open_headset(spec, seed=1)
+    bench = nominal_bench(headset)
     captures_folder, model_path, report_path = (folder / n for n in ("captures", "model.toml", "report.html"))
     capture_set(
         headset, bench, captures_folder, patterns=9 if quick else None,
@@ -88,14 +96,14 @@ def run_demo(
     bundles = {"before": folder / "bundle-ideal", "after": folder / "bundle"}
     export_bundle(Model(captures.bench), captures, bundles["before"])
     export_bundle(found.model, captures, bundles["after"])
-    shown = _show_all(
-        headset,
-        captures.bench,
-        bundles,
-        PICTURES[:1] if quick else PICTURES,
-        folder,
-        lambda d, w: say(0.62 + 0.3 * d, w),
+    pictures = PICTURES[:1] if quick else PICTURES
+    patterns = folder / "patterns"
+    found_patterns = _patterns(
+        headset, captures.bench, bundles, pictures, patterns, lambda d, w: say(0.62 + 0.25 * d, w)
     )
+    say(0.88, "showing")
+    with _devices(spec) as devices:
+        shown = [_show(devices, captures.bench, *each, patterns) for each in found_patterns]
 
     say(0.94, "writing the report")
     display = {name: _mean([p.qualities[name] for p in shown]) for name in ("before", "after", "oracle")}
@@ -140,63 +148,74 @@ def _make_empty(folder: Path) -> None:
         raise InputError(f"{folder} cannot be made ({error.strerror}): give another --out") from None
 
 
-def _bench(quick: bool) -> tuple[VirtualHeadset, Bench]:
-    """The virtual headset, and what a person would know of its bench."""
-    description = load_bench(BENCH)
-    if quick:
-        description = description.resized(*QUICK_SHAPE, QUICK_DISTANCE_MM)
-    headset = VirtualHeadset(description, seed=1)
-    return headset, nominal_bench(headset)
+@contextmanager
+def _devices(spec: str) -> Iterator[Devices]:
+    """The same bench once more, inside emulated hardware, with a real headset's drivers in front of it."""
+    with TemporaryDirectory(prefix="hololoop-") as folder:
+        socket = Path(folder) / "hardware.sock"
+        bus = f"{PREFIX}{socket}"
+        # An address of this run's own: another demo may be running.
+        address = f"127.{os.getpid() >> 16 & 255}.{os.getpid() >> 8 & 255}.{os.getpid() & 255 or 1}"
+        camera = {"kind": "virtual", "bus": bus}
+        if importlib.util.find_spec("depthai"):
+            camera = {"kind": "oak", "address": address}
+        with running(socket, spec, seed=2, oak=address):
+            tables = {
+                "panel": {"bus": bus},
+                "lasers": {"bus": bus, "power": {"green": 1.0}},
+                "camera": camera,
+            }
+            with driven(tables) as devices:
+                yield devices
 
 
-def _show_all(
+def _patterns(
     headset: VirtualHeadset,
     bench: Bench,
     bundles: dict[str, Path],
     pictures: Sequence[str],
     folder: Path,
     say: Progress,
-) -> list[Shown]:
-    """Every picture, shown with the pattern of each bundle and of the oracle."""
+) -> list[tuple[str, np.ndarray, dict[str, np.ndarray]]]:
+    """(name, target, gray levels by whom) of every picture: by each bundle, and by the oracle, who knows `headset`."""
     channel = bench.channels[0].name
     paths = {name: load_light_path(read_bundle(bundle), channel) for name, bundle in bundles.items()}
-    patterns = folder / "patterns"
-    patterns.mkdir()
-    shown = []
-    headset.lasers.off()
-    headset.lasers.set_power(channel, 1.0)
-    headset.move_to_plane(bench.distance_mm)
-    try:
-        for number, name in enumerate(pictures):
-            begin, part = number / len(pictures), 1 / len(pictures)
-            target = _target(name, bench.panel.shape)
-            _write_picture(patterns / f"{name}-target.png", target)
-            gray = {}
-            for k, (which, path) in enumerate(paths.items()):
-                say(begin + 0.1 * k * part, f"solving: {name}, {which}")
-                gray[which] = solve(path, target, ITERATIONS).gray
-            gray["oracle"] = _oracle(
-                headset, target, channel, gray["after"],
-                lambda done, name=name, begin=begin, part=part: say(  # type: ignore[misc]
-                    begin + (0.2 + 0.8 * done) * part, f"asking the oracle: {name}"
-                ),
-            )  # fmt: skip
-            seen = {}
-            for which, levels in gray.items():
-                write_gray(patterns / f"{name}-{which}.png", levels)
-                seen[which] = _look(headset, bench, levels, target)
-                _write_picture(patterns / f"{name}-{which}-seen.png", seen[which].light)
-            shown.append(
-                Shown(
-                    name,
-                    target,
-                    {which: one.light for which, one in seen.items()},
-                    {which: one.quality for which, one in seen.items()},
-                )
-            )
-    finally:
-        headset.lasers.off()
-    return shown
+    folder.mkdir()
+    found = []
+    for number, name in enumerate(pictures):
+        begin, part = number / len(pictures), 1 / len(pictures)
+        target = _target(name, bench.panel.shape)
+        _write_picture(folder / f"{name}-target.png", target)
+        gray = {}
+        for k, (which, path) in enumerate(paths.items()):
+            say(begin + 0.1 * k * part, f"solving: {name}, {which}")
+            gray[which] = solve(path, target, ITERATIONS).gray
+        gray["oracle"] = _oracle(
+            headset, target, channel, gray["after"],
+            lambda done, name=name, begin=begin, part=part: say(  # type: ignore[misc]
+                begin + (0.2 + 0.8 * done) * part, f"asking the oracle: {name}"
+            ),
+        )  # fmt: skip
+        for which, levels in gray.items():
+            write_gray(folder / f"{name}-{which}.png", levels)
+        found.append((name, target, gray))
+    return found
+
+
+def _show(
+    devices: Devices, bench: Bench, name: str, target: np.ndarray, gray: dict[str, np.ndarray], folder: Path
+) -> Shown:
+    """A picture with each of its patterns, as the camera sees it."""
+    channel = bench.channels[0].name
+    seen = {which: _look(devices, bench, channel, levels, target) for which, levels in gray.items()}
+    for which, one in seen.items():
+        _write_picture(folder / f"{name}-{which}-seen.png", one.light)
+    return Shown(
+        name,
+        target,
+        {which: one.light for which, one in seen.items()},
+        {which: one.quality for which, one in seen.items()},
+    )
 
 
 def _target(name: str, shape: tuple[int, int]) -> np.ndarray:
@@ -228,14 +247,17 @@ def _oracle(
     )
 
 
-def _look(headset: VirtualHeadset, bench: Bench, gray: np.ndarray, target: np.ndarray) -> Seen:
+def _look(devices: Devices, bench: Bench, channel: str, gray: np.ndarray, target: np.ndarray) -> Seen:
     """What the camera sees of a pattern, at an exposure that does not saturate, mean of several shots."""
-    camera = bench.camera
-    headset.panel.show(gray)
-    while (headset.camera.capture() >= camera.saturation).mean() > SATURATED:
-        headset.camera.exposure_ms = headset.camera.exposure_ms * 0.7
-    shots = [headset.camera.capture().astype(np.float64) - camera.black_level for _ in range(SHOTS)]
-    light = np.mean(shots, axis=0) / headset.camera.exposure_ms
+    camera = devices.camera
+    black = bench.camera.black_level * 2.0 ** (camera.bit_depth - bench.camera.bit_depth)
+    devices.panel.show(gray)
+    devices.light(channel)
+    while (camera.capture() >= 2**camera.bit_depth - 1).mean() > SATURATED:
+        camera.exposure_ms = camera.exposure_ms * 0.7
+    shots = [camera.capture().astype(np.float64) - black for _ in range(SHOTS)]
+    devices.lasers.off()
+    light = np.mean(shots, axis=0) / camera.exposure_ms
     return Seen(light, quality(light, target))
 
 

@@ -82,6 +82,11 @@ class OakCamera:
         self._order()
 
     @property
+    def longest_exposure_ms(self) -> float:
+        """One frame's time, ms."""
+        return 1000 / float(self._job["frames_per_s"])
+
+    @property
     def gain(self) -> float:
         """Gain, 1 at the sensor's base sensitivity; setting it raises InputError unless from 1 to 16."""
         return self._iso / 100

@@ -19,7 +19,7 @@ from .description import load_bench
 from .faults import Faults
 from .headset import VirtualHeadset
 from .i2c import LaserBoard
-from .oak import OakModel
+from .oak import OakModel, looking_at
 from .usb.board import BoardModel
 
 TICK_S = 0.001
@@ -105,14 +105,12 @@ class Hardware:
 
     def attach_oak(self, address: str) -> None:
         """Let an emulated OAK camera look at the bench, at a loopback address; its faults are the camera's."""
-        shift = self.headset.camera.bit_depth - 10
-
-        def expose(exposure_ms: float, gain: float) -> NDArray[np.uint16]:
-            counts = self.exposed(exposure_ms * gain)
-            return (counts.astype(np.float64) * 2.0**-shift).astype(np.uint16)
-
         self.oak = OakModel(
-            expose, self.headset.camera.shape, address, frames_per_s=120.0, faults=self.faults["camera"]
+            looking_at(self.exposed, self.headset.description.camera),
+            self.headset.camera.shape,
+            address,
+            frames_per_s=120.0,
+            faults=self.faults["camera"],
         )
 
     def light_since(self, since_s: float) -> list[tuple[float, float]]:

@@ -86,6 +86,8 @@ class VirtualCamera:
         self._take = take
         self._exposure_ms = 10.0
 
+    longest_exposure_ms = 10000.0
+
     @property
     def exposure_ms(self) -> float:
         """Exposure time, ms; setting it raises InputError unless above 0 and at most 10 s."""
@@ -93,7 +95,7 @@ class VirtualCamera:
 
     @exposure_ms.setter
     def exposure_ms(self, value: float) -> None:
-        if not (isinstance(value, int | float | np.floating) and 0 < value <= 10000):
+        if not (isinstance(value, int | float | np.floating) and 0 < value <= self.longest_exposure_ms):
             raise InputError(f"exposure {value!r} ms is out of range; give more than 0 and at most 10000.")
         self._exposure_ms = float(value)
 

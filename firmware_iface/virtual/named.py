@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from ..errors import InputError, nearest
 from .defects import CATALOGUE_KINDS, make_defect
 from .description import BenchDescription, ChannelDescription, SimulationDescription
@@ -15,17 +17,17 @@ _RGB = (
 
 def _benches() -> dict[str, BenchDescription]:
     make = make_defect
-    benches = [BenchDescription("ideal")]
+    demo = BenchDescription(
+        "demo",
+        defects=(
+            make("zero_order", fill_factor=0.94, surface_amplitude=0.12),
+            make("illumination", waist_x_share=1.9, waist_y_share=2.1),
+            make("phase_response", gain=1.08, s_curvature=0.12),
+        ),
+    )
+    benches = [BenchDescription("ideal"), demo, replace(demo.resized(144, 192, 18.0), name="small_demo")]
     benches += [BenchDescription(kind, defects=(make(kind),)) for kind in CATALOGUE_KINDS]
     benches += [
-        BenchDescription(
-            "demo",
-            defects=(
-                make("zero_order", fill_factor=0.94, surface_amplitude=0.12),
-                make("illumination", waist_x_share=1.9, waist_y_share=2.1),
-                make("phase_response", gain=1.08, s_curvature=0.12),
-            ),
-        ),
         BenchDescription("pair", defects=(make("phase_response"), make("pupil_aberration"))),
         BenchDescription("triple", defects=(make("crosstalk"), make("illumination"), make("distance"))),
         BenchDescription("colour", channels=_RGB, defects=(make("phase_response"),)),

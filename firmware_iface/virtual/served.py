@@ -15,10 +15,12 @@ import errno
 import json
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Client, Connection, Listener
 from pathlib import Path
 from typing import Any
@@ -33,6 +35,7 @@ from .usb.backend import VirtualUsb
 from .usb.device import Gone, Nak, Stall
 
 PREFIX = "virtual:"
+STARTS_WITHIN_S = 20.0
 LASERS = ".i2c"  # the laser board's bus has a socket of its own beside SOCKET
 SWITCH_S = 0.0002  # Python's 5 ms before a thread gives way are long on a bus
 USB_FAILURES = {failure.__name__: failure for failure in (Gone, Nak, Stall)}
@@ -141,6 +144,8 @@ class _RemoteUsb(VirtualUsb):
 class RemoteCamera:
     """The camera of emulated hardware."""
 
+    longest_exposure_ms = 10000.0
+
     def __init__(self, remote: Remote) -> None:
         self._remote = remote
         self.exposure_ms = 10.0
@@ -170,6 +175,40 @@ def reach(bus: str) -> Remote:
             f"there is no emulated hardware at {bus} ({error.strerror}); start "
             "python -m firmware_iface.virtual.served SOCKET"
         ) from None
+
+
+@contextmanager
+def running(path: Path, bench: str, seed: int = 0, oak: str | None = None) -> Iterator[Remote]:
+    """Emulated hardware in a process of its own, listening at `path`, while the block lasts.
+
+    oak : a loopback address to emulate an OAK camera at. Raises DeviceGoneError where it does not start.
+    """
+    command = [
+        sys.executable,
+        "-m",
+        "firmware_iface.virtual.served",
+        str(path),
+        "--bench",
+        bench,
+        "--seed",
+        str(seed),
+    ]
+    process = subprocess.Popen([*command, "--oak", oak] if oak else command)
+    try:
+        until = time.monotonic() + STARTS_WITHIN_S
+        while True:
+            try:
+                remote = reach(str(path))
+                break
+            except DeviceGoneError:
+                if time.monotonic() > until or process.poll() is not None:
+                    raise
+                time.sleep(0.02)
+        yield remote
+        remote.close()
+    finally:
+        process.kill()
+        process.wait()
 
 
 def usb_backend(bus: str) -> VirtualUsb:

@@ -17,13 +17,13 @@ from firmware_iface.errors import InputError
 from runtime.bundle import Bundle
 from runtime.calibrated import bundle_channels, bundle_paths, load_light_path, plane_of
 from runtime.calibration.check import Heldout, complete, heldout_errors, verdict
-from runtime.calibration.devices import Devices
 from runtime.calibration.drift import Drift, drifted
 from runtime.calibration.fit import Base, Estimate, Fitted, Shot, chi_squared, fit, gain_of, predicted
 from runtime.calibration.patterns import GRAINS, HELD_OUT, grains, grating, proof_picture
 from runtime.calibration.response import SWEEP, Sweep, best_period, fitted_response, measured_sweep
 from runtime.calibration.taking import Noise, Taker
 from runtime.calibration.view import View, on_panel, sampler
+from runtime.devices import Devices
 from runtime.registration import dot_pattern, dots_of, find_homography, panel_points
 from runtime.solver import quality, solve
 
@@ -102,8 +102,7 @@ def calibrate(
     for channel in channels:
         if channel not in devices.lasers.channels:
             raise InputError(f"the headset has no laser '{channel}', which the bundle is for: check both")
-    if devices.focus:
-        devices.focus(plane)
+    devices.move_to_plane(plane)
     started = time.perf_counter()
     many = len(channels) * (len(GRAINS) + len(HELD_OUT) + len(SWEEP) + 6) + 1
     taker = Taker(devices, lambda what: say(0.25 * min(taker.taken / many, 1), f"showing: {what}"))

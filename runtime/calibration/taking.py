@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware_iface.errors import InputError
-from runtime.calibration.devices import Devices
 from runtime.calibration.fit import Shot
+from runtime.devices import Devices
 
 AIM, BRIGHTEST = 0.7, 0.999  # this share of full scale for this quantile of a picture
 SHORTEST_MS, LONGEST_MS = 0.02, 1000.0
@@ -64,6 +64,7 @@ class Taker:
     def expose(self, gray: np.ndarray, black: float) -> float:
         """Set and return the exposure, ms, at which a pattern just does not saturate. Raises InputError if dark."""
         camera = self.devices.camera
+        longest_ms = min(LONGEST_MS, camera.longest_exposure_ms)
         self.said("exposure")
         for _ in range(8):
             self.devices.panel.show(gray)
@@ -71,7 +72,7 @@ class Taker:
             room = self.top - black
             if bright < 0.9 * room:
                 factor = AIM * room / max(bright, 1.0)
-                wanted = min(max(camera.exposure_ms * factor, SHORTEST_MS), LONGEST_MS)
+                wanted = min(max(camera.exposure_ms * factor, SHORTEST_MS), longest_ms)
                 if bright > 0.002 * room or wanted == camera.exposure_ms:
                     break
                 camera.exposure_ms = wanted
@@ -79,7 +80,7 @@ class Taker:
                 camera.exposure_ms = max(camera.exposure_ms / 5, SHORTEST_MS)
         else:
             raise InputError(
-                f"no exposure from {SHORTEST_MS:g} to {LONGEST_MS:g} ms suits the light: see that the camera looks "
+                f"no exposure from {SHORTEST_MS:g} to {longest_ms:g} ms suits the light: see that the camera looks "
                 "at the image and that the laser's power is steady"
             )
         if bright <= 0.002 * room:

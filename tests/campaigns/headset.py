@@ -9,12 +9,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import numpy as np
 
-from firmware_iface.virtual.served import Remote
+from firmware_iface.virtual.served import Remote, running
 from runtime.bundle import write_bundle
 from runtime.calibrated import pack_light_paths
 from runtime.service.client import Client, connect
@@ -96,32 +96,9 @@ def write_configuration(
     return file
 
 
-def reached(path: Path, within_s: float = 20.0) -> Remote:
-    """The emulated hardware at a socket, once it answers."""
-    until = time.monotonic() + within_s
-    while True:
-        try:
-            return Remote(str(path))
-        except OSError:
-            if time.monotonic() > until:
-                raise
-            time.sleep(0.02)
-
-
-@contextmanager
-def hardware(folder: Path, seed: int = 0, oak: str | None = None) -> Iterator[Remote]:
+def hardware(folder: Path, seed: int = 0, oak: str | None = None) -> AbstractContextManager[Remote]:
     """Emulated hardware for the configuration in `folder`, in a process of its own."""
-    path = folder / "hardware.sock"
-    command = [sys.executable, "-m", "firmware_iface.virtual.served", str(path)]
-    command += ["--bench", str(folder / "bench.toml"), "--seed", str(seed)]
-    process = subprocess.Popen([*URGENT, *command, *(["--oak", oak] if oak else [])], env=ENVIRONMENT)
-    try:
-        remote = reached(path)
-        yield remote
-        remote.close()
-    finally:
-        process.kill()
-        process.wait()
+    return running(folder / "hardware.sock", str(folder / "bench.toml"), seed, oak)
 
 
 @contextmanager

@@ -111,7 +111,9 @@ def run_capture(args: Namespace, screen: Screen) -> Result:
     from trainer.capture import capture_from
 
     with screen.progress("capturing") as told:
-        taken = capture_from(args.bench, args.out, args.patterns, args.planes, args.channels, args.seed, told)
+        taken = capture_from(
+            args.bench, args.out, args.patterns, args.planes, args.channels, args.seed, told, args.devices
+        )
     return taken.as_json()
 
 
@@ -207,7 +209,14 @@ def _capture_options(parser: ArgumentParser) -> None:
         "--bench",
         metavar="BENCH",
         required=True,
-        help="virtual:NAME, such as virtual:demo, or the TOML file of a virtual bench",
+        help="virtual:NAME, such as virtual:demo, or the TOML file of a virtual bench; with --devices the bench.toml "
+        "that says what is known of the bench",
+    )
+    parser.add_argument(
+        "--devices",
+        metavar="CONFIG.toml",
+        type=Path,
+        help="the panel, lasers and camera of a service's configuration (hololoop-runtime serve --help)",
     )
     out_option(parser, "CAPTURES", "folder of the new capture set")
     parser.add_argument(

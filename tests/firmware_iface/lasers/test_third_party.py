@@ -74,7 +74,9 @@ def test_adafruits_mcp4728(bench: Bench, wires: CircuitPythonBus, monkeypatch: p
     bench.board.power_cycle()
     again = adafruit.MCP4728(wires)
     kept = again.channel_b
-    assert (kept.raw_value, bool(kept.vref), bool(kept.gain)) == (3000, True, True), "its gain is the bit, as read"
+    assert (kept.raw_value, bool(kept.vref), bool(kept.gain)) == (3000, True, True), (
+        "its gain is the bit, as read"
+    )
     assert bench.board.dac.volts(1) == pytest.approx(3.0)
 
 

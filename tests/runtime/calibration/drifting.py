@@ -10,8 +10,8 @@ from firmware_iface.virtual import BenchDescription, VirtualHeadset
 from firmware_iface.virtual.defects import make_defect
 from runtime.bundle import write_bundle
 from runtime.calibrated import pack_light_paths
-from runtime.calibration.devices import Devices
 from runtime.calibration.fit import Base
+from runtime.devices import Devices
 from runtime.legendre import edge_to_edge
 from tests.runtime.benches import ideal_path
 

@@ -28,7 +28,9 @@ def test_a_headset_behind_its_drivers_is_calibrated_and_left_dark(
         assert main(["calibrate", str(bundle), "--headset", str(configuration), "--json"]) == 0
         result = json.loads(capsys.readouterr().out)
         light = [power for _, power in remote.light()]
-        assert light[-1] == 0 and max(light) == pytest.approx(50, rel=0.02)  # the configuration's half of full power
+        assert light[-1] == 0 and max(light) == pytest.approx(
+            50, rel=0.02
+        )  # the configuration's half of full power
         assert result["verdict"] == "recalibrated" and result["heldout"]["after"]["excess"] < 0.001
 
         remote.set_to("interlock", False)

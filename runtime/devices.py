@@ -1,7 +1,8 @@
-"""The devices that a calibration or a refinement uses, real or virtual, opened by one name."""
+"""The devices of a headset, real or virtual, opened by one name: for captures, calibration and refinement."""
 
 from __future__ import annotations
 
+import time
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
@@ -28,6 +29,16 @@ class Devices:
     power: Mapping[str, float] = field(default_factory=dict)
     focus: Callable[[float], None] | None = None
 
+    def move_to_plane(self, plane_mm: float) -> None:
+        """Focus the camera on a plane, mm from the panel, where it can."""
+        if self.focus:
+            self.focus(plane_mm)
+
+    @property
+    def time_s(self) -> float:
+        """A clock."""
+        return time.monotonic()
+
     def light(self, channel: str) -> None:
         """One laser on, all others off."""
         self.lasers.off()
@@ -48,15 +59,20 @@ def open_devices(spec: str, seed: int = 0) -> Iterator[Devices]:
         headset = open_headset(spec, seed)
         yield Devices(headset.panel, headset.lasers, headset.camera, {}, headset.move_to_plane)
         return
+    for name in ("panel", "lasers", "camera"):
+        if name not in tables:
+            raise InputError(f"{spec} has no [{name}]: the panel, the lasers and the camera are all needed")
+    with driven(tables) as devices:
+        yield devices
+
+
+@contextmanager
+def driven(tables: Mapping[str, Any]) -> Iterator[Devices]:
+    """The devices of the tables [panel], [lasers] and [camera] of a configuration; as `open_devices`."""
     from firmware_iface.assembled import laser_channels, laser_power, open_camera, open_panel
     from firmware_iface.lasers.guard import open_guarded_lasers
     from firmware_iface.virtual.served import i2c_bus
 
-    for name in ("panel", "lasers", "camera"):
-        if name not in tables:
-            raise InputError(
-                f"{spec} has no [{name}]: a calibration needs the panel, the lasers and the camera"
-            )
     bus = str(tables["lasers"].get("bus"))
     with ExitStack() as stack:
         camera = stack.enter_context(closing(open_camera(tables["camera"])))
