@@ -1,8 +1,8 @@
 """TI's phase light modulator on the DLPC900 controller (USB HID 0451:C900, DLPU018).
 
-Frames can be uploaded (pattern on the fly), which takes tens of seconds for a whole hologram because USB HID
-carries 64 KB/s: it is for calibration and tests. At video rate frames travel over the display link, see
-`mirrored`; this control part is the same.
+Frames can be uploaded (pattern on the fly), which takes about a minute for a whole hologram because USB HID
+carries 64 KB/s: it is for calibration and tests. At video rate frames travel over the display link, as bits
+that `video_pattern` draws; this control part is the same.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import struct
 import time
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,19 +19,23 @@ from numpy.typing import NDArray
 from ..errors import DeviceError, InputError
 from ..usb_link import UsbLink
 from . import erle
-from .panel import Frames, Gray, Panel
+from .mirrored import MirroredDisplay
+from .panel import Gray, Panel
 from .plm import P47, Modulator, bit_plane
 
 VENDOR, PRODUCT = 0x0451, 0xC900
 OUT, IN, PACKET = 0x01, 0x81, 64
+LOCK_S = 2.0  # until the receiver has found the picture
 LONGEST_DATA = 504  # bytes of an image in one command
 
 POWER, LAST_ERROR, FIRMWARE = 0x0200, 0x0100, 0x0206
 HARDWARE_STATUS, SYSTEM_STATUS, MAIN_STATUS = 0x1A0A, 0x1A0B, 0x1A0C
+RECEIVER, SOURCE = 0x1A01, 0x1A00
 DISPLAY_MODE, PATTERN, PATTERN_LUT, PATTERN_ENTRY = 0x1A1B, 0x1A24, 0x1A31, 0x1A34
 IMAGE_BEGIN, IMAGE_DATA = (0x1A2A, 0x1A2C), (0x1A2B, 0x1A2D)  # primary and secondary controller
 STOP, START = 0, 2
 POWERS = ("normal", "standby")
+RECEIVERS = ("off", "hdmi", "displayport")
 MODES = ("video", "pre-stored", "video-pattern", "on-the-fly")
 ERRORS = {
     1: "a batch file's checksum is wrong",
@@ -48,12 +53,20 @@ _READ, _REPLY, _FAILED = 0x80, 0x40, 0x20
 
 
 class Dlpc900Control:
-    """Commands of the controller: power, mode, status, errors."""
+    """Commands of the controller: power, mode, status, errors.
 
-    def __init__(self, link: UsbLink, mode: str) -> None:
+    receiver : "hdmi" or "displayport" for frames that come over that link, "off" for uploaded ones
+    exposure_us : of each pattern
+    """
+
+    def __init__(self, link: UsbLink, receiver: str = "off", exposure_us: int = 16667) -> None:
+        if receiver not in RECEIVERS:
+            raise InputError(f"there is no receiver '{receiver}'; use one of {', '.join(RECEIVERS)}.")
+        if not 105 <= exposure_us < 1 << 24:
+            raise InputError(f"exposure {exposure_us} µs is out of range; give 105 to {(1 << 24) - 1} µs.")
         self.name = link.name
         self._link = link
-        self._mode = mode
+        self._receiver, self._exposure_us = receiver, exposure_us
         self._sequence = 0
         self._unsure = False  # whether the last command broke off
         link.opened.append(self._set_up)
@@ -86,6 +99,15 @@ class Dlpc900Control:
                 raise DeviceError(f"{self.name} does not go into mode {mode}; power it off and on.")
             time.sleep(0.05)
 
+    def define(self, count: int) -> None:
+        """Fill the pattern table with the first `count` bits of image 0, in turn and for ever."""
+        exposure = self._exposure_us.to_bytes(3, "little")
+        for position in range(count):
+            # one bit, all colours, cleared afterwards; no trigger, no dark time; image 0, this bit position
+            line = struct.pack("<H", position) + exposure + struct.pack("<B3xBH", 0x71, 0, position << 11)
+            self.command(PATTERN_ENTRY, line)
+        self.command(PATTERN_LUT, struct.pack("<HI", count, 0))
+
     def status(self) -> dict[str, Any]:
         hardware, system, main = map(self._byte, (HARDWARE_STATUS, SYSTEM_STATUS, MAIN_STATUS))
         mode, power = self._byte(DISPLAY_MODE), self._byte(POWER)
@@ -112,7 +134,20 @@ class Dlpc900Control:
 
     def _set_up(self) -> None:
         self.set_power("normal")
-        self.set_mode(self._mode)
+        if self._receiver == "off":
+            self.set_mode("on-the-fly")
+            return
+        self.command(RECEIVER, bytes([RECEIVERS.index(self._receiver)]))
+        self.command(SOURCE, bytes([0]))  # the receiver's parallel port, 24 bits
+        self.set_mode("video")
+        end = time.monotonic() + LOCK_S
+        while not self._byte(MAIN_STATUS) & 8:
+            if time.monotonic() > end:
+                raise DeviceError(f"{self.name} sees no picture on {self._receiver}; check that cable.")
+            time.sleep(0.05)
+        self.set_mode("video-pattern")
+        self.define(1)
+        self.command(PATTERN, bytes([START]))
 
     def _byte(self, code: int) -> int:
         answer = self.command(code, read=True)
@@ -164,16 +199,11 @@ def parse_answer(packet: bytes) -> tuple[int, int, bytes]:
 
 
 class PatternUpload:
-    """Frames as one-bit patterns over USB: up to 24 pictures shown in turn, one alone until the next.
+    """Frames as one-bit patterns over USB: up to 24 pictures shown in turn, one alone until the next."""
 
-    exposure_us : of each picture, at least 105
-    """
-
-    def __init__(self, control: Dlpc900Control, modulator: Modulator = P47, exposure_us: int = 16667) -> None:
-        if not 105 <= exposure_us < 1 << 24:
-            raise InputError(f"exposure {exposure_us} µs is out of range; give 105 to {(1 << 24) - 1} µs.")
+    def __init__(self, control: Dlpc900Control, modulator: Modulator = P47) -> None:
         self.shape = modulator.shape
-        self._control, self._modulator, self._exposure_us = control, modulator, exposure_us
+        self._control, self._modulator = control, modulator
         self._sent = 0
 
     def send(self, gray: Gray) -> int:
@@ -191,9 +221,7 @@ class PatternUpload:
             image |= bit_plane(gray, self._modulator).astype(np.uint32) << position
         control = self._control
         control.command(PATTERN, bytes([STOP]))
-        for position in range(len(pictures)):
-            control.command(PATTERN_ENTRY, self._entry(position))
-        control.command(PATTERN_LUT, struct.pack("<HI", len(pictures), 0))
+        control.define(len(pictures))
         for index, half in enumerate(np.array_split(image, self._modulator.controllers, axis=1)):
             self._load(index, half)
         control.command(PATTERN, bytes([START]))
@@ -209,11 +237,6 @@ class PatternUpload:
     def close(self) -> None:
         """The control part lets go of the link that both use."""
 
-    def _entry(self, position: int) -> bytes:
-        """A line of the pattern table: one bit, all colours, cleared afterwards, image 0, this bit position."""
-        exposure = self._exposure_us.to_bytes(3, "little")
-        return struct.pack("<H", position) + exposure + struct.pack("<B3xBH", 0x71, 0, position << 11)
-
     def _load(self, index: int, image: NDArray[np.uint32]) -> None:
         data = erle.encode(image)
         self._control.command(IMAGE_BEGIN[index], struct.pack("<HI", 0, len(data)))
@@ -222,23 +245,37 @@ class PatternUpload:
             self._control.command(IMAGE_DATA[index], struct.pack("<H", len(part)) + part)
 
 
+def video_pattern(gray: Gray, modulator: Modulator) -> Gray:
+    """What a display link carries to show gray levels [H, W]: memory bits as 0 and 255, [2 H, 2 W].
+
+    All 24 bit planes are alike, so the pattern stays for a whole frame.
+    """
+    return 255 * bit_plane(gray, modulator)
+
+
 def open_dlpc900(
-    frames: Frames | None = None,
+    display: int | None = None,
     *,
     modulator: Modulator = P47,
+    receiver: str = "displayport",
     serial: str | None = None,
     backend: Any = None,
-    exposure_us: int = 16667,
+    exposure_us: int = 16000,
     timeout_s: float = 1.0,
 ) -> Panel:
     """Open a phase light modulator.
 
-    frames : how frames travel, for example a MirroredDisplay; None uploads them over USB, slowly
+    display : N of /dev/fbN that it is the screen of; None uploads frames over USB, slowly
+    receiver : how that screen is connected, "hdmi" or "displayport"
     backend : a pyusb backend; None is the system's libusb
-    exposure_us : of an uploaded picture
+    exposure_us : of a pattern, less than a frame of the display
     Raises DeviceGoneError where it is not attached, DeviceError where it does not answer as it should.
     """
-    name = "the phase light modulator"
-    link = UsbLink(VENDOR, PRODUCT, name, serial=serial, backend=backend, timeout_s=timeout_s)
-    control = Dlpc900Control(link, "on-the-fly" if frames is None else "video-pattern")
-    return Panel(control, frames or PatternUpload(control, modulator, exposure_us))
+    link = UsbLink(
+        VENDOR, PRODUCT, "the phase light modulator", serial=serial, backend=backend, timeout_s=timeout_s
+    )
+    if display is None:
+        control = Dlpc900Control(link, exposure_us=exposure_us)
+        return Panel(control, PatternUpload(control, modulator))
+    frames = MirroredDisplay(display, modulator.shape, draw=partial(video_pattern, modulator=modulator))
+    return Panel(Dlpc900Control(link, receiver, exposure_us), frames)

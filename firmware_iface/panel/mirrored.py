@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import mmap
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,9 @@ class MirroredDisplay:
     """A frame buffer whose screen the panel mirrors, gray levels in all colours.
 
     number : N of /dev/fbN
-    shape : (H, W), the panel's pixels; they are taken from the screen's top left
+    shape : (H, W), the panel's pixels; they are drawn at the screen's top left
     settle_s : from the start of a frame on the link until the panel has followed
+    draw : makes the screen's pixels, uint8 [rows, columns], of gray levels [H, W]; none: they are the same
     devices, settings : where the kernel shows frame buffers; tests give folders of their own
     """
 
@@ -31,6 +33,7 @@ class MirroredDisplay:
         number: int,
         shape: tuple[int, int],
         settle_s: float = 0.05,
+        draw: Callable[[Gray], Gray] = np.asarray,
         devices: Path = Path("/dev"),
         settings: Path = Path("/sys/class/graphics"),
     ) -> None:
@@ -38,6 +41,8 @@ class MirroredDisplay:
         self.name = f"the display fb{number}"
         self._settings = settings / f"fb{number}"
         self._settle_s = settle_s
+        self._draw = draw
+        self._screen: tuple[int, ...] = draw(np.zeros(shape, np.uint8)).shape
         self._sent = 0
         self._shown_s = 0.0
         self._read_settings()
@@ -54,11 +59,11 @@ class MirroredDisplay:
 
     def send(self, gray: Gray) -> int:
         """Draw into the half that is not shown, then pan to it."""
-        height, width = self.shape
+        height, width = self._screen
         half = (self._sent + 1) % 2
         memory = np.frombuffer(self._mapped, np.uint8).reshape(2 * self._rows, self._stride)
         screen = memory[half * self._rows : half * self._rows + height, : width * self._bytes]
-        screen.reshape(height, width, self._bytes)[:, :, :3] = gray[..., None]
+        screen.reshape(height, width, self._bytes)[:, :, :3] = self._draw(gray)[..., None]
         self._set("pan", f"0,{half * self._rows}")
         self._sent += 1
         self._shown_s = time.monotonic() + self._settle_s
@@ -84,7 +89,7 @@ class MirroredDisplay:
         self._bytes = int(self._get("bits_per_pixel")) // 8
         self._stride = int(self._get("stride"))
         self._rows = rows // 2
-        height, width = self.shape
+        height, width = self._screen
         if self._bytes not in (1, 3, 4):
             raise InputError(
                 f"{self.name} has {8 * self._bytes} bits a pixel, too few for 256 gray levels; "

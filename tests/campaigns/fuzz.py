@@ -24,6 +24,7 @@ from pathlib import Path
 Target = Callable[[bytes], None]
 
 LONGEST_S, MOST_MB = 5, 2048
+_SCRATCH = tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None)
 
 
 def panel_replies() -> Target:
@@ -196,7 +197,7 @@ def bundles() -> Target:
     from firmware_iface.errors import InputError
     from runtime import bundle
 
-    folder = Path(tempfile.mkdtemp(dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
+    folder = Path(_SCRATCH.name)
 
     def manifest(data: bytes) -> bytes:
         body = {
@@ -224,7 +225,7 @@ def capture_sets() -> Target:
     from firmware_iface.errors import InputError
     from trainer.captures import read_captures
 
-    folder = Path(tempfile.mkdtemp(dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
+    folder = Path(_SCRATCH.name)
 
     def one(data: bytes) -> None:
         bench, _, table = data.partition(b"\n\0\n")

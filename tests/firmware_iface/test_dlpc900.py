@@ -94,7 +94,7 @@ def test_the_bytes_of_one_upload() -> None:
         "08 00 31 1a",
         "08 00 2a 1a",
     ]
-    assert sent[1][6:18].hex(" ") == "00 00 1b 41 00 71 00 00 00 00 00 00"  # pattern 0, 16667 us, 1 bit
+    assert sent[1][6:18].hex(" ") == "00 00 80 3e 00 71 00 00 00 00 00 00"  # pattern 0, 16000 us, 1 bit
     assert sent[2][6:12].hex(" ") == "01 00 00 00 00 00"  # one pattern, for ever
     encoded = erle.encode(plm.bit_plane(np.array([[0, 240]], np.uint8), mirror).astype(np.uint32))
     assert sent[3][6:12] == b"\0\0" + len(encoded).to_bytes(4, "little")

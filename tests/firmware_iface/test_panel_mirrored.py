@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
-from firmware_iface.panel import MirroredDisplay, Panel, open_dlpc900
+from firmware_iface.panel import MirroredDisplay, Panel, dlpc900, open_dlpc900, plm
 from firmware_iface.virtual.usb import Dlpc900Model, VirtualUsb
 
 SHAPE = (6, 10)
@@ -31,16 +33,16 @@ class Screen:
     def set(self, name: str, value: object) -> None:
         (self.settings / "fb1" / name).write_text(f"{value}\n", encoding="ascii")
 
-    def scanned_out(self) -> np.ndarray:
+    def scanned_out(self, shape: tuple[int, int] = SHAPE) -> np.ndarray:
         """Pixels of the panel's place, [H, W, bytes], in the half that is panned to."""
         top = int((self.settings / "fb1" / "pan").read_text(encoding="ascii").split(",")[1])
         rows = np.frombuffer(self.memory.read_bytes(), np.uint8)
         rows = rows[: len(rows) // self.stride * self.stride].reshape(-1, self.stride)
-        height, width = SHAPE
+        height, width = shape
         return rows[top : top + height, : width * self.bytes].reshape(height, width, self.bytes)
 
     def display(self) -> MirroredDisplay:
-        return MirroredDisplay(1, SHAPE, 0.001, self.devices, self.settings)
+        return MirroredDisplay(1, SHAPE, 0.001, devices=self.devices, settings=self.settings)
 
 
 def pattern(seed: int) -> np.ndarray:
@@ -83,7 +85,7 @@ def test_a_screen_that_cannot_carry_the_panel_is_refused(tmp_path: Path) -> None
 def test_a_screen_that_is_not_there_or_off_is_said_so(tmp_path: Path) -> None:
     screen = Screen(tmp_path)
     with pytest.raises(DeviceGoneError, match="fb2 is not there"):
-        MirroredDisplay(2, SHAPE, 0, screen.devices, screen.settings)
+        MirroredDisplay(2, SHAPE, 0, devices=screen.devices, settings=screen.settings)
     display = screen.display()
     with pytest.raises(DeviceError, match="shows frame 0"):
         display.wait(3)
@@ -96,11 +98,30 @@ def test_a_screen_that_is_not_there_or_off_is_said_so(tmp_path: Path) -> None:
         screen.display()
 
 
-def test_control_over_usb_and_frames_over_the_display_link_make_one_panel(tmp_path: Path) -> None:
-    """The two parts are separate: a DLPC900 in video-pattern mode, its frames on the screen."""
-    screen = Screen(tmp_path)
+def test_control_over_usb_and_frames_over_the_display_link_make_one_panel(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The two parts are separate: a phase light modulator in video-pattern mode, its bits on the screen."""
+    screen = Screen(tmp_path, columns=20, rows=24)
+    monkeypatch.setattr(
+        dlpc900,
+        "MirroredDisplay",
+        partial(MirroredDisplay, settle_s=0, devices=screen.devices, settings=screen.settings),
+    )
     model = Dlpc900Model((12, 20))
-    panel = open_dlpc900(screen.display(), backend=VirtualUsb(model))
-    panel.show(pattern(5))
-    assert (screen.scanned_out()[..., 0] == pattern(5)).all()
-    assert panel.status()["mode"] == "video-pattern" and not model.images
+    modulator = replace(plm.P47, shape=SHAPE)
+
+    def opened() -> Panel:
+        return open_dlpc900(1, modulator=modulator, backend=VirtualUsb(model), timeout_s=0.1)
+
+    monkeypatch.setattr(dlpc900, "LOCK_S", 0.05)
+    with pytest.raises(DeviceError, match="no picture on displayport"):
+        opened()
+    model.video = lambda: screen.scanned_out((12, 20)).astype(np.uint32) @ [1 << 16, 1 << 8, 1, 0]
+    panel = opened()
+    assert panel.status()["mode"] == "video-pattern" and panel.status()["running"]
+    states = np.rint(plm.phase_waves() * 256).astype(np.uint8)
+    gray = np.random.default_rng(1).choice(states, SHAPE)
+    panel.show(gray)
+    np.testing.assert_array_equal(model.gray, gray)
+    assert not model.images, "nothing was uploaded"

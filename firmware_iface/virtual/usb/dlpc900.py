@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import struct
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,7 +58,8 @@ class Dlpc900Model(UsbModel):
     electrodes : which bit of a mirror's value lies top left, top right, bottom left, bottom right
     controllers : 2 where a second one holds the right half
 
-    Attributes: gray, shape; power, mode, running, entries, images (as loaded), commands (their count).
+    Attributes: video (gives what is on the display link, uint32 [rows, columns] of 24 bits, or None for no
+    signal); gray, shape; power, mode, running, entries, images (as loaded), commands (their count).
     """
 
     def __init__(
@@ -70,6 +72,7 @@ class Dlpc900Model(UsbModel):
     ) -> None:
         self.memory_shape = memory_shape
         self.shape = memory_shape[0] // 2, memory_shape[1] // 2
+        self.video: Callable[[], NDArray[np.uint32]] | None = None
         self._electrodes, self._mirrored, self._controllers = electrodes, mirrored, controllers
         super().__init__(
             device_descriptor(0x0451, 0xC900),
@@ -101,8 +104,11 @@ class Dlpc900Model(UsbModel):
     def plane(self, number: int) -> NDArray[np.uint8]:
         """The memory's bits of pattern `number` of the table, 0 or 1."""
         entry = self.entries[number]
-        halves = [self.images[entry.image, side] for side in range(self._controllers)]
-        return (np.hstack(halves) >> entry.position & 1).astype(np.uint8)
+        if self.mode == 2 and self.video is not None:
+            image = self.video()
+        else:
+            image = np.hstack([self.images[entry.image, side] for side in range(self._controllers)])
+        return (image >> entry.position & 1).astype(np.uint8)
 
     def on_reset(self) -> None:
         self.power = self.mode = self.error = self.commands = 0
@@ -150,7 +156,7 @@ class Dlpc900Model(UsbModel):
             self._answers.append((head + reply).ljust(64, b"\0"))
 
     def _answer(self, code: int) -> bytes:
-        main = (1 if self.power else 0) | (2 if self.running else 0) | 8
+        main = (1 if self.power else 0) | (2 if self.running else 0) | (8 if self.video else 0)
         known = {
             0x0100: bytes([self.error]),
             0x0200: bytes([self.power]),
@@ -222,9 +228,8 @@ class Dlpc900Model(UsbModel):
         if what == 2:
             used = [self.entries.get(k) for k in range(self._table[0])]
             sides = range(self._controllers)
-            if self.mode == 3 and not (
-                used and all(e and all((e.image, side) in self.images for side in sides) for e in used)
-            ):
+            loaded = all(e and all((e.image, side) in self.images for side in sides) for e in used)
+            if (self.mode >= 2 and not (used and all(used))) or (self.mode == 3 and not loaded):
                 raise _Refused(5)
         self.running = what == 2
 
