@@ -1,10 +1,14 @@
 """The devices that a configuration names, opened: one table each, one function each.
 
 [panel]                       a panel board over USB (firmware_iface/panel/PROTOCOL.md)
-kind = "board"
+kind = "board"                or "dlpc900", TI's phase light modulator, or "mirrored", a panel that is a screen
 bus = "virtual:SOCKET"        emulated hardware (firmware_iface.virtual.served); without it, the host's USB
 serial = "HL0001"             where several are attached
 refresh_hz = 60.0             of the panel itself
+modulator = "p47"             dlpc900: or "p67"
+display = 1                   mirrored, and dlpc900 unless frames are uploaded over USB: N of /dev/fbN
+height = 1080                 mirrored: its pixels
+width = 1920
 
 [lasers]                      three lasers on an I2C bus
 bus = "/dev/i2c-1"            or virtual:SOCKET
@@ -39,11 +43,15 @@ Table = Mapping[str, Any]
 class PanelTable:
     """[panel]"""
 
-    kind: str = parameter("board", "which panel", choices=("board",))
+    kind: str = parameter("board", "which panel", choices=("board", "dlpc900", "mirrored"))
     bus: str = parameter("usb", "usb, or virtual:SOCKET")
     serial: str = parameter("", "serial number, where several are attached")
     refresh_hz: float = parameter(60.0, "of the panel", 10, 1000)
     timeout_ms: float = parameter(80.0, "longest wait for one transfer", 5, 10000)
+    modulator: str = parameter("p47", "of a DLPC900", choices=("p47", "p67"))
+    display: int = parameter(-1, "N of /dev/fbN; -1: none", -1, 63)
+    height: int = parameter(1080, "rows of a mirrored panel", 2, 8192)
+    width: int = parameter(1920, "columns of a mirrored panel", 2, 8192)
 
 
 @dataclass(frozen=True)
@@ -69,10 +77,19 @@ class CameraTable:
 
 def open_panel(table: Table) -> Any:
     """The panel of a configuration's [panel]. Raises InputError or DeviceError."""
-    from .panel import open_board
+    from .panel import open_board, open_dlpc900, open_mirrored, plm
     from .panel.board import Timing
 
     asked = read_table(PanelTable, table, "[panel]")
+    if asked.kind == "mirrored":
+        return open_mirrored(max(0, asked.display), (asked.height, asked.width))
+    if asked.kind == "dlpc900":
+        return open_dlpc900(
+            None if asked.display < 0 else asked.display,
+            modulator={"p47": plm.P47, "p67": plm.P67}[asked.modulator],
+            serial=asked.serial or None,
+            timeout_s=asked.timeout_ms / 1000,
+        )
     period_us = round(1e6 / asked.refresh_hz)
     timing = Timing(period_us, light_delay_us=period_us // 4, light_width_us=period_us // 2)
     backend = None
