@@ -161,7 +161,7 @@ class BoardControl:
         self._timing = timing
 
     def set_mode(self, mode: str) -> None:
-        """ "dark", "show" or "test"."""
+        """Go into one of MODES."""
         if mode not in MODES:
             raise InputError(f"a panel board has no mode '{mode}'; use one of {', '.join(MODES)}.")
         self._link.control_out(MODE, value=MODES.index(mode))

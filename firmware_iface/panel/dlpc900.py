@@ -82,13 +82,13 @@ class Dlpc900Control:
         return answer
 
     def set_power(self, power: str) -> None:
-        """ "normal" or "standby"."""
+        """Switch to one of POWERS."""
         if power not in POWERS:
             raise InputError(f"{self.name} has no power mode '{power}'; use one of {', '.join(POWERS)}.")
         self.command(POWER, bytes([POWERS.index(power)]))
 
     def set_mode(self, mode: str) -> None:
-        """One of MODES; patterns are stopped first, as the controller demands."""
+        """Go into one of MODES; patterns are stopped first, as the controller demands."""
         if mode not in MODES:
             raise InputError(f"{self.name} has no mode '{mode}'; use one of {', '.join(MODES)}.")
         self.command(PATTERN, bytes([STOP]))
