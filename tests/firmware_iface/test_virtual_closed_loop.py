@@ -41,7 +41,7 @@ def test_a_pattern_sent_over_usb_is_the_picture_that_comes_over_the_cameras_link
     described = bench.description.camera
     oak = OakModel(looking_at(capture, described), bench.camera.shape, f"127.0.9.{WORKER + 1}", 20)
     panel = open_board(backend=VirtualUsb(board), timing=Timing(4000, 500, 3000))
-    camera = open_oak(oak.address, frames_per_s=20, exposure_ms=10.0)
+    camera = open_oak(oak.address, frames_per_s=20, exposure_ms=10.0, timeout_s=30.0, start_s=60.0)
     try:
         assert camera.capture().mean() == pytest.approx(described.black_level / 4, abs=1), "lasers are off"
         bench.lasers.set_power("green", 1.0)
