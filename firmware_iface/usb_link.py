@@ -20,7 +20,7 @@ TO_HOST, TO_DEVICE = 0xC0, 0x40  # vendor requests to the device
 
 
 class UsbLink:
-    """A device by vendor and product ID, with interface 0 claimed while it is open.
+    """A device by vendor and product ID, with interface 0 claimed while it is open; for one thread at a time.
 
     name : what messages call it
     serial : serial number, where several are attached

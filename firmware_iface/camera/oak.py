@@ -165,7 +165,10 @@ class OakCamera:
         """Keep a process running until closed."""
         while not self._closing:
             begun = time.monotonic()
-            loss = self._run_one()
+            try:
+                loss = self._run_one()
+            except OSError as error:
+                loss = f"its process could not be started: {error}"
             with self._news:
                 if self._closing:
                     return

@@ -54,7 +54,7 @@ class _Handle:
 
 
 class VirtualUsb:
-    """A pyusb backend on which the given models are plugged in.
+    """A pyusb backend on which the given models are plugged in; its methods are those of usb.backend.IBackend.
 
     models : UsbModel, any number; more may be added to the attribute `models`
     """
