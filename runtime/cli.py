@@ -21,6 +21,7 @@ import numpy as np
 from firmware_iface.errors import DeviceError, InputError, nearest
 from runtime.benchmark import command as benchmark
 from runtime.calibration import command as calibration
+from runtime.refinement import command as refinement
 from runtime.service import command as service
 
 PROGRAM = "hololoop-runtime"
@@ -181,6 +182,15 @@ def _parser() -> ArgumentParser:
     )
     calibration.arguments(refit)
     refit.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
+    refine = parts.add_parser(
+        "refine",
+        help="make a picture better while a camera looks at it",
+        description=refinement.ABOUT,
+        formatter_class=RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    refinement.arguments(refine)
+    refine.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
     serve = parts.add_parser(
         "serve",
         help="run the headset's service",
@@ -313,6 +323,7 @@ def show_solve(result: dict[str, Any]) -> None:
 COMMANDS = {
     "solve": (run_solve, show_solve),
     "calibrate": (calibration.run, calibration.show),
+    "refine": (refinement.run, refinement.show),
     "serve": (service.run_serve, service.show_serve),
     "benchmark": (benchmark.run, benchmark.show),
 }

@@ -22,7 +22,7 @@ from runtime.calibration.fit import Base, Estimate, Fitted, Shot, chi_squared, f
 from runtime.calibration.patterns import GRAINS, HELD_OUT, grains, grating, proof_picture
 from runtime.calibration.response import SWEEP, Sweep, best_period, fitted_response, measured_sweep
 from runtime.calibration.taking import Noise, Taker
-from runtime.calibration.view import View, on_panel, sampler
+from runtime.calibration.view import View, on_panel, sampler, view_of
 from runtime.devices import Devices
 from runtime.registration import dot_pattern, dots_of, find_homography, panel_points
 from runtime.solver import quality, solve
@@ -111,7 +111,7 @@ def calibrate(
         taken = {c: _taken(taker, c, bases[c], black, floor, seed) for c in channels}
         devices.lasers.off()
         captured = time.perf_counter()
-        known = _known_view(bundle)
+        known = view_of(bundle)
         view = _start_view(taken[channels[0]], known, shape, tuple(devices.camera.shape))
         found, sweeps = _refit(bases, taken, view, lambda d, w: say(0.25 + 0.6 * d, f"fitting: {w}"))
         say(0.86, "checking against held-out patterns")
@@ -177,19 +177,6 @@ def _taken(taker: Taker, channel: str, base: Base, black: float, floor: float, s
 def _spacing(shape: tuple[int, int]) -> float:
     """Of the dots, panel pixels: six or seven along the shorter side."""
     return min(max(16.0, min(shape) / 7), min(shape) / 4.5)
-
-
-def _known_view(bundle: Bundle) -> View | None:
-    """The camera's view of an earlier calibration, if the bundle holds one."""
-    given = bundle.description.get("camera")
-    if not isinstance(given, Mapping) or "view" not in given:
-        return None
-    try:
-        return View.from_json(given["view"])
-    except (TypeError, ValueError, KeyError) as error:
-        raise InputError(
-            f"the bundle's record of its camera cannot be read: {error}; export it again"
-        ) from None
 
 
 def _start_view(taken: Taken, known: View | None, shape: tuple[int, int], camera: tuple[int, int]) -> View:

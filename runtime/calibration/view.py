@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from firmware_iface.errors import InputError
+from runtime.bundle import Bundle
 from runtime.fft import irfft2, rfft2
 from runtime.legendre import edge_to_edge, legendre_maps
 from runtime.lightpath import FINE, Grid, image_frequencies
@@ -73,6 +75,19 @@ class View:
         y, x = np.mgrid[: self.shape[0], : self.shape[1]]
         there = panel_points(self.matrix(panel), np.stack([x.ravel(), y.ravel()], 1))
         return there[:, 1].reshape(self.shape), there[:, 0].reshape(self.shape)
+
+
+def view_of(bundle: Bundle) -> View | None:
+    """The camera's view of an earlier calibration, if the bundle holds one."""
+    given = bundle.description.get("camera")
+    if not isinstance(given, Mapping) or "view" not in given:
+        return None
+    try:
+        return View.from_json(given["view"])
+    except (TypeError, ValueError, KeyError) as error:
+        raise InputError(
+            f"the bundle's record of its camera cannot be read: {error}; export it again"
+        ) from None
 
 
 def sensitivity_maps(shape: tuple[int, int]) -> np.ndarray:

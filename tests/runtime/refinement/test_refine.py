@@ -5,20 +5,24 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 import safetensors.numpy
+from PIL import Image
 
 from firmware_iface.errors import InputError
 from firmware_iface.virtual import BenchDescription, VirtualHeadset
 from firmware_iface.virtual.defects import make_defect
 from runtime.approximator import Approximator
-from runtime.bundle import ADAPTERS, APPROXIMATOR, GRADIENT
+from runtime.bundle import ADAPTERS, APPROXIMATOR, GRADIENT, write_bundle
+from runtime.calibrated import pack_light_paths
 from runtime.calibration.view import View
+from runtime.cli import main
 from runtime.lightpath import LightPath
-from runtime.refinement import Eye, Refinement, refine
-from runtime.refinement.refine import HOLD_OUT, _to_step
+from runtime.refinement.eye import Eye
+from runtime.refinement.refine import HOLD_OUT, Refinement, _to_step, refine
 from runtime.solver import solve
 from tests.runtime.benches import ideal_path, scene
 
@@ -196,3 +200,48 @@ def test_what_does_not_fit_is_said(
     state = Refinement([path], approximator, target, start)
     with pytest.raises(InputError, match="captured picture"):
         state.take(np.ones(SHAPE))
+
+
+def test_the_command_refines_a_picture_and_leaves_the_bundle_and_the_dark(
+    files: dict[str, bytes],
+    path: LightPath,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    from firmware_iface import virtual
+
+    records, arrays = pack_light_paths([("green", DISTANCE_MM, 520.0, path)])
+    bundle = tmp_path / "bundle"
+    write_bundle(bundle, arrays, {"paths": records, "distance_mm": DISTANCE_MM}, {}, networks=files)
+    before = {p.name: p.read_bytes() for p in bundle.iterdir()}
+    picture, out, log = tmp_path / "picture.npy", tmp_path / "pattern.png", tmp_path / "drift.jsonl"
+    np.save(picture, scene(SHAPE))
+    headset = lit_headset("phase_response")
+    headset.lasers.off()
+    monkeypatch.setattr(virtual, "open_headset", lambda spec, seed: headset)
+    words = [
+        bundle,
+        picture,
+        "--headset",
+        "virtual:demo",
+        "--captures",
+        9,
+        "--out",
+        out,
+        "--log",
+        log,
+        "--json",
+    ]
+    assert main(["refine", *map(str, words)]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["psnr_db"]["best"] > result["psnr_db"]["first"] + 4 and result["captures"] == 9
+    assert len(log.read_text().splitlines()) == 9
+    with Image.open(out) as image:
+        np.testing.assert_array_equal(np.asarray(image), headset.panel.gray)
+    assert headset.lasers.power("green") == 0
+    assert {p.name: p.read_bytes() for p in bundle.iterdir()} == before
+
+    write_bundle(bundle, arrays, {"paths": records, "distance_mm": DISTANCE_MM}, {}, replace=True)
+    assert main(["refine", *map(str, words)]) == 2
+    assert "no approximator" in capsys.readouterr().err
