@@ -13,7 +13,7 @@ from contextlib import contextmanager, redirect_stdout, suppress
 from typing import NoReturn
 
 from firmware_iface.errors import InputError, nearest
-from trainer.commands import explaining, making, registering, training
+from trainer.commands import explaining, looping, making, registering, training
 from trainer.commands.command import PROGRAM, Command, Interrupted, release
 from trainer.commands.screen import Screen, one_line
 
@@ -40,7 +40,8 @@ class _Parser(ArgumentParser):
 
 def commands() -> list[Command]:
     """All commands, in the order in which they are used."""
-    return [*explaining.commands(), *training.commands(), *making.commands(), *registering.commands()]
+    parts = (explaining, training, looping, making, registering)
+    return [command for part in parts for command in part.commands()]
 
 
 def parser_of(known: Sequence[Command]) -> ArgumentParser:

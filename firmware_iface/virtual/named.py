@@ -32,6 +32,16 @@ def _benches() -> dict[str, BenchDescription]:
         BenchDescription("triple", defects=(make("crosstalk"), make("illumination"), make("distance"))),
         BenchDescription("colour", channels=_RGB, defects=(make("phase_response"),)),
         BenchDescription(
+            "mixed",  # small enough to train a dozen networks on
+            defects=(
+                make("zero_order", fill_factor=0.94, surface_amplitude=0.12),
+                make("illumination", waist_x_share=1.9, waist_y_share=2.1),
+                make("phase_response", gain=1.08, s_curvature=0.12),
+                make("stripes", rms=0.1),
+                make("fringes", contrast=0.1),
+            ),
+        ).resized(96, 128, 12.0),
+        BenchDescription(
             "planes",
             simulation=SimulationDescription(planes_mm=(24.0, 30.0, 36.0)),
             defects=(make("spatial_coherence"),),

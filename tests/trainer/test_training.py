@@ -203,12 +203,17 @@ def test_every_recipe_takes_steps(name: str, sets: TrainingSets) -> None:
     assert torch.isfinite(network(given)).all()
 
 
-def test_likeness_of_equal_pictures_is_perfect() -> None:
-    one = torch.rand(3, 40, 40)
-    same, other = likeness(one, one, [0, 1, 2]), likeness(one, one + 0.1, [0, 1, 2])
+def test_likeness_of_equal_pictures_is_perfect_and_counts_what_counts() -> None:
+    one, every = torch.rand(3, 40, 40), torch.ones(3, 40, 40)
+    same, other = likeness(one, one, every), likeness(0.9 * one, 0.9 * one + 0.1, every)
     assert (same.psnr_db, same.ssim) == (120, 1)
-    assert other.psnr_db == pytest.approx(20, abs=1) and other.ssim < 1
-    assert likeness(one, torch.cat((one[:1], 0 * one[1:])), [0]).ssim == 1
+    assert other.psnr_db == pytest.approx(20) and other.ssim < 1
+    half = every.clone()
+    half[:, :20] = 0
+    wrong = torch.cat((torch.zeros(3, 20, 40), one[:, 20:]), 1)
+    assert likeness(wrong, one, half).psnr_db == 120
+    assert likeness(0.9 * one, 0.9 * one + 0.1, half).psnr_db == pytest.approx(20)
+    assert likeness(torch.cat((one[:1], 0 * one[1:])), one, torch.cat((every[:1], 0 * one[1:]))).ssim == 1
 
 
 # That it goes on

@@ -30,23 +30,28 @@ class Likeness:
         return dict(vars(self))
 
 
-def likeness(ours: Tensor, target: Tensor, used: list[int], lpips: Lpips | None = None) -> Likeness:
-    """How near a picture [C, H, W] is to a target; `used` are the planes that hold a colour."""
+def likeness(ours: Tensor, target: Tensor, weight: Tensor, lpips: Lpips | None = None) -> Likeness:
+    """How near a picture [C, H, W] is to a target, over the pixels whose weight [C, H, W] is 1.
+
+    A colour without such a pixel does not count. LPIPS sees the target where the weight is 0.
+    """
     from skimage.metrics import structural_similarity
 
-    ours, target = ours.clamp(0, 1), target.clamp(0, 1)
-    mse = float(((ours - target)[used].double() ** 2).mean())
-    ssim = [
-        structural_similarity(
-            ours[k].numpy(), target[k].numpy(), gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
-            data_range=1.0,
-        )
-        for k in used
-    ]  # fmt: skip
+    ours, target = where_seen(ours, target, weight).clamp(0, 1), target.clamp(0, 1)
+    mse = float((weight * (ours - target).double() ** 2).sum() / weight.sum().clamp(min=1))
+    ssim = []
+    for k in range(len(ours)):
+        if bool(weight[k].any()):
+            _, near = structural_similarity(
+                ours[k].numpy(), target[k].numpy(), gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
+                data_range=1.0, full=True,
+            )  # fmt: skip
+            ssim.append(float(np.average(near, weights=weight[k].numpy())))
     distance = None
     if lpips is not None and min(ours.shape[1:]) >= SMALLEST:
         distance = 1 - float(lpips(three_planes(ours[None]), three_planes(target[None]))[0])
-    return Likeness(-10 * float(np.log10(max(mse, 1e-12))), float(np.mean(ssim)), distance)
+    psnr = -10 * float(np.log10(max(mse, 1e-12)))
+    return Likeness(psnr, float(np.mean(ssim)) if ssim else 0.0, distance)
 
 
 def mean_likeness(several: list[Likeness]) -> Likeness:
@@ -87,6 +92,4 @@ def noise_floor(pairs: Pairs, lpips: Lpips | None = None, seed: int = 0) -> Like
 
 
 def _likeness(pairs: Pairs, k: int, ours: Tensor, lpips: Lpips | None) -> Likeness:
-    target = picture(pairs.measured[k], pairs.white)
-    used = [plane for plane, capture in enumerate(pairs.captures[k]) if capture is not None]
-    return likeness(where_seen(ours, target, pairs.weight[k]), target, used, lpips)
+    return likeness(ours, picture(pairs.measured[k], pairs.white), pairs.weight[k], lpips)

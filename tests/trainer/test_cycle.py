@@ -1,0 +1,266 @@
+"""The cycle: patterns through a model and a network, on a bench with a defect that no effect names."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from firmware_iface.errors import InputError
+from firmware_iface.virtual import BenchDescription, VirtualHeadset, make_defect
+from runtime.solver import quality
+from tests.trainer.taught import SHAPE, captured, fringed, known
+from tests.trainer.test_networks import disturbed
+from trainer.cli import main
+from trainer.cycle.loop import Cycle, Settings, run_cycle
+from trainer.cycle.pictures import in_depth, photographs
+from trainer.cycle.retrieval import METHODS, Volume, beside_zero_order, loss_of, retrieve, torch_path
+from trainer.cycle.showing import Stage, with_iris_beside
+from trainer.evaluation.evaluate import DISPLAY, PREDICTION, Sizes, run_evaluation
+from trainer.model import Model
+from trainer.networks.approximator import Approximator, Architecture
+from trainer.training.recipe import RECIPES
+
+COMPACT = replace(RECIPES["compact"], filters=2)
+NEVER = 2.0  # no likeness is that good
+
+
+def cycle_of(headset: VirtualHeadset, folder: Path, count: int = 3, **changed: object) -> Cycle:
+    """Two rounds on a headset, under the ideal model."""
+    bench = known(headset)
+    settings = Settings(2, COMPACT, 150, iterations=30, good=NEVER)
+    names = ("astronaut", "coffee", "rocket", "chelsea")[:count]
+    stage = Stage(headset, bench, Model(bench))
+    return run_cycle(Model(bench), photographs(names, bench), replace(settings, **changed), folder, stage)
+
+
+def psnr(cycle: Cycle, number: int) -> float:
+    return float(np.mean([one.psnr_db for one in cycle.history[number].values()]))
+
+
+def test_each_round_is_seen_to_be_better_than_none(tmp_path: Path) -> None:
+    """The fringes of the bench go: with nothing learned they cost more than 4 dB."""
+    cycle = cycle_of(fringed(), tmp_path)
+    assert len(cycle.history) == 3
+    assert psnr(cycle, 1) > psnr(cycle, 0) + 4
+    assert psnr(cycle, 2) > psnr(cycle, 0) + 4
+    assert len(list((tmp_path / "round-2" / "patterns").iterdir())) == 3
+    assert (tmp_path / "round-1" / "network.safetensors").is_file()
+
+
+def test_online_each_picture_has_its_own_network(tmp_path: Path) -> None:
+    """Where what is wrong differs from picture to picture, a network of its own serves each better."""
+    headset = fringed(kind="zero_order")
+    shared = cycle_of(headset, tmp_path / "shared")
+    own = cycle_of(fringed(kind="zero_order"), tmp_path / "own", online=True)
+    assert psnr(own, 2) > psnr(shared, 2) + 0.5
+    assert set(own.own) == {"astronaut", "coffee", "rocket"}
+
+
+def test_a_picture_that_is_good_enough_is_left_alone(tmp_path: Path) -> None:
+    cycle = cycle_of(fringed(), tmp_path, count=2, good=0.0)
+    assert cycle.done == {"astronaut", "coffee"}
+    assert len(cycle.history) == 1 and cycle.network is None
+
+
+def test_recorded_captures_stand_in_for_the_camera(tmp_path: Path) -> None:
+    """What was recorded is learned from, and the patterns that are left behind show the picture better."""
+    captures = captured(tmp_path / "captures", patterns=12)
+    model, wanted = Model(captures.bench), photographs(("astronaut",), captures.bench)
+    settings = Settings(1, COMPACT, 150, iterations=30)
+    cycle = run_cycle(model, wanted, settings, tmp_path / "loop", None, [captures])
+    assert cycle.history == [] and cycle.network is not None
+    headset = fringed()
+    plain = {"astronaut": retrieve(model, wanted[0], "wirtinger", None, 30)}
+    stage = Stage(headset, captures.bench, model)
+    better = [
+        run_shown(stage, patterns, wanted[0], tmp_path / f"{k}")
+        for k, patterns in enumerate((plain, cycle.patterns))
+    ]
+    assert better[1] > better[0] + 3
+    with pytest.raises(InputError, match="recorded"):
+        run_cycle(model, wanted, replace(settings, rounds=2), tmp_path / "more", None, [captures])
+
+
+def run_shown(stage: Stage, patterns: dict[str, np.ndarray], wanted: Volume, folder: Path) -> float:
+    from trainer.compare import with_gains
+    from trainer.cycle.showing import display_likeness, seen_pairs
+
+    captures = stage.show(patterns, wanted.planes_mm, folder)
+    seen = seen_pairs(captures, with_gains(captures, stage.model, captures.captures))
+    return display_likeness(seen[wanted.name], wanted).psnr_db
+
+
+# Phase retrieval
+
+
+@pytest.mark.parametrize("colours", [False, True])
+def test_the_phase_gradient_through_the_network_is_the_slope(colours: bool) -> None:
+    """Seed eq. 23 through light path and network, along a random direction, in double precision."""
+    bench = known(fringed(colours))
+    names, planes = [c.name for c in bench.channels], (5.5, 6.0)
+    paths = [[torch_path(Model(bench), n, z, torch.float64) for n in names] for z in planes]
+    shape = (len(planes), len(names), *SHAPE)
+    generator = torch.Generator().manual_seed(0)
+    network = disturbed("compact", SHAPE, 2, len(names)).double()
+    phase = (6 * torch.rand(shape[1:], generator=generator, dtype=torch.float64)).requires_grad_(True)
+    target, weight = (torch.rand(shape, generator=generator, dtype=torch.float64) for _ in range(2))
+    direction = torch.randn(shape[1:], generator=generator, dtype=torch.float64)
+    with torch.no_grad():  # the target's scale is held while the slope is taken
+        fixed = scaled(phase, paths, target, weight, network)
+    (gradient,) = torch.autograd.grad(loss_of(phase, paths, target, weight, network), [phase])
+    step = 1e-5
+    with torch.no_grad():
+        rise = [
+            float(penalty_at(phase + sign * step * direction, paths, fixed, weight, network))
+            for sign in (1, -1)
+        ]
+    assert float((gradient * direction).sum()) == pytest.approx((rise[0] - rise[1]) / (2 * step), rel=1e-4)
+
+
+def light(phase: torch.Tensor, paths: list, network: torch.nn.Module) -> torch.Tensor:
+    from runtime.lightpath import irradiance, pixel_irradiance
+
+    rows = [[pixel_irradiance(p, irradiance(p, phase[c])) for c, p in enumerate(row)] for row in paths]
+    return network(torch.stack([torch.stack(row) for row in rows]))
+
+
+def scaled(phase, paths, target, weight, network) -> torch.Tensor:  # type: ignore[no-untyped-def]
+    seen = light(phase, paths, network)
+    over = (target.sqrt() * seen.clamp(min=0).sqrt() * weight).sum((0, 2, 3)) / (target * weight).sum(
+        (0, 2, 3)
+    )
+    return target * over[None, :, None, None] ** 2
+
+
+def penalty_at(phase, paths, target, weight, network) -> torch.Tensor:  # type: ignore[no-untyped-def]
+    seen = light(phase, paths, network)
+    return (weight * ((seen.clamp(min=0) + 1e-3).sqrt() - (target + 1e-3).sqrt()) ** 2).sum()
+
+
+def test_every_named_method_shows_the_picture() -> None:
+    bench = known(fringed())
+    headset = VirtualHeadset(BenchDescription("ideal").resized(*SHAPE, 6.0))
+    picture = photographs(("astronaut",), bench)[0]
+    found = {}
+    for method in METHODS:
+        shown = with_iris_beside(headset) if method == "wirtinger_no_zero_order" else headset
+        gray = retrieve(Model(bench), picture, method, None, 40)[0]
+        assert gray.dtype == np.uint8 and gray.shape == SHAPE
+        found[method] = quality(shown.true_irradiance(gray, "green"), picture.irradiance[0, 0]).psnr_db
+    assert found["wirtinger"] > found["gerchberg_saxton"] > 10
+    assert found["wirtinger"] > found["double_phase"] > 10
+    with pytest.raises(InputError, match="wirtinger"):
+        retrieve(Model(bench), picture, "wirtnger")
+
+
+def test_the_ramp_and_the_iris_keep_the_zero_order_out() -> None:
+    """Undiffracted light alone: all of it passes an iris on the axis, and nothing one that stands beside it."""
+    description = BenchDescription("leaky", defects=(make_defect("zero_order", surface_amplitude=0.5),))
+    headset = VirtualHeadset(description.resized(*SHAPE, 6.0))
+    chequer = (128 * (np.indices(SHAPE).sum(0) % 2)).astype(np.uint8)  # diffracts to the band's corners
+    straight, beside = (
+        h.true_irradiance(chequer, "green").mean() for h in (headset, with_iris_beside(headset))
+    )
+    assert beside < 0.02 * straight
+    model = beside_zero_order(Model(known(headset)))
+    assert model.names == ("iris",)
+
+
+def test_a_stack_of_planes_shows_each_part_in_its_plane() -> None:
+    """One pattern, two planes: each strip is better in its own plane than from the pattern of the other one."""
+    bench = known(fringed())
+    headset = VirtualHeadset(BenchDescription("ideal").resized(*SHAPE, 6.0))
+    flat = photographs(("astronaut",), bench)[0]
+    wanted = in_depth(flat, (4.0, 8.0))
+    deep = retrieve(Model(bench), wanted, "hardware_in_the_loop", None, 60)[0]
+    single = retrieve(Model(bench), replace(flat, planes_mm=(4.0,)), "wirtinger", None, 60)[0]
+    far = wanted.weight[1] > 0
+    target = flat.irradiance[0, 0]
+    seen = [headset.true_irradiance(gray, "green", 8.0) for gray in (deep, single)]
+    assert quality(seen[0], target, far).psnr_db > quality(seen[1], target, far).psnr_db + 6
+    with pytest.raises(InputError, match="one plane"):
+        retrieve(Model(bench), wanted, "gerchberg_saxton")
+
+
+def test_three_colours_are_solved_together() -> None:
+    bench = known(fringed(True))
+    picture = photographs(("astronaut",), bench)[0]
+    identity = Approximator(Architecture("compact", 2, SHAPE, 2)).eval()
+    gray = retrieve(Model(bench), picture, "hardware_in_the_loop", identity, 10)
+    assert gray.shape == (2, *SHAPE) and not np.array_equal(gray[0], gray[1])
+
+
+# The commands
+
+
+def bench_file(folder: Path, kind: str = "fringes") -> Path:
+    path = folder / "bench.toml"
+    path.write_text(
+        f'name = "small"\n[panel]\nwidth = {SHAPE[1]}\nheight = {SHAPE[0]}\n'
+        f'[propagation]\ndistance_mm = 6.0\n[[defect]]\nkind = "{kind}"\n'
+    )
+    return path
+
+
+def test_the_loop_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = [
+        "loop",
+        "--bench",
+        str(bench_file(tmp_path)),
+        "--steps",
+        "60",
+        "--filters",
+        "2",
+        "--iterations",
+        "10",
+    ]
+    assert main([*words, "--out", str(tmp_path / "loop"), "--good", "2", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert [one["round"] for one in result["rounds"]] == [0, 1]
+    assert result["rounds"][1]["mean"]["psnr_db"] > result["rounds"][0]["mean"]["psnr_db"]
+    assert result["rounds"][0]["mean"]["one_minus_lpips"] is None
+    assert main([*words, "--out", str(tmp_path / "loop")]) == 2
+    assert "not empty" in capsys.readouterr().err
+    assert main(["loop", "--out", str(tmp_path / "none")]) == 2
+    assert "--bench" in capsys.readouterr().err
+
+
+def test_evaluate_prints_its_contract(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = [
+        "evaluate",
+        "--bench",
+        str(bench_file(tmp_path)),
+        "--filters",
+        "2",
+        "--steps",
+        "30",
+        "--iterations",
+        "20",
+    ]
+    methods = ["ideal", "published", "compact_is_not_one"]
+    assert main([*words, "--methods", ",".join(methods)]) == 2
+    assert "compact_is_not_one" in capsys.readouterr().err
+    assert main([*words, "--methods", "ideal,published,wirtinger,network_1", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert [row["method"] for row in result["prediction"]] == ["ideal", "published"]
+    assert [row["method"] for row in result["display"]] == ["wirtinger", "network_1"]
+    keys = {"psnr_db", "ssim", "one_minus_lpips"}
+    for row in (*result["prediction"], *result["display"], result["noise_floor"], result["oracle"]):
+        assert row.keys() - {"method"} == keys
+        assert row["one_minus_lpips"] is None and row["psnr_db"] > 5 and 0 < row["ssim"] < 1
+    assert result["noise_floor"]["psnr_db"] > result["prediction"][0]["psnr_db"]
+
+
+@pytest.mark.slow
+def test_every_method_of_evaluate_runs(tmp_path: Path) -> None:
+    found = run_evaluation(str(bench_file(tmp_path, "zero_order")), sizes=Sizes(2, 20, 20), workers=1)
+    assert [row["method"] for row in found["prediction"]] == list(PREDICTION)
+    assert [row["method"] for row in found["display"]] == list(DISPLAY)
+    by_name = {row["method"]: row["psnr_db"] for row in found["display"]}
+    assert by_name["physics"] > by_name["wirtinger"] + 3
+    assert abs(by_name["physics"] - found["oracle"]["psnr_db"]) < 3

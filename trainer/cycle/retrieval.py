@@ -1,0 +1,185 @@
+"""Phase retrieval for the cycle: named methods, from a wanted volume to gray levels of each colour.
+
+    double_phase, gerchberg_saxton, wirtinger   through the model's light path (Hsueh and Sawchuk 1978; Gerchberg and
+                                                Saxton 1972; Chakravarthula et al. 2019)
+    wirtinger_no_zero_order                     the same, with the iris beside the zero order and a ramp on the pattern
+    hardware_in_the_loop                        Wirtinger descent through light path and network (seed eq. 14-23)
+
+The last is the torch light path and the network differentiated together; all others are the headset's own solver.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from firmware_iface.errors import InputError, nearest
+from runtime.lightpath import LightPath, irradiance, pixel_irradiance
+from runtime.solver import DriveRange, solve
+from trainer.effects.registry import BUILT_IN
+from trainer.export import baked_path, told_to_display
+from trainer.model import Model, absent
+from trainer.networks.approximator import Approximator, amplitude
+from trainer.prediction import light_path
+from trainer.scene import scene_for, stages_for
+
+SOLVERS = {
+    "double_phase": "double_phase",
+    "gerchberg_saxton": "gerchberg_saxton",
+    "wirtinger": "default",
+    "wirtinger_no_zero_order": "default",
+    "hardware_in_the_loop": "default",
+}
+METHODS = tuple(SOLVERS)
+ITERATIONS = 60
+RATE, BETAS = 0.05, (0.8, 0.95)  # of Adam, rad: quick and without overshoot from a start that is nearly right
+CARRIER, OPENING = (
+    0.3,
+    0.26,
+)  # of the panel's band: where the iris stands beside the zero order, and its half width
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class Volume:
+    """What is to be seen: irradiance [K, C, H, W] of any scale on K planes (mm), each colour and pixel.
+
+    weight [K, H, W]: how much a pixel of a plane counts; a scene in depth counts each pixel where it is in focus.
+    """
+
+    name: str
+    planes_mm: tuple[float, ...]
+    irradiance: np.ndarray
+    weight: np.ndarray
+
+    @staticmethod
+    def flat(name: str, plane_mm: float, picture: np.ndarray) -> Volume:
+        """A picture [C, H, W] on one plane."""
+        return Volume(name, (plane_mm,), picture[None], np.ones((1, *picture.shape[1:]), np.float32))
+
+
+def beside_zero_order(model: Model) -> Model:
+    """The model with the iris beside the zero order, as the seed's prototype has it (its section 5).
+
+    Patterns then carry a phase ramp, which takes the picture's band into the iris; undiffracted light stays out.
+    """
+    iris = next(effect for effect in BUILT_IN if effect.name == "iris")
+    values = {"half_width": OPENING, "centre_y": CARRIER, "centre_x": 0.0}
+    start = absent(iris, model.bench)
+    return model.having(start.with_values({n: np.full_like(v, values[n]) for n, v in start.values.items()}))
+
+
+def retrieve(
+    model: Model,
+    wanted: Volume,
+    method: str = "hardware_in_the_loop",
+    network: Approximator | None = None,
+    iterations: int = ITERATIONS,
+    progress: Progress | None = None,
+) -> np.ndarray:
+    """Gray levels of each colour, uint8 [C, H, W].
+
+    network : what `hardware_in_the_loop` looks through; None is the identity, with which it is plain Wirtinger descent.
+    Raises InputError for a method that is not there, and a method of one plane for a volume of several.
+    """
+    if method not in METHODS:
+        raise InputError(f"there is no phase retrieval '{method}': {nearest(method, METHODS)}")
+    model = told_to_display(model)
+    if method == "wirtinger_no_zero_order":
+        model = beside_zero_order(model)
+    paths = [[baked_path(model, c.name, plane) for plane in wanted.planes_mm] for c in model.bench.channels]
+    if method == "hardware_in_the_loop" and (network is not None or len(wanted.planes_mm) > 1):
+        return _through(model, wanted, network, iterations, progress)
+    return np.stack([_solved(stack, wanted, c, method, iterations)[0] for c, stack in enumerate(paths)])
+
+
+def _solved(
+    stack: list[LightPath], wanted: Volume, colour: int, method: str, iterations: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gray levels and phase [H, W] of one colour, by the headset's solver."""
+    if len(stack) > 1:
+        raise InputError(
+            f"'{method}' shows one plane and {wanted.name} has {len(stack)}: use hardware_in_the_loop"
+        )
+    solution = solve(stack[0], wanted.irradiance[0, colour], iterations, method=SOLVERS[method])
+    return solution.gray.copy(), solution.phase.copy()
+
+
+def _through(
+    model: Model,
+    wanted: Volume,
+    network: Approximator | None,
+    iterations: int,
+    progress: Progress | None,
+) -> np.ndarray:
+    """Adam on the penalty of what the network makes of the light, all colours and planes at once.
+
+    Begins with what the solver finds without the network for the plane that counts most; the best pattern met is kept.
+    """
+    first = int(np.argmax(wanted.weight.sum((1, 2))))
+    plane = wanted.planes_mm[first]
+    flat = Volume.flat(wanted.name, plane, np.sum(wanted.weight[:, None] * wanted.irradiance, 0))
+    baked = [baked_path(model, c.name, plane) for c in model.bench.channels]
+    start = [_solved([path], flat, c, "wirtinger", iterations)[1] for c, path in enumerate(baked)]
+    phase = torch.tensor(np.stack(start), dtype=torch.float32).requires_grad_(True)
+    paths = [[torch_path(model, c.name, z) for c in model.bench.channels] for z in wanted.planes_mm]
+    target = torch.as_tensor(wanted.irradiance, dtype=torch.float32)
+    weight = torch.as_tensor(wanted.weight, dtype=torch.float32)[:, None]
+    target = target / ((target * weight).sum() / (weight.sum() * target.shape[1])).clamp(min=1e-12)
+    drives = [DriveRange(path) for path in baked]
+    adam = torch.optim.Adam([phase], lr=RATE, betas=BETAS)
+    best, least = phase.detach().clone(), float("inf")
+    for step in range(iterations + 1):
+        loss = loss_of(phase, paths, target, weight, network)
+        if loss.item() < least:
+            best, least = phase.detach().clone(), loss.item()
+        if progress:
+            progress(step / max(iterations, 1))
+        if step < iterations:
+            (phase.grad,) = torch.autograd.grad(loss, [phase])
+            adam.step()
+            with torch.no_grad():
+                for c, drive in enumerate(drives):
+                    if drive.bounded:
+                        phase[c] = torch.as_tensor(drive.held(phase[c].numpy()), dtype=phase.dtype)
+    return np.stack([drive.gray(p) for drive, p in zip(drives, best.numpy(), strict=True)])
+
+
+def loss_of(
+    phase: Tensor,
+    paths: list[list[LightPath]],
+    target: Tensor,
+    weight: Tensor,
+    network: Callable[[Tensor], Tensor] | None,
+) -> Tensor:
+    """The penalty of phases [C, H, W] (rad), sum over planes, colours and pixels that count.
+
+    paths : light paths [K][C] on tensors. target [K, C, H, W] is scaled to what is seen, a colour each.
+    """
+    light = torch.stack(
+        [torch.stack([_light(path, phase[c]) for c, path in enumerate(row)]) for row in paths]
+    )
+    seen = light if network is None else network(light)
+    with torch.no_grad():
+        root, wanted = torch.sqrt(seen.clamp(min=0)), torch.sqrt(target)
+        scale = (
+            (root * wanted * weight).sum((0, 2, 3)) / (target * weight).sum((0, 2, 3)).clamp(min=1e-12)
+        ) ** 2
+        asked = amplitude(target * scale[None, :, None, None])
+    return (weight * (amplitude(seen) - asked) ** 2).sum()
+
+
+def torch_path(model: Model, channel: str, plane_mm: float, dtype: torch.dtype = torch.float32) -> LightPath:
+    """A model's light path for one colour and plane, on tensors."""
+    with torch.no_grad():
+        scene = scene_for(model, channel, plane_mm, dtype)
+        return light_path(scene, stages_for(scene, model.present))
+
+
+def _light(path: LightPath, phase: Tensor) -> Tensor:
+    return pixel_irradiance(path, irradiance(path, phase))
