@@ -63,16 +63,22 @@ def run_compare(args: Namespace, screen: Screen) -> Result:
     """How far a model is from the captures."""
     refuse_folder(args.report, "--report")
     captures, _, model = inputs_of(args)
+    from trainer.budget import error_budget
     from trainer.compare import compare
+    from trainer.networks.approximator import read_approximator
 
+    network = read_approximator(args.network)[0] if args.network else None
     use_every_core()
     with screen.progress("comparing") as told:
-        found = compare(captures, model, told)
+        found = compare(captures, model, lambda done: told(0.6 * done))
+        budget = None
+        if found.as_json()["heldout"]["excess"] is not None:
+            budget = error_budget(captures, found.model, network, lambda done: told(0.6 + 0.4 * done))
     if args.report:
         from trainer.report import write_report
 
         write_report(args.report, f"Comparison: {captures.folder.name}", comparison=found, model=found.model)
-    return found.as_json()
+    return {**found.as_json(), "budget": None if budget is None else vars(budget)}
 
 
 def run_diagnose(args: Namespace, screen: Screen) -> Result:
@@ -202,6 +208,9 @@ def _check_options(parser: ArgumentParser) -> None:
 def _compare_options(parser: ArgumentParser) -> None:
     captures_argument(parser)
     model_options(parser)
+    parser.add_argument(
+        "--network", metavar="FILE", type=Path, help="a network trained beyond the model: its part of the error too"
+    )
     report_option(parser)
 
 

@@ -122,28 +122,31 @@ def stacked(captures: CaptureSet, rows: Sequence[Capture]) -> list[tuple[Capture
 
 def measured_on_panel(model: Model, batch: Batch) -> Measured:
     """Prediction and measurement of one capture (a batch of one) as irradiance on the panel's pixels."""
-    predictor = Predictor(model, batch)
-    scene, stages = predictor.scene, predictor.stages(model)
-    with torch.no_grad():
-        light = predictor.light(model, predictor.trace(model))
-        gain = (
-            model.gain[batch.channel]
-            * batch.exposure[:, None, None]
-            * _own_gain(scene, stages, light, model, batch)
-        )
-    light.requires_grad_(True)
-    expected = counts(scene, stages, light, gain, None)
-    (sensitivity,) = torch.autograd.grad(expected.sum(), light)
-    sensitivity = sensitivity.expand_as(light)
+    scene, stages, expected, sensitivity = expected_counts(model, batch)
     sharp = sensitivity > DULL * sensitivity.max()
     safe = torch.where(sharp, sensitivity, 1.0)
-    change = torch.where(sharp, (batch.signal - expected.detach()) / safe, 0.0)
+    change = torch.where(sharp, (batch.signal - expected) / safe, 0.0)
     weight = batch.weight * sharp
     noise = batch.noise / safe**2
     shown = display_irradiance(model, batch)
     change, weight, noise = (onto_panel(scene, stages, one[0]) for one in (change, weight, noise))
     weight = (weight > 0.999).to(change.dtype)
     return Measured(shown, shown + change, weight, noise)
+
+
+def expected_counts(model: Model, batch: Batch) -> tuple[Scene, Stages, Tensor, Tensor]:
+    """Counts that a model expects of a batch of one, and counts a unit of light more, each [1, h, w]; where and how."""
+    predictor = Predictor(model, batch)
+    scene, stages = predictor.scene, predictor.stages(model)
+    with torch.no_grad():
+        light = predictor.light(model, predictor.trace(model))
+        own = _own_gain(scene, stages, light, model, batch)
+        gain = model.gain[batch.channel] * batch.exposure[:, None, None] * own
+    with torch.enable_grad():
+        light.requires_grad_(True)
+        expected = counts(scene, stages, light, gain, None)
+        (sensitivity,) = torch.autograd.grad(expected.sum(), light)
+    return scene, stages, expected.detach(), sensitivity.expand_as(expected)
 
 
 def _own_gain(scene: Scene, stages: Stages, light: Tensor, model: Model, batch: Batch) -> Tensor:
