@@ -190,7 +190,9 @@ def _parser() -> ArgumentParser:
         allow_abbrev=False,
     )
     refinement.arguments(refine)
-    refine.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
+    refine.add_argument(
+        "--json", action="store_true", help="print one JSON object on stdout and nothing else"
+    )
     serve = parts.add_parser(
         "serve",
         help="run the headset's service",

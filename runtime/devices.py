@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
@@ -34,11 +33,6 @@ class Devices:
         if self.focus:
             self.focus(plane_mm)
 
-    @property
-    def time_s(self) -> float:
-        """A clock."""
-        return time.monotonic()
-
     def light(self, channel: str) -> None:
         """One laser on, all others off."""
         self.lasers.off()
@@ -52,7 +46,7 @@ def open_devices(spec: str, seed: int = 0) -> Iterator[Devices]:
     With a configuration, the lasers are armed, in a guard process that goes dark when this one ends in any way. Raises
     InputError, and DeviceError where a device fails or a fault is latched (which a person has to clear).
     """
-    tables = _configured(spec)
+    tables = configuration_of(spec)
     if tables is None:
         from firmware_iface.virtual import open_headset
 
@@ -85,7 +79,7 @@ def driven(tables: Mapping[str, Any]) -> Iterator[Devices]:
         yield Devices(panel, lasers, camera, laser_power(tables["lasers"]))
 
 
-def _configured(spec: str) -> dict[str, Any] | None:
+def configuration_of(spec: str) -> dict[str, Any] | None:
     """The devices' tables of a service's configuration; None for a virtual bench."""
     if spec.startswith("virtual:") or not Path(spec).is_file():
         return None

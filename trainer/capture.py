@@ -6,8 +6,7 @@ laser's power is the only thing that changes the gain.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.errors import InputError, nearest
-from runtime.devices import Devices, open_devices
 from trainer.bench_file import Bench, Camera, read_bench
 from trainer.capture_writer import CaptureWriter
+from trainer.headset import open_bench
 from trainer.patterns import Pattern, choose_patterns, default_count
 
 Progress = Callable[[float, str], None]
@@ -87,56 +86,17 @@ def capture_from(
     channels: Sequence[str] | None = None,
     seed: int = 0,
     progress: Progress | None = None,
-    devices: Path | None = None,
+    known: Path | None = None,
 ) -> Taken:
-    """A capture set from the bench that `spec` names: `virtual:NAME`, or the TOML file of a virtual bench.
+    """A capture set from the bench that `spec` names: `virtual:NAME`, the TOML file of a virtual bench, or the
+    configuration of a real headset, with the bench.toml `known`.
 
-    devices : a service's configuration; its panel, lasers and camera are used, and `spec` is the bench's bench.toml
-    Raises InputError for an unknown bench, channel or plane, a folder that holds something already, or devices that
-    are not what bench.toml says; DeviceError (an InputError) where a device fails.
+    Raises InputError for an unknown bench, channel or plane, or a folder that holds something already; DeviceError
+    where a device fails.
     """
-    if devices is None:
-        headset, bench, own_planes = open_bench(spec, seed)
-        planes = tuple(planes_mm) if planes_mm else own_planes
-        return capture_set(headset, bench, folder, patterns, planes, channels, seed, progress)
-    bench = read_bench(Path(spec))
-    with open_devices(str(devices), seed) as opened:
-        _check_devices(opened, bench)
-        if opened.focus is None and len(set(planes_mm or ())) > 1:
-            raise InputError("--planes: this camera does not focus by itself; capture one plane at a time")
-        return capture_set(
-            opened, bench, folder, patterns, planes_mm or (), channels, seed, progress, power=opened.power
-        )
-
-
-def _check_devices(devices: Devices, bench: Bench) -> None:
-    """Raises InputError where the devices are not those of bench.toml."""
-    for what, has, said in (
-        ("panel is (rows, columns)", devices.panel.shape, bench.panel.shape),
-        ("camera's picture is (rows, columns)", devices.camera.shape, bench.camera.shape),
-        ("camera's bit depth is", devices.camera.bit_depth, bench.camera.bit_depth),
-    ):
-        if has != said:
-            raise InputError(f"the {what} {has} and bench.toml says {said}: correct bench.toml")
-    for channel in bench.channels:
-        if channel.name not in devices.lasers.channels:
-            known = ", ".join(devices.lasers.channels)
-            raise InputError(
-                f"bench.toml has a channel '{channel.name}' and the lasers are {known}: correct one"
-            )
-
-
-def open_bench(spec: str, seed: int = 0) -> tuple[Any, Bench, tuple[float, ...]]:
-    """The headset that `spec` names, what is known of its bench, and the planes worth capturing."""
-    from firmware_iface.virtual import open_headset
-
-    headset = open_headset(spec, seed)
-    return headset, nominal_bench(headset), headset.description.planes_mm
-
-
-def nominal_bench(headset: Any) -> Bench:
-    """What a person would write down of a virtual headset's bench."""
-    return read_bench(_whole_levels(headset.description.nominal()))
+    with open_bench(spec, seed, read_bench(known) if known else None) as opened:
+        planes = tuple(planes_mm) if planes_mm else opened.planes_mm
+        return capture_set(opened.headset, opened.bench, folder, patterns, planes, channels, seed, progress)
 
 
 def capture_set(
@@ -149,11 +109,9 @@ def capture_set(
     seed: int = 0,
     progress: Progress | None = None,
     choose: Choose | None = None,
-    power: Mapping[str, float] | None = None,
 ) -> Taken:
     """Show patterns on a bench, capture them, and write the set.
 
-    power : of a laser while it is on, fraction of full; full where it is not named
     patterns : how many for each colour and plane; the first is shown twice, for the noise
     choose : gives the patterns of a colour and plane instead
     """
@@ -186,7 +144,7 @@ def capture_set(
         for channel in chosen:
             shown = [(p, choose(channel, p)) for p in planes]
             headset.lasers.off()
-            headset.lasers.set_power(channel, (power or {}).get(channel, 1.0))
+            headset.lasers.set_power(channel, 1.0)
             try:
                 exposures[channel] = _expose(headset, bench.camera, shown, channel, say)
                 for plane, several in shown:
@@ -270,11 +228,3 @@ def _dimmed(counts: NDArray[np.uint16], camera: Camera) -> NDArray[np.uint16]:
     """What counts would be at a quarter of the exposure."""
     below = (counts.astype(np.float32) - camera.black_level) / 4 + camera.black_level
     return np.maximum(np.rint(below), 0).astype(np.uint16)
-
-
-def _whole_levels(tables: dict[str, Any]) -> dict[str, Any]:
-    """The tables with `panel.levels` as a whole number, as a bench file has it."""
-    panel = dict(tables["panel"])
-    if math.isfinite(panel["levels"]) and float(panel["levels"]).is_integer():
-        panel["levels"] = int(panel["levels"])
-    return {**tables, "panel": panel}

@@ -31,9 +31,9 @@ from runtime.files import whole_file
 from runtime.solver import Quality, quality, solve
 from runtime.targets import decode_srgb, encode_srgb, fit_area
 from trainer.bench_file import Bench
-from trainer.capture import nominal_bench
 from trainer.effects.registry import catalogue
 from trainer.export import export_bundle
+from trainer.headset import nominal_bench
 from trainer.model import Model
 from trainer.numbers import listed
 from trainer.shown import Shown, with_display

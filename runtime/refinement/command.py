@@ -38,10 +38,10 @@ def run(args: Namespace) -> dict[str, Any]:
     from runtime.approximator import approximator_of
     from runtime.bundle import read_bundle
     from runtime.calibrated import bundle_channels, load_light_path
-    from runtime.devices import open_devices
     from runtime.calibration.taking import Taker
     from runtime.calibration.view import View, view_of
     from runtime.cli import write_gray
+    from runtime.devices import open_devices
     from runtime.refinement.eye import Eye
     from runtime.refinement.refine import Refinement, refine
     from runtime.solver import solve

@@ -209,7 +209,10 @@ def _compare_options(parser: ArgumentParser) -> None:
     captures_argument(parser)
     model_options(parser)
     parser.add_argument(
-        "--network", metavar="FILE", type=Path, help="a network trained beyond the model: its part of the error too"
+        "--network",
+        metavar="FILE",
+        type=Path,
+        help="a network trained beyond the model: its part of the error too",
     )
     report_option(parser)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from firmware_iface.errors import InputError
 from trainer.commands.command import (
@@ -21,42 +22,70 @@ from trainer.commands.command import (
 from trainer.commands.screen import Screen
 from trainer.commands.training import judge_options, seed_option
 
+if TYPE_CHECKING:
+    from trainer.cycle.loop import Settings
+
 
 def run_loop(args: Namespace, screen: Screen) -> Result:
     """The hardware-in-the-loop cycle on a bench, or with recorded captures."""
-    from dataclasses import replace
+    from contextlib import ExitStack
 
-    from trainer.capture import open_bench
     from trainer.captures import read_captures
-    from trainer.cycle.loop import Settings, run_cycle
+    from trainer.cycle.loop import run_cycle
     from trainer.cycle.pictures import LEARNED, photographs, volumes_of
     from trainer.cycle.retrieval import beside_zero_order
     from trainer.cycle.showing import Stage, with_iris_beside
     from trainer.effects.registry import catalogue
+    from trainer.headset import open_bench
     from trainer.model import Model
     from trainer.model_file import read_model
-    from trainer.training.judges import left_out, read_judges
-    from trainer.training.recipe import recipe_named
+    from trainer.training.judges import left_out
 
     recorded = [read_captures(folder) for folder in args.recorded]
     if args.bench is None and not recorded:
         raise InputError("there is nothing to learn from: give --bench BENCH, or --recorded CAPTURES")
-    headset, bench = None, recorded[0].bench if recorded else None
-    if args.bench is not None:
-        headset, bench, _ = open_bench(args.bench, args.seed)
-    assert bench is not None
-    model = read_model(args.model, catalogue(args.effects), bench) if args.model else Model(bench)
+    if args.out.exists() and (not args.out.is_dir() or any(args.out.iterdir())):
+        raise InputError(f"--out {args.out} is there already and is not empty: give another folder")
+    settings = _settings(args)
+    known = recorded[0].bench if recorded else None
+    model = read_model(args.model, catalogue(args.effects), known) if args.model else None
+    workers_of(args)
+    with ExitStack() as stack:
+        headset, bench = None, known
+        if args.bench is not None:
+            opened = stack.enter_context(open_bench(args.bench, args.seed, model.bench if model else known))
+            headset, bench = opened.headset, opened.bench
+        assert bench is not None  # of the bench, or of the recorded captures
+        model = model or Model(bench)
+        if args.method == "wirtinger_no_zero_order":
+            model = beside_zero_order(model)
+            headset = None if headset is None else with_iris_beside(headset)
+        wanted = volumes_of(args.pictures, bench) if args.pictures else photographs(LEARNED, bench)
+        stage = None if headset is None else Stage(headset, bench, Model(bench))
+        told = stack.enter_context(screen.progress("the cycle"))
+        cycle = run_cycle(model, wanted, settings, args.out, stage, recorded, progress=told)
+    rounds = [{name: found.as_json() for name, found in one.items()} for one in cycle.history]
+    return {
+        "folder": str(args.out),
+        "pictures": [one.name for one in wanted],
+        "rounds": [{"round": k, "pictures": one, "mean": _mean(one)} for k, one in enumerate(rounds)],
+        "good_enough": sorted(cycle.done),
+        "left_out": left_out(settings.recipe, settings.judges),
+    }
+
+
+def _settings(args: Namespace) -> Settings:
+    from dataclasses import replace
+
+    from trainer.cycle.loop import Settings
+    from trainer.training.judges import read_judges
+    from trainer.training.recipe import recipe_named
+
     recipe = recipe_named(args.network)
     if args.filters is not None:
         recipe = replace(recipe, filters=args.filters)
     judges = read_judges(args.vgg, args.lpips)
-    if args.method == "wirtinger_no_zero_order":
-        model = beside_zero_order(model)
-        headset = None if headset is None else with_iris_beside(headset)
-    wanted = volumes_of(args.pictures, bench) if args.pictures else photographs(LEARNED, bench)
-    if args.out.exists() and any(args.out.iterdir()):
-        raise InputError(f"--out {args.out} is there already and is not empty: give another folder")
-    settings = Settings(
+    return Settings(
         args.rounds,
         recipe,
         args.steps,
@@ -67,18 +96,6 @@ def run_loop(args: Namespace, screen: Screen) -> Result:
         args.seed,
         judges,
     )
-    workers_of(args)
-    stage = None if headset is None else Stage(headset, bench, Model(bench))
-    with screen.progress("the cycle") as told:
-        cycle = run_cycle(model, wanted, settings, args.out, stage, recorded, progress=told)
-    rounds = [{name: found.as_json() for name, found in one.items()} for one in cycle.history]
-    return {
-        "folder": str(args.out),
-        "pictures": [one.name for one in wanted],
-        "rounds": [{"round": k, "pictures": one, "mean": _mean(one)} for k, one in enumerate(rounds)],
-        "good_enough": sorted(cycle.done),
-        "left_out": left_out(recipe, judges),
-    }
 
 
 def _mean(found: dict[str, Result]) -> Result:
@@ -114,7 +131,6 @@ def run_evaluate(args: Namespace, screen: Screen) -> Result:
     """Every method on one bench."""
     from dataclasses import replace
 
-    from trainer.capture import open_bench
     from trainer.effects.registry import catalogue
     from trainer.evaluation.evaluate import METHODS, Sizes, run_evaluation
     from trainer.model_file import read_model
@@ -125,7 +141,7 @@ def run_evaluate(args: Namespace, screen: Screen) -> Result:
     sizes = replace(sizes, **{name: value for name, value in given.items() if value is not None})
     model = None
     if args.model:
-        model = read_model(args.model, catalogue(args.effects), open_bench(args.bench, args.seed)[1])
+        model = read_model(args.model, catalogue(args.effects))
     judges = read_judges(args.vgg, args.lpips)
     with screen.progress("comparing methods") as told:
         found = run_evaluation(
@@ -163,7 +179,9 @@ def _network_options(parser: ArgumentParser) -> None:
 
 
 def _loop_options(parser: ArgumentParser) -> None:
-    parser.add_argument("--bench", metavar="BENCH", help="virtual:NAME, or the TOML file of a bench")
+    parser.add_argument(
+        "--bench", metavar="BENCH", help="virtual:NAME, a virtual bench's TOML file, or a headset's"
+    )
     parser.add_argument(
         "--rounds", metavar="K", type=whole(0, 1000), default=1, help="how often to learn (default 1)"
     )

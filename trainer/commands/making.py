@@ -112,7 +112,7 @@ def run_capture(args: Namespace, screen: Screen) -> Result:
 
     with screen.progress("capturing") as told:
         taken = capture_from(
-            args.bench, args.out, args.patterns, args.planes, args.channels, args.seed, told, args.devices
+            args.bench, args.out, args.patterns, args.planes, args.channels, args.seed, told, args.known
         )
     return taken.as_json()
 
@@ -209,14 +209,14 @@ def _capture_options(parser: ArgumentParser) -> None:
         "--bench",
         metavar="BENCH",
         required=True,
-        help="virtual:NAME, such as virtual:demo, or the TOML file of a virtual bench; with --devices the bench.toml "
-        "that says what is known of the bench",
+        help="virtual:NAME, such as virtual:demo, the TOML file of a virtual bench, or a headset's configuration "
+        "(hololoop-runtime serve --help)",
     )
     parser.add_argument(
-        "--devices",
-        metavar="CONFIG.toml",
+        "--known",
+        metavar="BENCH.toml",
         type=Path,
-        help="the panel, lasers and camera of a service's configuration (hololoop-runtime serve --help)",
+        help="with a headset's configuration: the bench.toml that says what is known of its bench",
     )
     out_option(parser, "CAPTURES", "folder of the new capture set")
     parser.add_argument(

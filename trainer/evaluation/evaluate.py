@@ -16,14 +16,16 @@ from typing import Any
 import numpy as np
 
 from firmware_iface.errors import InputError, nearest
+from firmware_iface.virtual import VirtualHeadset, open_headset
 from trainer.bench_file import Bench
-from trainer.capture import capture_set, open_bench
+from trainer.capture import capture_set
 from trainer.captures import CaptureSet, read_captures
 from trainer.compare import with_gains
 from trainer.cycle.loop import Cycle, Settings, run_cycle
 from trainer.cycle.pictures import HELD_OUT, LEARNED, in_depth, photographs
 from trainer.cycle.retrieval import Volume, retrieve
 from trainer.cycle.showing import Stage, display_likeness, seen_pairs, with_iris_beside
+from trainer.headset import nominal_bench
 from trainer.model import Model
 from trainer.networks.approximator import Approximator, read_approximator
 from trainer.training.metrics import Likeness, evaluate, mean_likeness, noise_floor
@@ -95,19 +97,13 @@ class _Comparison:
     patterns: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
 
     @cached_property
-    def _opened(self) -> tuple[Any, Bench, tuple[float, ...]]:
-        opened = open_bench(self.spec, self.seed)
-        if not hasattr(opened[0], "oracle_pattern"):
-            raise InputError(f"--bench {self.spec}: only a virtual bench knows the truth; give virtual:NAME")
-        return opened
+    def headset(self) -> VirtualHeadset:
+        """Only a virtual bench knows the truth that an oracle is asked for."""
+        return open_headset(self.spec, self.seed)
 
-    @property
-    def headset(self) -> Any:
-        return self._opened[0]
-
-    @property
+    @cached_property
     def bench(self) -> Bench:
-        return self._opened[1]
+        return nominal_bench(self.headset)
 
     @cached_property
     def ideal(self) -> Model:
@@ -125,6 +121,8 @@ class _Comparison:
     def physics(self) -> Model:
         """The model of the named effects."""
         if self.given is not None:
+            if (self.given.bench.panel, self.given.bench.channels) != (self.bench.panel, self.bench.channels):
+                raise InputError(f"--model is of another bench than {self.spec}: its panel or colours differ")
             return self.given
         from trainer.effects.registry import catalogue
         from trainer.explain import explain

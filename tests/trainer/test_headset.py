@@ -1,0 +1,47 @@
+"""Real devices as the trainer's commands see them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_iface.errors import InputError
+from tests.trainer.taught import SHAPE, fringed, known
+from trainer.capture import capture_set
+from trainer.headset import RealHeadset, open_bench
+
+
+def test_real_lasers_stay_within_the_power_that_is_set(tmp_path: Path) -> None:
+    """Asked for full power, they get what the configuration allows; a capture set is taken all the same."""
+    virtual = fringed()
+    real = RealHeadset(virtual.panel, virtual.lasers, virtual.camera, {"green": 0.25}, 6.0)
+    real.lasers.set_power("green", 1.0)
+    assert virtual.lasers.power("green") == 0.25
+    taken = capture_set(real, known(virtual), tmp_path / "captures", patterns=2)
+    assert taken.captures == 3 and taken.saturated < 0.02
+    assert virtual.lasers.power("green") == 0
+
+
+def test_a_fixed_focus_is_not_asked_to_move() -> None:
+    virtual = fringed()
+    real = RealHeadset(virtual.panel, virtual.lasers, virtual.camera, {}, 6.0)
+    real.move_to_plane(6.0)
+    with pytest.raises(InputError, match="run of its own"):
+        real.move_to_plane(7.0)
+    focused = RealHeadset(virtual.panel, virtual.lasers, virtual.camera, {}, 6.0, virtual.move_to_plane)
+    focused.move_to_plane(7.0)
+    assert virtual.plane_mm == 7.0
+
+
+def test_a_real_headset_needs_a_description_of_its_bench(tmp_path: Path) -> None:
+    path = tmp_path / "headset.toml"
+    path.write_text(
+        'bundle = "bundle"\n[panel]\n[camera]\n[lasers]\nbus = "virtual:x"\npower = { green = 0.5 }\n'
+    )
+    with pytest.raises(InputError, match="--model"), open_bench(str(path)):
+        pass
+    with open_bench("virtual:mixed", 1) as opened:
+        assert opened.bench.panel.shape == (96, 128) == opened.headset.panel.shape
+        assert np.prod(SHAPE) < 96 * 128
