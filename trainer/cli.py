@@ -13,7 +13,7 @@ from contextlib import contextmanager, redirect_stdout, suppress
 from typing import NoReturn
 
 from firmware_iface.errors import InputError, nearest
-from trainer.commands import explaining, looping, making, registering, training
+from trainer.commands import explaining, looping, making, registering, starting, training
 from trainer.commands.command import PROGRAM, Command, Interrupted, release
 from trainer.commands.screen import Screen, one_line
 
@@ -40,7 +40,7 @@ class _Parser(ArgumentParser):
 
 def commands() -> list[Command]:
     """All commands, in the order in which they are used."""
-    parts = (explaining, training, looping, making, registering)
+    parts = (explaining, training, looping, making, starting, registering)
     return [command for part in parts for command in part.commands()]
 
 

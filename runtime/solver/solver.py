@@ -167,7 +167,6 @@ class Solver:
         if deadline_ms is not None and not self.step.known:
             self.rehearse(targets)
         begun = time.perf_counter()
-        self.follows = False
         phase = self.phases[0]
         optics_targets = self._aim(targets)
         if start is None:
@@ -184,7 +183,7 @@ class Solver:
         deadline_ms: float | None = None,
         motion: tuple[int, int] | None = None,
     ) -> Solution:
-        """`solve` for the next frame of a video, beginning with the pattern of the one before.
+        """`solve` for the next frame of a video, beginning with the pattern of the picture solved before.
 
         motion: how far content has moved since, (down, right) in pixels; none: found from the frames. The first
         frame and a new scene begin cold. One iteration is usually enough.
@@ -210,21 +209,18 @@ class Solver:
                     self.phases[0][part] = other[part]
         else:
             self._cold(optics_targets, self.phases[0])
-        self.before[...] = picture
-        self.follows = True
         return self._improve(targets, begun, iterations, deadline_ms, None)
 
     def rehearse(self, target: np.ndarray | None = None) -> None:
         """Measure how long the start, an iteration and the rounding take on this machine."""
         targets = self._checked(np.ones(self.shape) if target is None else target)
-        kept = self.best.copy() if self.follows else None
+        before, best, follows = self.before.copy(), self.best.copy(), self.follows
         for _ in range(2):  # the first touches memory for the first time and is not counted
             self.begin, self.step, self.finish = Pace(), Pace(), Pace()
             begun = time.perf_counter()
             self._cold(self._aim(targets), self.phases[0])
             self._improve(targets, begun, 3, None, None)
-        if kept is not None:
-            self.best[...] = kept
+        self.before, self.best[...], self.follows = before, best, follows
 
     def _improve(
         self,
@@ -235,6 +231,8 @@ class Solver:
         progress: Progress | None,
     ) -> Solution:
         """Steps from phases[0] until the budget is used up, and the solution from the best phase met."""
+        self.before[...] = targets[0, 0]
+        self.follows = True
         if iterations is None:
             iterations = ITERATIONS if deadline_ms is None else _ENDLESS
         if self.method is None:

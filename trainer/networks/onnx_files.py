@@ -65,10 +65,10 @@ def onnx_files(network: Approximator) -> dict[str, bytes]:
     joint = joint_gradient(network, tuple(adapters))
     arguments = (irradiance, target, *adapters.values())
     with _quiet():
-        forward = _saved(network, (irradiance,), ["irradiance"], ["corrected"])
+        forward = saved(network, (irradiance,), ["irradiance"], ["corrected"])
         graph = _traced(joint, arguments)
         names = ["loss", "corrected", "gradient", *(f"gradient.{name}" for name in adapters)]
-        gradient = _saved(graph, arguments, ["irradiance", "target", *adapters], names)
+        gradient = saved(graph, arguments, ["irradiance", "target", *adapters], names)
     return {APPROXIMATOR: forward, GRADIENT: gradient, ADAPTERS: safetensors.torch.save(adapters)}
 
 
@@ -101,7 +101,8 @@ def _traced(function: Callable[..., Any], arguments: tuple[Tensor, ...]) -> torc
     return graph
 
 
-def _saved(module: Any, arguments: tuple[Tensor, ...], inputs: list[str], outputs: list[str]) -> bytes:
+def saved(module: Any, arguments: tuple[Tensor, ...], inputs: list[str], outputs: list[str]) -> bytes:
+    """A module as ONNX for arguments of these sizes."""
     program = torch.onnx.export(
         module,
         arguments,
