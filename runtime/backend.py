@@ -21,6 +21,7 @@ Array = Any
 Strip = Callable[[int, slice], "tuple[float, ...] | None"]
 
 STRIP_BYTES = 1 << 19  # of one row buffer: a share of a core's second cache
+COLUMNS = 96  # of a column transform by one core
 BACKENDS = ("numpy", "cupy")
 
 
@@ -59,6 +60,19 @@ class Backend:
         """Unscaled DFT of each row of a strip, on the calling core alone."""
         fft.into(x, out, 1, forward, 1)
 
+    def through_columns(self, x: Array, multiply: Callable[[slice], None]) -> None:
+        """DFT of each column, `multiply` (which is told the columns), inverse DFT; in place and not scaled.
+
+        Some columns at a time, so that they are in a core's cache all the way.
+        """
+
+        def work(worker: int, columns: slice) -> None:
+            fft.into(x[:, columns], x[:, columns], 0, True, 1)
+            multiply(columns)
+            fft.into(x[:, columns], x[:, columns], 0, False, 1)
+
+        self.over_rows(x.shape[1], COLUMNS, work)
+
     def columns_fft(self, x: Array, forward: bool) -> None:
         """Unscaled DFT of each column, in place, on all cores."""
         fft.into(x, x, 0, forward, self.threads)
@@ -92,6 +106,11 @@ class CupyBackend(Backend):
 
     def columns_fft(self, x: Array, forward: bool) -> None:
         self._transform(x, x, 0, forward)
+
+    def through_columns(self, x: Array, multiply: Callable[[slice], None]) -> None:
+        self.columns_fft(x, True)
+        multiply(slice(0, x.shape[1]))
+        self.columns_fft(x, False)
 
     def _transform(self, x: Array, out: Array, axis: int, forward: bool) -> None:
         if forward:

@@ -84,10 +84,13 @@ class Optics:
     def forward(self, phase: Array, light: Array) -> None:
         """Fill `light` [H, W] from phase (rad) [H, W]; the fields are kept for `adjoint`."""
         image = light if self.image is None else self.image
-        self.panel.forward(phase)
+        self.panel.forward(phase, columns=not self.in_place)
         for mode in range(len(self.transfers)):
-            self._through_pupil(mode)
-            self.backend.columns_fft(self.spectrum, False)
+            if self.in_place:
+                self._through_columns(self.transfers[mode])
+            else:
+                self._through_pupil(mode)
+                self.backend.columns_fft(self.spectrum, False)
             self._onto_image(mode, image)
         if self.image is not None:
             self.backend.filter(image, self.filter, self.half_spectrum)
@@ -100,12 +103,12 @@ class Optics:
         the last `forward`.
         """
         self._back(slope)
-        self.panel.adjoint(phase, gradient)
+        self.panel.adjoint(phase, gradient, columns=not self.in_place)
 
     def adjoint_wave(self, slope: Array, wave: Array) -> None:
         """Fill `wave` [H, W] with the field that reaches the panel: that of `adjoint` before it becomes phase."""
         self._back(slope)
-        self.panel.field_from_spectrum(wave)
+        self.panel.field_from_spectrum(wave, columns=not self.in_place)
 
     def wave_at_panel(self, wave: Array) -> None:
         """A field at the image's pixels [H, W] to the one on the panel that it comes from, in place.
@@ -117,7 +120,7 @@ class Optics:
         self.fields[mode][self.at_pixels] = wave
         self._off_image(mode, None)
         self._back_through_pupil(mode, again=False)
-        self.panel.field_from_spectrum(wave)
+        self.panel.field_from_spectrum(wave, columns=not self.in_place)
 
     def _back(self, slope: Array) -> None:
         """2 slope z of every mode, back to the panel's spectrum."""
@@ -196,6 +199,18 @@ class Optics:
             self.backend.over_rows(len(fields), self.strip, work)
         self.spectrum[begin:] = 0
 
+    def _through_columns(self, transfer: Array) -> None:
+        """Where one buffer is both the panel's and the image's: along the columns, and through the pupil, at once."""
+        spectrum, xp = self.spectrum, self.backend.xp
+
+        def multiply(columns: slice) -> None:
+            for run in self.rows.runs:
+                part = spectrum[run.panel, columns]
+                xp.multiply(part, transfer[run.band, columns], out=part)
+            spectrum[self.rows.image_gap, columns] = 0
+
+        self.backend.through_columns(spectrum, multiply)
+
     def _through_pupil(self, mode: int) -> None:
         """The panel's spectrum times a transfer function, onto the image's DFT."""
         xp = self.backend.xp
@@ -217,6 +232,9 @@ class Optics:
 
     def _back_through_pupil(self, mode: int, again: bool) -> None:
         """Adjoint of columns' inverse DFT and `_through_pupil`; `again`: added to the panel's spectrum."""
+        if self.in_place:
+            self._through_columns(self.conjugates[mode])
+            return
         xp = self.backend.xp
         self.backend.columns_fft(self.spectrum, True)
         for run in self.panel.runs:

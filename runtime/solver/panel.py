@@ -42,12 +42,13 @@ class Panel:
         if self.crosstalk:  # in the band's own order, whose frequencies are each there once
             self.runs = tuple(Run(run.band, run.band, run.image, False) for run in rows.runs)
 
-    def forward(self, phase: Array) -> None:
-        """Fill `spectrum` from phase (rad) [H, W]."""
+    def forward(self, phase: Array, columns: bool = True) -> None:
+        """Fill `spectrum` from phase (rad) [H, W]; columns: transformed too, which a caller may do by itself."""
         mixing = self.crosstalk
         if mixing is None:
             self._rows_forward(phase, self.spectrum, None)
-            self.backend.columns_fft(self.spectrum, True)
+            if columns:
+                self.backend.columns_fft(self.spectrum, True)
             return
         self.spectrum[...] = 0
         for i, down in enumerate(mixing.down):
@@ -59,14 +60,15 @@ class Panel:
             for run in self.rows.runs:
                 self.spectrum[run.band] += mixing.columns[run.panel] * down[run.band]
 
-    def adjoint(self, phase: Array, gradient: Array) -> None:
+    def adjoint(self, phase: Array, gradient: Array, columns: bool = True) -> None:
         """Gradient of a loss over phase [H, W], from its gradient over `spectrum`, which is used up.
 
-        `phase` is that of the last `forward`.
+        `phase` is that of the last `forward`; columns: as there.
         """
         mixing = self.crosstalk
         if mixing is None:
-            self.backend.columns_fft(self.spectrum, False)
+            if columns:
+                self.backend.columns_fft(self.spectrum, False)
             self._rows_adjoint(phase, self.spectrum, None, gradient)
             return
         gradient[...] = 0
@@ -82,18 +84,19 @@ class Panel:
                 mixing.unmix_across(mixing.one, j, mixing.back)
             mixing.unmix_down(mixing.back, i, gradient)
 
-    def field_from_spectrum(self, field: Array) -> None:
+    def field_from_spectrum(self, field: Array, columns: bool = True) -> None:
         """Adjoint of the way from a field on the panel [H, W] (crosstalk aside) to `spectrum`, which is used up."""
-        columns = self.spectrum
+        spectrum = self.spectrum
         if self.crosstalk:
-            columns = self.crosstalk.columns
-            columns[...] = 0
+            spectrum = self.crosstalk.columns
+            spectrum[...] = 0
             for run in self.rows.runs:
-                columns[run.panel] += self.spectrum[run.band]
-        self.backend.columns_fft(columns, False)
+                spectrum[run.panel] += self.spectrum[run.band]
+        if columns:
+            self.backend.columns_fft(spectrum, False)
 
         def work(worker: int, rows: slice) -> None:
-            field[rows] = self._row_back(worker, rows, columns, None)
+            field[rows] = self._row_back(worker, rows, spectrum, None)
 
         self.backend.over_rows(self.shape[0], self.strip, work)
 
