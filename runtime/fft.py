@@ -52,14 +52,15 @@ def has_ducc() -> bool:
     return _ducc is not None
 
 
-def into(x: np.ndarray, out: np.ndarray, axis: int, forward: bool, threads: int) -> None:
-    """DFT of complex `x` [n, m] along an axis, written to `out` (which may be x); neither way is scaled."""
+def into(x: np.ndarray, out: np.ndarray, axes: int | tuple[int, ...], forward: bool, threads: int) -> None:
+    """DFT of complex `x` [n, m] along axes, written to `out` (which may be x); neither way is scaled."""
+    over = (axes,) if isinstance(axes, int) else axes
     if _ducc is not None:
-        _ducc.c2c(x, axes=(axis,), forward=forward, out=out, nthreads=threads)
+        _ducc.c2c(x, axes=over, forward=forward, out=out, nthreads=threads)
     elif forward:  # pragma: no cover
-        out[...] = _scipy.fft(x, axis=axis, overwrite_x=x is out, workers=threads)
+        out[...] = _scipy.fftn(x, axes=over, overwrite_x=x is out, workers=threads)
     else:  # pragma: no cover
-        out[...] = _scipy.ifft(x, axis=axis, norm="forward", overwrite_x=x is out, workers=threads)
+        out[...] = _scipy.ifftn(x, axes=over, norm="forward", overwrite_x=x is out, workers=threads)
 
 
 def filter_into(image: np.ndarray, transfer: np.ndarray, spectrum: np.ndarray, threads: int) -> None:

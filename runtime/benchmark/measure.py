@@ -57,7 +57,7 @@ def measure(
     first = next(iter(pictures.values()))
     solver = Solver(path)
     solver.rehearse(first)
-    floor, iteration = _against_ffts(solver, first)
+    floor, parts, iteration = _against_ffts(solver, first)
     cold = _median(lambda: solver.solve(first, 0))
     told(0.1, "convergence")
     curves, final, pace = _convergence(path, pictures, lambda done, what: told(0.1 + 0.6 * done, what))
@@ -71,7 +71,7 @@ def measure(
     for shape in shapes[1:]:
         smaller = Solver(_path(shape))
         smaller.rehearse(picture(PICTURES[0], shape))
-        _, each = _against_ffts(smaller, picture(PICTURES[0], shape))
+        *_, each = _against_ffts(smaller, picture(PICTURES[0], shape))
         scaling.append({"pixels": int(np.prod(shape)), "iteration_ms": _ms(each)})
     by_ms = {name: _by_ms(curves[name], *pace[name]) for name in curves}
     told(1, "done")
@@ -81,6 +81,8 @@ def measure(
         "fft_floor_ms": _ms(floor),
         "iteration_ms": _ms(iteration),
         "iteration_over_floor": round(iteration / floor, 3),
+        "pruned_fft_ms": _ms(parts),
+        "iteration_over_pruned_fft": round(iteration / parts, 3),
         "cold_start_over_iteration": round(cold / iteration, 3),
         "psnr_by_iteration": {name: [round(v, 3) for v in curve] for name, curve in curves.items()},
         "psnr_by_ms": by_ms,
@@ -126,38 +128,39 @@ def _path(shape: tuple[int, int]) -> LightPath:
     return single(ideal_path(shape, PITCH, WAVELENGTH, DISTANCE * shape[0] / SHAPES[0][0], IRIS))
 
 
-def _against_ffts(solver: Solver, target: np.ndarray) -> tuple[float, float]:
-    """Median ms of an iteration's transforms alone, and of an iteration, measured in turns."""
-    path = solver.stacks[0][0]
-    rows = np.ones((path.grid.shape[0], path.grid.padded[1]), np.complex64)
-    columns = np.ones((path.grid.padded[0], 2 * path.grid.band[1] + 1), np.complex64)
+def _against_ffts(solver: Solver, target: np.ndarray) -> tuple[float, float, float]:
+    """Median ms, measured in turns, of an iteration's four transforms alone, of what it makes of them, and of itself.
+
+    First as whole two-dimensional transforms of the padded grid, then as the rows and columns that the iteration
+    does not leave out.
+    """
+    grid = solver.stacks[0][0].grid
+    whole = np.zeros(grid.padded, np.complex64)
+    rows = np.zeros((grid.shape[0], grid.padded[1]), np.complex64)
+    columns = np.zeros((grid.padded[0], 2 * grid.band[1] + 1), np.complex64)
     solver.solve(target, 1)
     phase, following = solver.phases[0], solver.phases[1]
 
-    def transforms() -> None:
+    def whole_transforms() -> None:
+        for forward in (True, False, True, False):
+            fft.into(whole, whole, (0, 1), forward, fft.THREADS)
+
+    def part_transforms() -> None:
         for forward in (True, False, True, False):
             fft.into(rows, rows, 1, forward, fft.THREADS)
             fft.into(columns, columns, 0, forward, fft.THREADS)
-            rows.fill(1)  # four unscaled transforms would grow without end
-            columns.fill(1)
-
-    def fills() -> None:
-        for _ in range(4):
-            rows.fill(1)
-            columns.fill(1)
 
     def iteration() -> None:
         solver.objective.look(phase)
         assert solver.method is not None
         solver.method.step(phase, following)
 
-    floors: list[float] = []
-    fillings: list[float] = []
-    iterations: list[float] = []
+    runs = (whole_transforms, part_transforms, iteration)
+    times: list[list[float]] = [[], [], []]
     for _ in range(ROUNDS):
-        for kept, run in ((floors, transforms), (fillings, fills), (iterations, iteration)):
+        for kept, run in zip(times, runs, strict=True):
             kept.append(_timed(run))
-    return statistics.median(floors) - statistics.median(fillings), statistics.median(iterations)
+    return statistics.median(times[0]), statistics.median(times[1]), statistics.median(times[2])
 
 
 def _convergence(

@@ -32,7 +32,7 @@ class Panel:
         self.leak = None if path.leak is None else xp.asarray(path.leak)
         self.strip = min(backend.strip_rows(grid.padded[1]), height)
         room = (self.strip, grid.padded[1])
-        self.field = [xp.zeros(room, pair) for _ in range(backend.threads)]  # dark beyond the panel
+        self.lit = xp.zeros((height, grid.padded[1]), pair)  # source exp(j phase); dark beyond the panel
         self.row = [xp.zeros(room, pair) for _ in range(backend.threads)]
         self.part = [xp.empty((self.strip, width), real) for _ in range(backend.threads)]
         self.crosstalk = None if path.crosstalk is None else Crosstalk(path, rows, columns, backend)
@@ -69,7 +69,7 @@ class Panel:
         if mixing is None:
             if columns:
                 self.backend.columns_fft(self.spectrum, False)
-            self._rows_adjoint(phase, self.spectrum, None, gradient)
+            self._rows_adjoint(self.spectrum, None, gradient)
             return
         gradient[...] = 0
         for i, down in enumerate(mixing.down):
@@ -80,7 +80,8 @@ class Panel:
             self.backend.columns_fft(mixing.columns, False)
             mixing.back[...] = 0
             for j, across in enumerate(mixing.across):
-                self._rows_adjoint(mixing.mix_across(mixed, j), mixing.columns, across, mixing.one)
+                self._light_all(mixing.mix_across(mixed, j))
+                self._rows_adjoint(mixing.columns, across, mixing.one)
                 mixing.unmix_across(mixing.one, j, mixing.back)
             mixing.unmix_down(mixing.back, i, gradient)
 
@@ -100,31 +101,36 @@ class Panel:
 
         self.backend.over_rows(self.shape[0], self.strip, work)
 
-    def _lit(self, worker: int, rows: slice, phase: Array) -> Array:
-        """source exp(j phase) in a strip's room: cosine and sine apart cost a fraction of a complex exponential.
+    def _light_all(self, phase: Array) -> None:
+        def work(worker: int, rows: slice) -> None:
+            self._light(worker, rows, phase)
 
-        It is computed again for the adjoint, which is quicker than to keep it in memory.
-        """
-        xp, count = self.backend.xp, rows.stop - rows.start
-        lit, part = self.field[worker][:count, : self.shape[1]], self.part[worker][:count]
+        self.backend.over_rows(self.shape[0], self.strip, work)
+
+    def _light(self, worker: int, rows: slice, phase: Array) -> None:
+        """source exp(j phase): cosine and sine apart cost a fraction of a complex exponential."""
+        xp = self.backend.xp
+        lit, part = self.lit[rows, : self.shape[1]], self.part[worker][: rows.stop - rows.start]
         xp.cos(phase[rows], out=part)
         lit.real[...] = part
         xp.sin(phase[rows], out=part)
         lit.imag[...] = part
         if self.source is not None:
             lit *= self.source[rows]
-        return lit
 
     def _rows_forward(self, phase: Array, spectrum: Array, turned: Array | None) -> None:
         """Spectra of the rows, the band's columns of them; `turned` [columns]: times this, added."""
-        height = self.shape[0]
+        height, width = self.shape
 
         def work(worker: int, rows: slice) -> None:
-            lit, count = self._lit(worker, rows, phase), rows.stop - rows.start
-            if self.leak is not None:
-                lit += self.leak[rows]
-            row = self.row[worker][:count]
-            self.backend.rows_fft(self.field[worker][:count], row, True)
+            self._light(worker, rows, phase)
+            row = self.row[worker][: rows.stop - rows.start]
+            if self.leak is None:
+                self.backend.rows_fft(self.lit[rows], row, True)
+            else:
+                row[:, width:] = 0
+                self.backend.xp.add(self.lit[rows, :width], self.leak[rows], out=row[:, :width])
+                self.backend.rows_fft(row, row, True)
             for run in self.columns.runs:
                 if turned is None:
                     spectrum[rows, run.band] = row[:, run.panel]
@@ -149,15 +155,14 @@ class Panel:
         self.backend.rows_fft(row, row, False)
         return row[:, : self.shape[1]]
 
-    def _rows_adjoint(self, phase: Array, spectrum: Array, turned: Array | None, gradient: Array) -> None:
-        """Seed eq. 22-23, Re(-j exp(-j phase) ...), with the field that lights the panel in it."""
+    def _rows_adjoint(self, spectrum: Array, turned: Array | None, gradient: Array) -> None:
+        """Seed eq. 22-23, Re(-j exp(-j phase) ...), with the field that lights the panel, `lit`, in it."""
         xp = self.backend.xp
 
         def work(worker: int, rows: slice) -> None:
             row = self._row_back(worker, rows, spectrum, turned)
-            lit = self._lit(worker, rows, phase)
-            xp.conjugate(lit, out=lit)
-            lit *= row
-            gradient[rows] = lit.imag
+            xp.conjugate(row, out=row)
+            row *= self.lit[rows, : self.shape[1]]
+            xp.negative(row.imag, out=gradient[rows])
 
         self.backend.over_rows(self.shape[0], self.strip, work)
