@@ -19,6 +19,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from firmware_iface.errors import DeviceError, InputError, nearest
+from runtime import doctor
 from runtime.benchmark import command as benchmark
 from runtime.calibration import command as calibration
 from runtime.refinement import command as refinement
@@ -202,6 +203,15 @@ def _parser() -> ArgumentParser:
     )
     service.add_options(serve)
     serve.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
+    devices = parts.add_parser(
+        "devices",
+        help="say what is attached, what is wrong and what to do",
+        description=doctor.ABOUT,
+        formatter_class=RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    doctor.arguments(devices)
+    devices.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
     measure = parts.add_parser(
         "benchmark",
         help="measure the solver on this machine",
@@ -327,6 +337,7 @@ COMMANDS = {
     "calibrate": (calibration.run, calibration.show),
     "refine": (refinement.run, refinement.show),
     "serve": (service.run_serve, service.show_serve),
+    "devices": (doctor.run, doctor.show),
     "benchmark": (benchmark.run, benchmark.show),
 }
 

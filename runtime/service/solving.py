@@ -5,13 +5,15 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from firmware_iface.assembled import mrad_per_pixel
 from firmware_iface.errors import InputError
 from firmware_iface.lasers.eye_safety import spot_shares
-from runtime.bundle import read_bundle
+from runtime.approximator import approximator_of
+from runtime.bundle import INITIALISER, read_bundle
 from runtime.calibrated import bundle_channels, load_light_path
 from runtime.lightpath import LightPath
 from runtime.service.configuration import Configuration
@@ -37,13 +39,14 @@ class PatternSolver:
     """Solves for one light path, frame after frame.
 
     mrad_per_pixel : angle of a pixel at the eye, where the light of each pattern is to be predicted; 0: it is not
+    options : of `Solver`
     shape : (1, H, W)
     """
 
-    def __init__(self, path: LightPath, mrad_per_pixel: float = 0.0) -> None:
+    def __init__(self, path: LightPath, mrad_per_pixel: float = 0.0, **options: Any) -> None:
         self.shape = (1, *path.grid.shape)
         self._path, self._mrad = path, mrad_per_pixel
-        self._solver = Solver(path)
+        self._solver = Solver(path, **options)
 
     def patterns(self, target: np.ndarray, deadline_ns: int) -> Iterator[Pattern]:
         """Ever better patterns for a target irradiance [1, H, W]; the last one by the deadline (monotonic, ns).
@@ -72,10 +75,24 @@ class PatternSolver:
 def open_solver(configuration: Configuration) -> PatternSolver:
     """The solver for a configuration's bundle and colour. Raises InputError where they do not fit."""
     bundle = read_bundle(configuration.bundle)
+    channels = bundle_channels(bundle)
     channel = configuration.timing.channel or None
-    if channel is None and len(bundle_channels(bundle)) > 1:
+    if channel is None and len(channels) > 1:
         raise InputError(
             f'{configuration.bundle} has several colours and one is shown: write channel = "NAME" in [service], '
-            f"one of {', '.join(bundle_channels(bundle))}"
+            f"one of {', '.join(channels)}"
         )
-    return PatternSolver(load_light_path(bundle, channel), mrad_per_pixel(configuration.devices["lasers"]))
+    path = load_light_path(bundle, channel)
+    approximator = approximator_of(bundle, (len(channels), *path.grid.shape))
+    if approximator is not None and len(channels) > 1:
+        raise InputError(
+            f"{configuration.bundle} has an approximator that sees {len(channels)} colours and one is shown: "
+            "export a bundle of that colour alone"
+        )
+    return PatternSolver(
+        path,
+        mrad_per_pixel(configuration.devices["lasers"]),
+        grid="panel",  # by a deadline the finer grid buys less than the iterations that it costs
+        approximator=approximator,
+        initialiser=bundle.networks.get(INITIALISER),
+    )

@@ -27,7 +27,7 @@ from runtime.service.loop import Loop
 from runtime.service.messages import ProtocolError
 from runtime.service.metrics import Metrics
 from runtime.service.pipeline import Pipeline
-from runtime.service.protocol import Code, Done, Error, Part
+from runtime.service.protocol import Code, Done, Error, Lasers, Part
 from runtime.service.sessions import RequestError, Session
 from runtime.service.systemd import Notifier, passed_socket
 
@@ -56,6 +56,7 @@ class Supervisor:
         self.sessions: set[Session] = set()
         self.turned_ns = time.monotonic_ns()
         self.fed_ns = 0
+        self.told: Lasers | None = None
         self.stopping = False
 
     def run(self) -> None:
@@ -93,6 +94,7 @@ class Supervisor:
         for session in waited:
             self.pipeline.give_frame(session, now)
         self._feed_watchdog(now)
+        self._publish()
         self.loop.turn(TURN_WAITED_S if waited else TURN_S)
         for session in [s for s in self.sessions if s.closed]:
             self._leave(session)
@@ -106,6 +108,14 @@ class Supervisor:
         self.fed_ns = now
         if all(now - loop.turned_ns < LOOPS_NS for loop in loops):
             self.notifier.alive()
+
+    def _publish(self) -> None:
+        """The lasers' state and power, for metrics."""
+        if self.lighting.state != self.told:
+            self.told = self.lighting.state
+            self.metrics.lasers(self.told)
+        for channel, power in self.lighting.level.items():
+            self.metrics.laser_power.labels(channel).set(power)
 
     def _stop(self) -> None:
         self.stopping = True

@@ -1,0 +1,251 @@
+"""`hololoop-runtime devices`: what is attached, what answers, what is wrong, and what to do about it."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import textwrap
+from argparse import ArgumentParser, Namespace
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from firmware_iface.assembled import open_camera, open_lasers, open_panel
+from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
+from runtime.service.configuration import Configuration, read_configuration
+
+ABOUT = """Say what is attached, what answers, what is wrong, and what to do.
+
+Without CONFIG: what this host has, USB devices that hololoop knows, I2C buses, cameras. With CONFIG, the headset's
+TOML file (see hololoop-runtime serve --help): each of its devices is opened and asked, with the lasers dark. Where
+its service runs, which holds the devices, the service is asked instead.
+
+examples:
+  hololoop-runtime devices
+  hololoop-runtime devices headset.toml"""
+
+KNOWN_USB = {
+    (0x1209, 0x0001): "panel board",
+    (0x0451, 0xC900): "DLPC900 phase light modulator",
+    (0x03E7, 0x2485): "OAK camera, not booted",
+    (0x03E7, 0xF63B): "OAK camera, booted",
+}
+SATURATED, TOO_MANY = 0.99, 0.02  # of full scale; of the pixels
+NEEDED = {  # what the safety controller needs to hold before anything can be armed, without this program's own share
+    "key": "the key is off: turn it on",
+    "interlock": "the interlock is open: close it",
+    "dark": "the DAC is not dark: switch the laser board off and on",
+    "cool": "the lasers are too hot: let them cool down",
+    "quiet": "a photodiode sees too much light: find its source",
+    "ceilings": "the ceilings are not written: switch the laser board off and on",
+}
+
+
+@dataclass
+class Finding:
+    """One device, and how it is.
+
+    part : panel, lasers, camera, bundle, service, usb, i2c. problems : each a sentence with what to do
+    """
+
+    part: str
+    what: str
+    attached: bool = True
+    answers: bool = True
+    status: dict[str, Any] = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+
+
+def arguments(parser: ArgumentParser) -> None:
+    """The options of `devices`."""
+    parser.add_argument("config", metavar="CONFIG", type=Path, nargs="?", help="the headset's TOML file")
+
+
+def run(args: Namespace) -> dict[str, Any]:
+    """Look at everything; returns what `--json` prints."""
+    found = host() if args.config is None else headset(read_configuration(args.config))
+    return {
+        "devices": [asdict(finding) for finding in found],
+        "problems": sum(len(finding.problems) for finding in found),
+        "ready": all(finding.answers and not finding.problems for finding in found),
+    }
+
+
+def show(result: dict[str, Any]) -> None:
+    """A line a device, and under it what is wrong."""
+    for found in result["devices"]:
+        state = "answers" if found["answers"] else "does not answer" if found["attached"] else "not there"
+        mark = "ok" if found["answers"] and not found["problems"] else "!!"
+        print(f"{mark}  {found['part']:8} {found['what']}: {state}")
+        told = (f"{name} {_plain(value)}" for name, value in found["status"].items())
+        for line in textwrap.wrap("; ".join(told), 110):
+            print(f"      {line}")
+        for problem in found["problems"]:
+            print(f"    - {problem}")
+    print("everything is well" if result["ready"] else f"to be mended: {result['problems']}")
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_plain(one)}" for name, one in value.items())
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list):
+        return ", ".join(map(str, value)) or "none"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def host() -> list[Finding]:
+    """What this host has, without opening any of it."""
+    return [*_usb(), *_i2c(), _camera_library()]
+
+
+def headset(configuration: Configuration) -> list[Finding]:
+    """The devices of a configuration, or its service where that runs."""
+    if (service := _service(configuration)) is not None:
+        return [service]
+    bundle, shape = _bundle(configuration)
+    found = [bundle, _panel(configuration.devices["panel"], shape), _lasers(configuration.devices["lasers"])]
+    if "camera" in configuration.devices:
+        found.append(_camera(configuration.devices["camera"]))
+    return found
+
+
+def _usb() -> list[Finding]:
+    import usb.core
+
+    try:
+        devices = list(usb.core.find(find_all=True) or [])
+    except usb.core.NoBackendError:
+        problem = "libusb is not installed, so no USB device can be opened: install libusb-1.0"
+        return [Finding("usb", "the host's USB", answers=False, problems=[problem])]
+    except usb.core.USBError as error:
+        problem = f"USB cannot be looked at ({error.strerror}): check /dev/bus/usb and its rights"
+        return [Finding("usb", "the host's USB", answers=False, problems=[problem])]
+    known = [(KNOWN_USB.get((d.idVendor, d.idProduct)), d) for d in devices]
+    found = [
+        Finding("usb", f"{name}, {d.idVendor:04x}:{d.idProduct:04x}, bus {d.bus} address {d.address}")
+        for name, d in known
+        if name
+    ]
+    nothing = f"{len(devices)} devices, none that hololoop knows"
+    return found or [Finding("usb", nothing, attached=False, answers=False)]
+
+
+def _i2c() -> list[Finding]:
+    buses = sorted(Path("/dev").glob("i2c-*"))
+    if not buses:
+        problem = "there is no /dev/i2c-*: load the module i2c-dev, and enable the host's I2C"
+        return [Finding("i2c", "the host's I2C", attached=False, answers=False, problems=[problem])]
+    found = []
+    for bus in buses:
+        allowed = os.access(bus, os.R_OK | os.W_OK)
+        problems = [] if allowed else [f"this user may not open {bus}: add it to the group i2c"]
+        found.append(Finding("i2c", str(bus), answers=allowed, problems=problems))
+    return found
+
+
+def _camera_library() -> Finding:
+    there = importlib.util.find_spec("depthai") is not None
+    problems = [] if there else ["depthai is not installed: pip install 'hololoop[camera]' for an OAK camera"]
+    return Finding("camera", "depthai, the library of OAK cameras", there, there, problems=problems)
+
+
+def _service(configuration: Configuration) -> Finding | None:
+    from runtime.service.client import connect
+    from runtime.service.protocol import Lasers, Part
+
+    try:
+        with connect(configuration.socket, timeout_s=2.0) as client:
+            state = client.status()
+    except (InputError, OSError):
+        return None
+    parts = {"panel": Part(state.panel), "solver": Part(state.solver), "camera": Part(state.camera)}
+    problems = [
+        f"the service has no sign of life of the {name} ({part.name.lower()}): its log says why"
+        for name, part in parts.items()
+        if part not in (Part.FRESH, Part.ABSENT)
+    ]
+    if state.lasers in (Lasers.FAULT, Lasers.LOST):
+        problems.append(
+            f"lasers: {Lasers(state.lasers).name.lower()}; find the cause in the log, clear and arm"
+        )
+    status: dict[str, Any] = {name: part.name.lower() for name, part in parts.items()}
+    status |= {"lasers": Lasers(state.lasers).name.lower(), "shown": state.shown, "late": state.late}
+    status |= {"failed": state.failed, "faults": state.faults}
+    return Finding("service", f"the service at {configuration.socket}", status=status, problems=problems)
+
+
+def _bundle(configuration: Configuration) -> tuple[Finding, tuple[int, ...] | None]:
+    from runtime.service.solving import open_solver
+
+    found = Finding("bundle", str(configuration.bundle))
+    try:
+        shape = open_solver(configuration).shape[1:]
+    except InputError as error:
+        found.attached, found.answers = configuration.bundle.is_dir(), False
+        found.problems.append(str(error))
+        return found, None
+    found.status["shape"] = list(shape)
+    return found, shape
+
+
+def _opened(found: Finding, opening: Callable[[], Any], look: Callable[[Any], None]) -> Finding:
+    """Open a device and look at it; what it raises is what is wrong."""
+    try:
+        with closing(opening()) as device:
+            found.status |= device.status()
+            look(device)
+    except (DeviceError, InputError, OSError) as error:
+        found.answers = False
+        found.attached = not isinstance(error, DeviceGoneError)
+        found.problems.append(str(error))
+    return found
+
+
+def _panel(table: dict[str, Any], shape: tuple[int, ...] | None) -> Finding:
+    found = Finding("panel", f"{table.get('kind', 'board')} at {table.get('bus', 'usb')}")
+
+    def look(panel: Any) -> None:
+        found.problems += [
+            f"the panel reports: {fault}; check it" for fault in found.status.get("faults", [])
+        ]
+        if shape is not None and tuple(panel.shape) != tuple(shape):
+            found.problems.append(
+                f"the panel is {panel.shape} and the bundle is for {shape}: export its own bundle"
+            )
+
+    return _opened(found, lambda: open_panel(table), look)
+
+
+def _lasers(table: dict[str, Any]) -> Finding:
+    found = Finding("lasers", f"laser board at {table.get('bus')}")
+
+    def look(lasers: Any) -> None:
+        holds = found.status["holds"]
+        found.problems += [problem for name, problem in NEEDED.items() if not holds.get(name, True)]
+        if found.status["faults"]:
+            latched = ", ".join(found.status["faults"])
+            found.problems.append(
+                f"latched: {latched}; find the cause, then clear and arm through the service"
+            )
+
+    return _opened(found, lambda: open_lasers(table), look)
+
+
+def _camera(table: dict[str, Any]) -> Finding:
+    found = Finding("camera", f"{table.get('kind', 'oak')} at {table.get('address') or table.get('bus', '')}")
+
+    def look(camera: Any) -> None:
+        counts = camera.capture()
+        full = 2**camera.bit_depth - 1
+        found.status |= {"shape": list(counts.shape), "mean_counts": round(float(counts.mean()), 1)}
+        share = float((counts >= SATURATED * full).mean())
+        if share > TOO_MANY:
+            found.problems.append(
+                f"{100 * share:.0f} % of the pixels are saturated with the lasers dark: shade it, or expose less"
+            )
+
+    return _opened(found, lambda: open_camera(table), look)
