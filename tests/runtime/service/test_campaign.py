@@ -2,44 +2,17 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 
-from tests.campaigns.faults import plans
-from tests.campaigns.headset import ENVIRONMENT
+from tests.campaigns.faults import campaign, plans, summary
 from tests.campaigns.kinds import KINDS
 from tests.campaigns.soak import soak
-
-ROOT = Path(__file__).resolve().parents[3]
 
 
 def test_every_kind_of_fault_is_survived() -> None:
     """Dark where that is demanded, nothing torn, nothing lost without a word, and back again."""
-    done = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "tests.campaigns.faults",
-            "--count",
-            "68",
-            "--seed",
-            "7",
-            "--headsets",
-            "2",
-            "--json",
-        ],
-        cwd=ROOT,
-        env=ENVIRONMENT,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    found = json.loads(done.stdout)
+    result = campaign(count=68, seed=7, lanes=2, oak=False)
+    found = summary(result)
     assert list(found) == [
         "faults",
         "by_kind",
@@ -51,7 +24,7 @@ def test_every_kind_of_fault_is_survived() -> None:
         "recovered",
         "not_recovered",
     ]
-    assert found["faults"] == found["recovered"] == sum(found["by_kind"].values()) == 68, done.stderr
+    assert found["faults"] == found["recovered"] == sum(found["by_kind"].values()) == 68, result.troubles
     assert set(found["by_kind"]) == {kind.name for kind in KINDS}
     assert found["torn_frames"] == found["lost_without_error"] == found["not_recovered"] == 0
     assert found["dark_required"] > 30

@@ -21,7 +21,7 @@ def scraped(metrics: Metrics) -> dict[tuple[str, ...], float]:
     metrics.serve(port)
     text = urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10).read().decode()
     return {
-        (sample.name, *sample.labels.values()): sample.value
+        (sample.name, *sorted(sample.labels.values())): sample.value
         for family in text_string_to_metric_families(text)
         for sample in family.samples
     }
@@ -47,8 +47,8 @@ def test_what_happened_is_read_over_http(capsys: pytest.CaptureFixture[str]) -> 
     assert {stage: found["hololoop_frame_stage_seconds_count", stage] for stage in STAGES} == {
         stage: float(stage == "solve") for stage in STAGES
     }
-    assert found["hololoop_frame_stage_seconds_bucket", "solve", "0.002"] == 0
-    assert found["hololoop_frame_stage_seconds_bucket", "solve", "0.004"] == 1
+    assert found["hololoop_frame_stage_seconds_bucket", "0.002", "solve"] == 0
+    assert found["hololoop_frame_stage_seconds_bucket", "0.004", "solve"] == 1
 
 
 def test_a_port_that_is_taken_is_a_sentence() -> None:
