@@ -20,6 +20,7 @@ import numpy as np
 
 from firmware_iface.errors import DeviceError, InputError, nearest
 from runtime import doctor
+from runtime import show as showing
 from runtime.benchmark import command as benchmark
 from runtime.calibration import command as calibration
 from runtime.refinement import command as refinement
@@ -32,6 +33,7 @@ ABOUT = """Compute the patterns that look right through a calibrated bench.
 
 The usual way:
   hololoop-runtime solve bundle/ picture.png --out pattern.png
+  hololoop-runtime show pattern.png --headset headset.toml --out seen/
 
 A bundle comes from the workstation: hololoop-trainer export --model model.toml --out bundle/"""
 
@@ -194,6 +196,15 @@ def _parser() -> ArgumentParser:
     refine.add_argument(
         "--json", action="store_true", help="print one JSON object on stdout and nothing else"
     )
+    look = parts.add_parser(
+        "show",
+        help="show patterns on a headset and save what its camera sees",
+        description=showing.ABOUT,
+        formatter_class=RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    showing.arguments(look)
+    look.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
     serve = parts.add_parser(
         "serve",
         help="run the headset's service",
@@ -334,6 +345,7 @@ def show_solve(result: dict[str, Any]) -> None:
 
 COMMANDS = {
     "solve": (run_solve, show_solve),
+    "show": (showing.run, showing.show),
     "calibrate": (calibration.run, calibration.show),
     "refine": (refinement.run, refinement.show),
     "serve": (service.run_serve, service.show_serve),

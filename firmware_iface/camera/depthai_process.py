@@ -20,6 +20,8 @@ from .pipe import Frame, frame_message, state_message
 
 LOST, STARVED, FAILED = 11, 12, 13  # exit codes
 
+FIRST_S = 5.0  # a sensor takes its time to start
+
 _ENVIRONMENT = {  # read by the library when it is loaded
     "DEPTHAI_TELEMETRY": "0",
     "DEPTHAI_RECONNECT_TIMEOUT": "0",
@@ -99,6 +101,7 @@ class _Child:
         control = camera.inputControl.createInputQueue()
         pipeline.start()
         last, told = time.monotonic(), 0.0
+        patience_s = max(job["starved_s"], FIRST_S)
         while True:
             if self._orders():
                 order = dai.CameraControl()
@@ -112,8 +115,8 @@ class _Child:
             now = time.monotonic()
             if image is not None:
                 self._write(frame_message(_frame(image)))
-                last = now
-            elif now - last > job["starved_s"] + self._exposure_us * 2e-6:
+                last, patience_s = now, job["starved_s"]
+            elif now - last > patience_s + self._exposure_us * 2e-6:
                 self.tell("no frames came")
                 os._exit(STARVED)  # without closing: the library may hang in it
             if now - told > 0.2:

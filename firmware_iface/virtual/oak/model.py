@@ -10,7 +10,9 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -186,24 +188,43 @@ class OakModel:
         if source is None:
             return
         number = 0
-        while link.alive:
-            exposure_ms, gain = self.exposure_ms, self.gain
-            begin = time.monotonic()
-            counts = self._expose(exposure_ms, gain)
-            self._sleep_until(begin + exposure_ms / 1000)
-            frame = _frame_message(counts, source, number, begin + exposure_ms / 1000, exposure_ms, gain)
-            fault = self.faults.take("hang", "timeout", "late", "garbage", "short_write")
-            if fault == "late":
-                self._sleep_until(time.monotonic() + self.faults.late_s)
-            elif fault == "garbage":
-                frame = self.faults.garbled(frame)
-            elif fault == "short_write":
-                frame = frame[: len(frame) // 2]
-            if fault not in ("hang", "timeout"):
-                link.send(stream, frame)
-                number += 1
-                self.frames += 1
-            self._sleep_until(begin + self._period_s)
+        taken: _Taken | None = None
+        coming: Future[_Taken] | None = None
+        with ThreadPoolExecutor(1, "oak exposure") as sensor:
+            while link.alive:
+                begin = time.monotonic()
+                coming = coming or sensor.submit(self._take)
+                wait([coming], max(self._period_s, self.exposure_ms / 1000))
+                if coming.done():
+                    taken, coming = coming.result(), None
+                # a bench that takes longer than a frame to compute must not silence the stream: meanwhile the
+                # frame before is sent again, with the time at which it was exposed
+                if taken is not None and self._send(link, stream, _frame_message(taken, source, number)):
+                    number += 1
+                self._sleep_until(begin + self._period_s)
+
+    def _send(self, link: Link, stream: int, frame: bytes) -> bool:
+        """Send a frame as the faults say; whether it was sent."""
+        fault = self.faults.take("hang", "timeout", "late", "garbage", "short_write")
+        if fault in ("hang", "timeout"):
+            return False
+        if fault == "late":
+            self._sleep_until(time.monotonic() + self.faults.late_s)
+        elif fault == "garbage":
+            frame = self.faults.garbled(frame)
+        elif fault == "short_write":
+            frame = frame[: len(frame) // 2]
+        link.send(stream, frame)
+        self.frames += 1
+        return True
+
+    def _take(self) -> _Taken:
+        """One exposure: what is there when it begins, at the time when it ends."""
+        exposure_ms, gain = self.exposure_ms, self.gain
+        end_s = time.monotonic() + exposure_ms / 1000
+        counts = self._expose(exposure_ms, gain)
+        self._sleep_until(end_s)
+        return _Taken(counts, end_s, exposure_ms, gain)
 
     def _sleep_until(self, moment: float) -> None:
         self._closed.wait(max(0, moment - time.monotonic()))
@@ -230,18 +251,25 @@ def pack_raw10(counts: NDArray[np.uint16]) -> bytes:
     return out.tobytes()
 
 
-def _frame_message(
-    counts: NDArray[np.uint16], source: str, number: int, end_s: float, exposure_ms: float, gain: float
-) -> bytes:
+@dataclass(frozen=True)
+class _Taken:
+    counts: NDArray[np.uint16]
+    end_s: float
+    exposure_ms: float
+    gain: float
+
+
+def _frame_message(taken: _Taken, source: str, number: int) -> bytes:
+    counts = taken.counts
     height, width = counts.shape
     if source == "raw":
         data, stride, kind = pack_raw10(counts), width * 10 // 8, _RAW10
     else:
         data, stride, kind = (counts >> 2).astype(np.uint8).tobytes(), width, _GRAY8
-    second, nanosecond = divmod(int(end_s * 1e9), 10**9)
+    second, nanosecond = divmod(int(taken.end_s * 1e9), 10**9)
     moment = (second, nanosecond)
     form = (Unsigned(kind), Unsigned(width), Unsigned(height), Unsigned(stride), Unsigned(1), 0, 0, 0)
-    settings = (round(exposure_ms * 1000), round(gain * 100), 0, 0, 0.0, 0, -1, -1.0, None)
+    settings = (round(taken.exposure_ms * 1000), round(taken.gain * 100), 0, 0, 0.0, 0, -1, -1.0, None)
     metadata = (moment, moment, None, number, form, form, settings, 0, 0, _geometry(width, height))
     body = nop.encode(metadata)
     return data + body + _FRAME.to_bytes(4, "little") + len(body).to_bytes(4, "little") + _MARKER

@@ -1,0 +1,90 @@
+"""`hololoop-runtime show`: on an ideal virtual headset, and on one emulated down to its buses' bytes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from firmware_iface.virtual import open_headset
+from runtime.cli import main
+
+BENCH = """
+[panel]
+height = 48
+width = 64
+[propagation]
+distance_mm = 8.0
+"""
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Path:
+    path = tmp_path / "bench.toml"
+    path.write_text(BENCH, encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def patterns(tmp_path: Path) -> list[Path]:
+    paths = []
+    for seed in range(2):
+        gray = np.random.default_rng(seed).integers(0, 256, (48, 64), dtype=np.uint8)
+        paths.append(tmp_path / f"pattern-{seed}.png")
+        Image.fromarray(gray).save(paths[-1])
+    return paths
+
+
+def run(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, dict, str]:
+    code = main([str(word) for word in words])
+    out, err = capsys.readouterr()
+    return code, json.loads(out) if out else {}, err
+
+
+def seen(path: str) -> np.ndarray:
+    with Image.open(path) as image:
+        assert image.mode.startswith("I;16")
+        return np.array(image).astype(float)
+
+
+@pytest.mark.parametrize("emulated", [False, True])
+def test_each_pattern_is_seen_by_the_camera(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, bench: Path, patterns: list[Path], emulated: bool
+) -> None:
+    """Against the bench's noise-free truth; emulated, through pyusb, smbus2 and, where it is there, depthai."""
+    words = ["show", *patterns, "--headset", bench, "--out", tmp_path / "seen", "--exposure-ms", 8, "--json"]
+    code, result, err = run(capsys, *words, *(["--emulated"] if emulated else []))
+    assert code == 0 and not err and result["exposure_ms"] == 8 and result["channel"] == "green"
+    truth = open_headset(str(bench))
+    for path, one in zip(patterns, result["shown"], strict=True):
+        counts = seen(one["seen"])
+        expected = truth.expected_counts(np.array(Image.open(path)), "green")
+        assert np.corrcoef(counts.ravel(), expected.ravel())[0, 1] > 0.97
+        assert one["mean_counts"] == pytest.approx(counts.mean(), abs=0.01)
+        assert one["brightest_counts"] == counts.max() and one["saturated_share"] < 0.05
+
+
+def test_what_cannot_be_shown_says_why(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, bench: Path, patterns: list[Path]
+) -> None:
+    colour, small = tmp_path / "colour.png", tmp_path / "small.png"
+    Image.new("RGB", (64, 48)).save(colour)
+    Image.new("L", (8, 8)).save(small)
+    text = tmp_path / "text.png"
+    text.write_text("no picture", encoding="utf-8")
+    good = patterns[0]
+    for words, message in (
+        ((colour, "--headset", bench), "not 8-bit gray (RGB)"),
+        ((small, "--headset", bench), "(48, 64)"),
+        ((text, "--headset", bench), "not a picture"),
+        ((tmp_path / "none.png", "--headset", bench), "missing"),
+        ((good, "--headset", bench, "--channel", "ultraviolet"), "use one of green"),
+        ((good, "--headset", bench, "--exposure-ms", 0), "exposure"),
+        ((good, "--headset", "virtual:nothing", "--emulated"), "no virtual bench 'nothing'"),
+        ((good,), "--headset"),
+    ):
+        code, _, err = run(capsys, "show", *words)
+        assert code == 2 and message in err and err.count("\n") == 1, err
