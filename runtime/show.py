@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from firmware_iface.errors import InputError
-from runtime.calibration.devices import open_devices
+from runtime.devices import open_devices
 from runtime.files import whole_file
 
 ABOUT = """Show patterns on a headset, one after the other, and save what its camera sees of each.
