@@ -185,14 +185,17 @@ class Lasers:
         if not armed:
             raise DeviceError("the lasers are not armed; arm() them first.")
         self._fractions[k] = float(fraction)
-        start = max(
-            start, min(end, self._lasers[k].code(1e-9))
-        )  # below the threshold there is no light to ramp
+        # below the threshold there is no light to ramp
+        start = max(start, min(end, self._lasers[k].code(1e-9)))
         self._ramping = True
         try:
             for step in range(1, RAMP_STEPS + 1):
+                # less than was asked, where off() or expect() came between the steps
+                allowed = self._lasers[k].code(self._fractions[k])
+                if allowed == 0:
+                    return
                 with self._dark_on_failure():
-                    self._put(k, start + (end - start) * step // RAMP_STEPS)
+                    self._put(k, min(start + (end - start) * step // RAMP_STEPS, allowed))
                 yield
                 with self._dark_on_failure():
                     if self._clock() - self._beat_at >= BEAT_S:

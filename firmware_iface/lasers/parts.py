@@ -97,7 +97,7 @@ class Parts:
             lambda: self.expander.enable(0),
         )
         for act in acts:
-            with suppress(OSError):
+            with suppress(Exception):  # of whatever kind: it may not keep the next part from being told
                 act()
 
 

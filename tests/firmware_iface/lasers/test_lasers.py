@@ -352,17 +352,47 @@ def test_a_reply_of_garbage_is_never_believed(bench: Bench) -> None:
     assert told >= 59, "one in 256 passes the packet error code"
 
 
-def test_the_budget_is_kept_across_channels_and_by_prediction(bench: Bench) -> None:
+def bright(bench: Bench) -> Lasers:
+    """Armed red and green lasers of 300 µW each: together more than a Class 1 point source."""
     bench.board.controller.built_for = ((40000, 40000, 9000),) * 3
     for diode in bench.board.diodes:
-        diode.photodiode_v_per_uw = 1 / 300
+        diode.photodiode_v_per_uw, diode.slope_uw_per_ma = 1 / 300, 20.0
+    channels = [replace(c, slope_uw_per_ma=20.0, full_power_uw=300.0) for c in VIRTUAL_CHANNELS[:2]]
     bench.ready()
-    bright = tuple(replace(c, threshold_ma=d.threshold_ma, slope_uw_per_ma=20.0, full_power_uw=300.0)
-                   for c, d in zip(VIRTUAL_CHANNELS[:2], bench.board.diodes, strict=False))  # fmt: skip
-    for diode in bench.board.diodes:
-        diode.slope_uw_per_ma = 20.0
-    lasers = Lasers(bench.bus, bright, lambda: bench.now, bench.pass_time)
+    lasers = Lasers(bench.bus, channels, lambda: bench.now, bench.pass_time)
     lasers.arm()
+    return lasers
+
+
+@pytest.mark.parametrize("act", ["off", "trip", "expect", "heartbeat that fails"])
+def test_what_lowers_the_light_in_the_middle_of_a_ramp_is_not_undone_by_its_next_steps(
+    bench: Bench, act: str
+) -> None:
+    lasers = bright(bench)
+    flat = spot_shares(np.ones((100, 100)), 1.0)
+    lasers.expect({"red": flat, "green": flat})
+    lasers.set_power("red", 1.0)
+    ramp = lasers.ramp("green", 1.0)
+    for _ in range(12):
+        next(ramp)
+        bench.pass_time(0.005)
+    if act == "expect":
+        assert lasers.expect(None) == pytest.approx(0.65)
+    elif act == "heartbeat that fails":
+        bench.board.bus.faults.arm("nack")
+        with pytest.raises(DeviceError):
+            lasers.heartbeat()
+    else:
+        getattr(lasers, act)()
+    most = 390 if act == "expect" else 0
+    for _ in ramp:
+        bench.pass_time(0.005)
+        assert bench.light_uw <= most
+    assert bench.light_uw == pytest.approx(most, rel=0.01)
+
+
+def test_the_budget_is_kept_across_channels_and_by_prediction(bench: Bench) -> None:
+    lasers = bright(bench)
     lasers.set_power("red", 1.0)
     with pytest.raises(InputError, match="1.54 of the Class 1 limit"):
         lasers.set_power("green", 1.0)
@@ -403,6 +433,21 @@ def test_an_exception_and_a_close_end_dark_and_disarmed(bench: Bench) -> None:
     lasers.close()
     with pytest.raises(DeviceError, match="closed"):
         lasers.heartbeat()
+
+
+def test_every_part_is_told_to_go_dark_whatever_the_others_do(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lasers = bench.armed()
+    lasers.set_power("green", 1.0)
+
+    def fails(*given: object) -> None:
+        raise TypeError("not even an error of the bus")
+
+    monkeypatch.setattr(lasers.parts.controller, "command", fails)
+    monkeypatch.setattr(lasers.parts.dac, "dark", fails)
+    lasers.trip()
+    assert bench.light_uw == 0 and bench.board.expander.pins() & 0b111 == 0
 
 
 def test_an_interruption_between_the_steps_of_a_ramp_is_not_swallowed(bench: Bench) -> None:
