@@ -12,7 +12,8 @@ from runtime.calibration.fit import Base, Estimate, Shot, gain_of, predicted
 from runtime.calibration.view import sampler
 
 TILE = 20  # pixels; tiles are taken to err independently
-WORTH_SHARE, WORTH_LEAST = 0.02, 0.0001  # of the excess before, and absolutely: less is not worth a change
+MOST, LEAST = 0.5, 0.0001  # share of what has come in excess, and absolutely: less is not worth a change
+LEFT = 0.02  # share of the excess before that may be left
 COMPLETE = 0.0003  # excess below which nothing is missing
 WRONG = 0.001  # excess above which a light path does not fit: an error of 3 % of the contrast
 SURE = 1.96  # standard errors
@@ -71,22 +72,23 @@ def removed(before: Heldout, after: Heldout) -> tuple[float, float]:
     return float(difference.sum()), float(difference.std()) * math.sqrt(difference.size)
 
 
-def verdict(before: Heldout, after: Heldout) -> str:
-    """What is to be done with a refit.
+def verdict(before: Heldout, after: Heldout, known: float = 0.0) -> str:
+    """What is to be done with a refit. known: the excess that the light path had when it was made.
 
-    "recalibrated": it predicts better than the light path that was there, surely and by enough to matter.
-    "unchanged": what was there predicts as well as the camera can tell. "not_explained": what was there is wrong, and
-    the refit does not mend it.
+    "recalibrated": the refit predicts better than the light path that was there, surely, and takes away most of what
+    has come since: what explains less would only bend parameters towards something else that is wrong. "unchanged":
+    what was there predicts about as well as when it was made. "not_explained": it is wrong, and the refit does not
+    mend it.
     """
     gone, error = removed(before, after)
-    if gone - SURE * error > 0 and gone > max(WORTH_SHARE * before.excess, WORTH_LEAST):
+    if gone - SURE * error > 0 and gone > max(MOST * (before.excess - known), LEAST):
         return "recalibrated"
-    return "unchanged" if before.excess < WRONG else "not_explained"
+    return "unchanged" if before.excess < max(WRONG, 2 * known) else "not_explained"
 
 
 def complete(before: Heldout, after: Heldout) -> bool:
     """Whether what remains after a refit is too little to matter."""
-    return after.excess < max(COMPLETE, WORTH_SHARE * before.excess)
+    return after.excess < max(COMPLETE, LEFT * before.excess)
 
 
 def _tiled(values: np.ndarray) -> np.ndarray:

@@ -56,8 +56,8 @@ def run(args: Namespace) -> dict[str, Any]:
         restore_bundle(args.bundle)
         return {"verdict": "restored", "bundle": str(args.bundle), "previous": str(previous(args.bundle))}
     bundle = read_bundle(args.bundle)
-    with open_devices(args.headset, args.seed) as devices, _progress() as say:
-        found = calibrate(devices, bundle, args.plane, args.seed, say)
+    with _progress() as say:
+        found = calibrate(lambda: open_devices(args.headset, args.seed), bundle, args.plane, args.seed, say)
     replaced = found.verdict == "recalibrated" and not args.check
     result: dict[str, Any] = {
         "bundle": str(args.bundle),

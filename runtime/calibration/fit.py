@@ -28,6 +28,7 @@ from runtime.lightpath import (
 
 # What is thought possible before anything is seen, as standard deviations; keeps what no light shows at rest.
 LIKELY = {"wavefront": 1000.0, "amplitude": 1.0, "distance": 5.0, "view": 3.0}
+LIKELY_STRETCH = 0.01  # of a homography that dots gave
 HELD = 1e30  # precision of what is not to move
 VIEW = (
     ("shift_y_px", 0.02),
@@ -36,6 +37,7 @@ VIEW = (
     ("blur_y_px2", 0.02),
     ("blur_x_px2", 0.02),
 )  # fields of a View and the steps of their secants
+STRETCH = tuple((name, 1e-3) for name in ("magnification", "aspect", "shear", "keystone_y", "keystone_x"))
 SETTLED = 0.3  # a step that lowers chi squared by less, per parameter, is the last
 
 Progress = Callable[[float], None]
@@ -119,14 +121,16 @@ def fit(
     start: Estimate,
     orders: tuple[int, int],
     iterations: int = 4,
+    new_view: bool = False,
     progress: Progress | None = None,
 ) -> Fitted:
     """The estimate that explains the shots best, from `start` on, with Legendre terms up to two orders.
 
     orders: of the wavefront, and of the beam's amplitude; (0, 0) fits the camera's view alone. The response is
-    held. progress: share done.
+    held. new_view: the view's homography is as good as dots are, so that its stretch is fitted along. progress:
+    share done.
     """
-    layout = _Layout(tuple(bases), *orders)
+    layout = _Layout(tuple(bases), *orders, VIEW + STRETCH if new_view else VIEW)
     estimate = layout.widened(start)
     cost = chi_squared(bases, shots, estimate) + layout.prior(estimate)
     damping = 1e-3
@@ -171,16 +175,23 @@ def _samplers(bases: Mapping[str, Base], view: View, finer: int) -> dict[str, Sa
 class _Layout:
     """Where each number of an estimate stands in the vector that is fitted."""
 
-    def __init__(self, channels: tuple[str, ...], wavefront: int, amplitude: int) -> None:
+    def __init__(
+        self,
+        channels: tuple[str, ...],
+        wavefront: int,
+        amplitude: int,
+        view: tuple[tuple[str, float], ...] = VIEW,
+    ) -> None:
         shape = (1, 1)
-        self.channels = channels
+        self.channels, self.view = channels, view
         self.orders = (wavefront, amplitude)
         self.wavefront = len(wavefront_maps(shape, wavefront)) if wavefront >= 2 else 0
         self.amplitude = len(amplitude_maps(shape, amplitude)) if amplitude >= 1 else 0
-        sizes = [self.wavefront, self.amplitude * len(channels), 1, len(VIEW) + TERMS + 1]
+        sizes = [self.wavefront, self.amplitude * len(channels), 1, len(view) + TERMS + 1]
         self.edges = np.cumsum([0, *sizes])
         spread = [np.full(n, LIKELY[k]) for n, k in zip(sizes, LIKELY, strict=True)]
         self.precision = 1 / np.concatenate(spread) ** 2
+        self.precision[self.edges[3] + len(VIEW) :][: len(view) - len(VIEW)] = 1 / LIKELY_STRETCH**2
         if not any(self.orders):
             self.precision[self.edges[2]] = HELD
 
@@ -188,7 +199,7 @@ class _Layout:
         """The vector of an estimate."""
         drift, view = estimate.drift, estimate.view
         beams = [drift.log_amplitude[c] for c in self.channels]
-        seen = [getattr(view, name) for name, _ in VIEW]
+        seen = [getattr(view, name) for name, _ in self.view]
         parts = [drift.wavefront_nm, *beams, [drift.distance_mm], seen, view.sensitivity, [view.stray]]
         return np.concatenate([np.asarray(p, float) for p in parts])
 
@@ -205,8 +216,8 @@ class _Layout:
             log_amplitude=dict(zip(self.channels, split, strict=True)),
             distance_mm=float(distance[0]),
         )
-        values: dict[str, Any] = dict(zip((name for name, _ in VIEW), map(float, seen), strict=False))
-        sensitivity = tuple(float(v) for v in seen[len(VIEW) : -1])
+        values: dict[str, Any] = dict(zip((name for name, _ in self.view), map(float, seen), strict=False))
+        sensitivity = tuple(float(v) for v in seen[len(self.view) : -1])
         view = replace(estimate.view, sensitivity=sensitivity, stray=float(seen[-1]), **values)
         return Estimate(drift, view)
 
@@ -242,7 +253,7 @@ def _normal_equations(
     normal, gradient = np.zeros((count, count)), np.zeros(count)
     samplers = _samplers(bases, estimate.view, 2)
     rough = _samplers(bases, estimate.view, 1)
-    views = _stepped_views(bases, estimate.view)
+    views = _stepped_views(bases, estimate.view, layout.view)
     for number, shot in enumerate(shots):
         base = bases[shot.channel]
         light = predicted(base, shot, estimate, samplers[shot.channel])
@@ -260,11 +271,12 @@ def _normal_equations(
     return normal, gradient
 
 
-def _stepped_views(bases: Mapping[str, Base], view: View) -> list[tuple[float, dict[str, Sampler]]]:
+def _stepped_views(
+    bases: Mapping[str, Base], view: View, steps: tuple[tuple[str, float], ...] = VIEW
+) -> list[tuple[float, dict[str, Sampler]]]:
     """For each fitted field of a view, the step of its secant and what samples light after it; the first
     entry is without a step.
     """
-    steps = [(name, step) for name, step in VIEW]
     moved = [replace(view, **{name: getattr(view, name) + step}) for name, step in steps]
     return [(0.0, _samplers(bases, view, 1))] + [
         (step, _samplers(bases, one, 1)) for (_, step), one in zip(steps, moved, strict=True)
@@ -324,5 +336,5 @@ def _columns(
     for k, (step, samplers) in enumerate(views[1:]):
         yield place + k, (samplers[shot.channel](image) - light) / step * even
     for k, one in enumerate(sensitivity_maps(estimate.view.shape)):
-        yield place + len(VIEW) + k, light * even * one
-    yield place + len(VIEW) + TERMS, np.full(light.shape, light.mean(), np.float32)
+        yield place + len(layout.view) + k, light * even * one
+    yield place + len(layout.view) + TERMS, np.full(light.shape, light.mean(), np.float32)

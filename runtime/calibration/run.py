@@ -8,7 +8,8 @@ it was; after the fit, the picture solved through the new one. Lasers are on onl
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -74,11 +75,10 @@ class Calibration:
     plane_mm: float
     captures: int
     seconds: Mapping[str, float]
-    known_view: View | None
 
 
 def calibrate(
-    devices: Devices,
+    open_devices: Callable[[], AbstractContextManager[Devices]],
     bundle: Bundle,
     plane_mm: float | None = None,
     seed: int = 0,
@@ -86,47 +86,46 @@ def calibrate(
 ) -> Calibration:
     """Show, capture, refit and check. The bundle is not touched; lasers are off afterwards, whatever happens.
 
-    plane_mm: the image plane that the camera is focused on; none: the bundle's own. Raises InputError where the
-    panel is not the bundle's, a colour has no laser, or the camera cannot see what it should.
+    open_devices: opens the headset for the captures, and once more for the last picture: while the fit computes, no
+    laser is armed. plane_mm: the image plane that the camera is focused on; none: the bundle's own. Raises InputError
+    where the panel is not the bundle's, a colour has no laser, or the camera cannot see what it should.
     """
     say = progress or (lambda done, what: None)
     channels = bundle_channels(bundle)
     bases = {c: Base(load_light_path(bundle, c, plane_mm), _wavelength(bundle, c)) for c in channels}
     shape = next(iter(bases.values())).path.grid.shape
     plane = plane_of(bundle, channels[0], plane_mm)
-    if tuple(devices.panel.shape) != shape:
-        raise InputError(
-            f"the bundle is for a panel of {shape[0]} x {shape[1]} and this one has "
-            f"{' x '.join(map(str, devices.panel.shape))} pixels: use the bundle of this headset"
-        )
-    for channel in channels:
-        if channel not in devices.lasers.channels:
-            raise InputError(f"the headset has no laser '{channel}', which the bundle is for: check both")
-    devices.move_to_plane(plane)
+    say(0.0, "solving what is to be shown")
+    plans = {c: _planned(c, bases[c], seed) for c in channels}
     started = time.perf_counter()
-    many = len(channels) * (len(GRAINS) + len(HELD_OUT) + len(SWEEP) + 6) + 1
-    taker = Taker(devices, lambda what: say(0.25 * min(taker.taken / many, 1), f"showing: {what}"))
-    try:
+    many = len(channels) * (len(GRAINS) + len(HELD_OUT) + len(SWEEP) + 8) + 2
+
+    def showing(what: str) -> None:
+        say(0.25 * min(taker.taken / many, 1), f"showing: {what}")
+
+    with open_devices() as devices, _dark_after(devices):
+        _check(devices, channels, shape)
+        devices.move_to_plane(plane)
+        camera = tuple(devices.camera.shape)
+        taker = Taker(devices, showing)
         black, floor = taker.darkness()
-        taken = {c: _taken(taker, c, bases[c], black, floor, seed) for c in channels}
-        devices.lasers.off()
-        captured = time.perf_counter()
-        known = view_of(bundle)
-        view = _start_view(taken[channels[0]], known, shape, tuple(devices.camera.shape))
-        found, sweeps = _refit(bases, taken, view, lambda d, w: say(0.25 + 0.6 * d, f"fitting: {w}"))
-        say(0.86, "checking against held-out patterns")
-        heldout = [shot for t in taken.values() for shot in t.heldout]
-        as_it_was = fit(bases, heldout, Estimate(Drift(), found.estimate.view), (0, 0)).estimate
-        before, after = (heldout_errors(bases, heldout, e) for e in (as_it_was, found.estimate))
-        pictures = {}
-        for channel in channels:
-            say(0.92, f"showing the picture again: {channel}")
-            pictures[channel] = _pictures(taker, channel, bases[channel], taken[channel], found.estimate)
-    finally:
-        devices.lasers.off()
+        taken = {c: _taken(taker, c, plans[c], black, floor) for c in channels}
+    captured = time.perf_counter()
+    view, new = _start_view(taken[channels[0]], view_of(bundle), shape, camera)
+    found, sweeps = _refit(bases, taken, view, new, lambda d, w: say(0.25 + 0.6 * d, f"fitting: {w}"))
+    say(0.86, "checking against held-out patterns")
+    heldout = [shot for t in taken.values() for shot in t.heldout]
+    as_it_was = fit(bases, heldout, Estimate(Drift(), found.estimate.view), (0, 0), new_view=new).estimate
+    before, after = (heldout_errors(bases, heldout, e) for e in (as_it_was, found.estimate))
+    say(0.92, "solving the picture again")
+    better = {c: _solved(bases[c], c, found.estimate.drift) for c in channels}
+    with open_devices() as devices, _dark_after(devices):
+        devices.move_to_plane(plane)
+        taker = Taker(devices, lambda what: say(0.96, f"showing: {what}"), taker.taken)
+        pictures = {c: _pictures(taker, c, better[c], taken[c], found.estimate.view) for c in channels}
     done = time.perf_counter()
     return Calibration(
-        verdict(before, after),
+        verdict(before, after, _excess_before(bundle)),
         complete(before, after),
         found.estimate,
         found.errors,
@@ -140,38 +139,83 @@ def calibrate(
         plane,
         taker.taken,
         {"capturing": captured - started, "fitting": done - captured},
-        known,
     )
+
+
+@contextmanager
+def _dark_after(devices: Devices) -> Iterator[None]:
+    try:
+        yield
+    finally:
+        devices.lasers.off()
+
+
+def _check(devices: Devices, channels: list[str], shape: tuple[int, int]) -> None:
+    """Raises InputError where the headset is not the one that the bundle is for."""
+    if tuple(devices.panel.shape) != shape:
+        raise InputError(
+            f"the bundle is for a panel of {shape[0]} x {shape[1]} and this one has "
+            f"{' x '.join(map(str, devices.panel.shape))} pixels: use the bundle of this headset"
+        )
+    for channel in channels:
+        if channel not in devices.lasers.channels:
+            raise InputError(f"the headset has no laser '{channel}', which the bundle is for: check both")
 
 
 def _wavelength(bundle: Bundle, channel: str) -> float:
     return float(next(r["wavelength_nm"] for r in bundle_paths(bundle) if r["channel"] == channel))
 
 
-def _taken(taker: Taker, channel: str, base: Base, black: float, floor: float, seed: int) -> Taken:
-    """Every capture of one colour, with the light path as it was."""
+def _excess_before(bundle: Bundle) -> float:
+    """The excess that a bundle had when it was last calibrated or exported; 0 where nothing says so."""
+    done = bundle.provenance.get("calibrations") or []
+    record = done[-1]["heldout"]["after"] if done else bundle.provenance.get("heldout") or {}
+    return float(record.get("excess") or 0.0)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """The patterns of one colour, uint8 [H, W] each."""
+
+    dots: np.ndarray
+    gratings: list[np.ndarray]
+    fitted: list[np.ndarray]
+    heldout: list[np.ndarray]
+
+
+def _planned(channel: str, base: Base, seed: int) -> _Plan:
+    """What is shown of one colour, with the light path as it was."""
     path, shape = base.path, base.path.grid.shape
-    dots = solve(path, np.maximum(dot_pattern(shape, _spacing(shape)), 1e-3), SOLVING).gray
-    picture = solve(path, proof_picture(shape), SOLVING).gray
     still = Estimate(Drift(), View(shape))
     period = best_period(base, channel, still, sampler(still.view, path.grid, 1))
+    kept = [grains(shape, size, seed + 1000 + k) for k, size in enumerate(HELD_OUT)]
+    return _Plan(
+        solve(path, np.maximum(dot_pattern(shape, _spacing(shape)), 1e-3), SOLVING).gray,
+        [grating(shape, period, g) for g in SWEEP],
+        [grains(shape, size, seed + k) for k, size in enumerate(GRAINS)],
+        [*kept, _solved(base, channel, Drift())],
+    )
+
+
+def _solved(base: Base, channel: str, drift: Drift) -> np.ndarray:
+    """The pattern of the test picture through a drifted light path, uint8 [H, W]."""
+    path = drifted(base.path, channel, base.wavelength_nm, drift)
+    return solve(path, proof_picture(path.grid.shape), SOLVING).gray
+
+
+def _taken(taker: Taker, channel: str, plan: _Plan, black: float, floor: float) -> Taken:
+    """Every capture of one colour."""
     taker.light(channel)
-    first = grains(shape, GRAINS[0], seed)
-    exposure = taker.expose(first, black)
-    noise = taker.noise(first, black, floor)
-    gratings = [grating(shape, period, g) for g in SWEEP]
-    learned = [grains(shape, size, seed + k) for k, size in enumerate(GRAINS)]
-    kept = [grains(shape, size, seed + 1000 + k) for k, size in enumerate(HELD_OUT)] + [picture]
-    result = Taken(
-        taker.shot(channel, dots, noise, f"{channel}, dots"),
-        taker.shots(channel, gratings, noise, f"{channel}, grating"),
-        taker.shots(channel, learned, noise, f"{channel}, pattern"),
-        taker.shots(channel, kept, noise, f"{channel}, held-out pattern"),
+    exposure = taker.expose(plan.fitted[0], black)
+    noise = taker.noise(plan.fitted[0], black, floor)
+    return Taken(
+        taker.shot(channel, plan.dots, noise, f"{channel}, dots"),
+        taker.shots(channel, plan.gratings, noise, f"{channel}, grating"),
+        taker.shots(channel, plan.fitted, noise, f"{channel}, pattern"),
+        taker.shots(channel, plan.heldout, noise, f"{channel}, held-out pattern"),
         exposure,
         noise,
     )
-    taker.devices.lasers.off()
-    return result
 
 
 def _spacing(shape: tuple[int, int]) -> float:
@@ -179,8 +223,10 @@ def _spacing(shape: tuple[int, int]) -> float:
     return min(max(16.0, min(shape) / 7), min(shape) / 4.5)
 
 
-def _start_view(taken: Taken, known: View | None, shape: tuple[int, int], camera: tuple[int, int]) -> View:
-    """Where the camera looks, by the dots.
+def _start_view(
+    taken: Taken, known: View | None, shape: tuple[int, int], camera: tuple[int, int]
+) -> tuple[View, bool]:
+    """Where the camera looks, by the dots; and whether all of that is new.
 
     A camera of the panel's own size may be registered: then only its rigid motion is looked for, and so it is with
     a view that was known. Its scale is the lens's and does not drift; a magnified picture is the light's doing. Only
@@ -194,14 +240,13 @@ def _start_view(taken: Taken, known: View | None, shape: tuple[int, int], camera
     away = panel_points(found, corners) - panel_points(start.matrix(shape), corners)
     right, down = away.mean(0)
     if np.hypot(*(away - (right, down)).T).max() > SAME_PX:
-        return View(camera, tuple(float(v) for v in found.ravel()))
-    return replace(
-        start, shift_y_px=start.shift_y_px + float(down), shift_x_px=start.shift_x_px + float(right)
-    )
+        return View(camera, tuple(float(v) for v in found.ravel())), True
+    down, right = start.shift_y_px + float(down), start.shift_x_px + float(right)
+    return replace(start, shift_y_px=down, shift_x_px=right), False
 
 
 def _refit(
-    bases: Mapping[str, Base], taken: Mapping[str, Taken], view: View, say: Progress
+    bases: Mapping[str, Base], taken: Mapping[str, Taken], view: View, new: bool, say: Progress
 ) -> tuple[Fitted, dict[str, Sweep]]:
     """Distance from several starts, then response and the rest in turn, with rising orders."""
     shots = [shot for t in taken.values() for shot in t.fitted]
@@ -221,6 +266,7 @@ def _refit(
             shots,
             estimate,
             orders,
+            new_view=new,
             progress=lambda d, b=begin, p=part, o=orders: say(
                 b + p * d, f"wavefront and beam to order {o[0]}"
             ),  # type: ignore[misc]
@@ -244,21 +290,21 @@ def _with_response(
 
 
 def _pictures(
-    taker: Taker, channel: str, base: Base, taken: Taken, estimate: Estimate
+    taker: Taker, channel: str, gray: np.ndarray, taken: Taken, view: View
 ) -> dict[str, tuple[np.ndarray, float]]:
-    """The test picture before and after, as the camera saw it on the panel's pixels, with its PSNR in dB."""
-    target = proof_picture(base.path.grid.shape)
-    path = drifted(base.path, channel, base.wavelength_nm, estimate.drift)
-    gray = solve(path, target, SOLVING).gray
+    """The test picture before and after, as the camera saw it on the panel's pixels, with its PSNR in dB.
+
+    gray: the pattern after; the one before is the last of the held-out ones.
+    """
     taker.light(channel)
     taker.devices.camera.exposure_ms = taken.exposure_ms
     after = taker.shot(channel, gray, taken.noise, f"{channel}, picture")
-    taker.devices.lasers.off()
+    target = proof_picture(gray.shape)
+    inside = tuple(slice(n // 16, n - n // 16) for n in gray.shape)
     seen = {}
     for name, shot in (("before", taken.heldout[-1]), ("after", after)):
-        light = on_panel(shot.signal, estimate.view, base.path.grid.shape)
-        edge = tuple(slice(n // 16, n - n // 16) for n in light.shape)
-        seen[name] = (light, quality(np.maximum(light[edge], 0), target[edge]).psnr_db)
+        light = on_panel(shot.signal, view, gray.shape)
+        seen[name] = (light, quality(np.maximum(light[inside], 0), target[inside]).psnr_db)
     return seen
 
 

@@ -37,11 +37,10 @@ class Noise:
 
 
 class Taker:
-    """Takes captures of one colour after another; lasers are on only while it does."""
+    """Takes captures of one colour after another; lasers are on only while it does. taken: pictures so far."""
 
-    def __init__(self, devices: Devices, said: Said) -> None:
-        self.devices, self.said = devices, said
-        self.taken = 0
+    def __init__(self, devices: Devices, said: Said, taken: int = 0) -> None:
+        self.devices, self.said, self.taken = devices, said, taken
         self.top = float(2**devices.camera.bit_depth - 1)
 
     def darkness(self) -> tuple[float, float]:
@@ -64,7 +63,6 @@ class Taker:
     def expose(self, gray: np.ndarray, black: float) -> float:
         """Set and return the exposure, ms, at which a pattern just does not saturate. Raises InputError if dark."""
         camera = self.devices.camera
-        longest_ms = min(LONGEST_MS, camera.longest_exposure_ms)
         self.said("exposure")
         for _ in range(8):
             self.devices.panel.show(gray)
@@ -72,7 +70,7 @@ class Taker:
             room = self.top - black
             if bright < 0.9 * room:
                 factor = AIM * room / max(bright, 1.0)
-                wanted = min(max(camera.exposure_ms * factor, SHORTEST_MS), longest_ms)
+                wanted = min(max(camera.exposure_ms * factor, SHORTEST_MS), LONGEST_MS)
                 if bright > 0.002 * room or wanted == camera.exposure_ms:
                     break
                 camera.exposure_ms = wanted
@@ -80,7 +78,7 @@ class Taker:
                 camera.exposure_ms = max(camera.exposure_ms / 5, SHORTEST_MS)
         else:
             raise InputError(
-                f"no exposure from {SHORTEST_MS:g} to {longest_ms:g} ms suits the light: see that the camera looks "
+                f"no exposure from {SHORTEST_MS:g} to {LONGEST_MS:g} ms suits the light: see that the camera looks "
                 "at the image and that the laser's power is steady"
             )
         if bright <= 0.002 * room:

@@ -19,8 +19,8 @@ from runtime.legendre import edge_to_edge, legendre_maps
 from runtime.lightpath import FINE, Grid, image_frequencies
 from runtime.registration import panel_points, resample
 
-SENSITIVITY_ORDER = 2  # of the camera's own fall-off
-TERMS = 5  # of that order
+SENSITIVITY_ORDER = 4  # of the camera's own fall-off, so that none of it is taken for the beam's
+TERMS = 14  # of that order
 
 Sampler = Callable[[np.ndarray], np.ndarray]
 
@@ -31,6 +31,8 @@ class View:
 
     shape: (h, w), pixels. homography: 9 numbers, row-major, from camera pixels (x, y, 1) to panel pixels.
     shift_y_px, shift_x_px, rotation_mrad: a rigid motion on the panel after it, about the panel's centre.
+    magnification, aspect, shear, keystone_y, keystone_x: what a homography from dots is still wrong by, relative,
+    at the panel's border.
     blur_y_px2, blur_x_px2: variance of the lens's blur, panel pixels squared. sensitivity: Legendre terms of
     its logarithm, from order 1 on. stray: light that is added, share of a picture's mean.
     """
@@ -40,6 +42,11 @@ class View:
     shift_y_px: float = 0.0
     shift_x_px: float = 0.0
     rotation_mrad: float = 0.0
+    magnification: float = 0.0
+    aspect: float = 0.0
+    shear: float = 0.0
+    keystone_y: float = 0.0
+    keystone_x: float = 0.0
     blur_y_px2: float = 0.0
     blur_x_px2: float = 0.0
     sensitivity: tuple[float, ...] = (0.0,) * TERMS
@@ -68,7 +75,10 @@ class View:
         to_centre, back = np.eye(3), np.eye(3)
         to_centre[:2, 2], back[:2, 2] = (-cx, -cy), (cx + self.shift_x_px, cy + self.shift_y_px)
         turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
-        return back @ turn @ to_centre @ np.asarray(self.homography, float).reshape(3, 3)
+        m, a, s = self.magnification, self.aspect, self.shear
+        keystone = (2 * self.keystone_x / panel[1], 2 * self.keystone_y / panel[0], 1)
+        stretch = np.array([[1 + m + a, s, 0], [s, 1 + m - a, 0], keystone])
+        return back @ turn @ stretch @ to_centre @ np.asarray(self.homography, float).reshape(3, 3)
 
     def positions(self, panel: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
         """Where each camera pixel's centre looks on a panel of that shape: (y, x), each float64 [h, w]."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +32,11 @@ def headset(bench: BenchDescription, seed: int = 1) -> VirtualHeadset:
 
 def devices(headset: VirtualHeadset) -> Devices:
     return Devices(headset.panel, headset.lasers, headset.camera, {}, headset.move_to_plane)
+
+
+def opened(headset: VirtualHeadset) -> Callable[[], AbstractContextManager[Devices]]:
+    """What opens a headset that is there already."""
+    return lambda: nullcontext(devices(headset))
 
 
 def base(shape: tuple[int, int] = SHAPE) -> Base:

@@ -12,7 +12,7 @@ from firmware_iface.errors import InputError
 from firmware_iface.virtual import VirtualHeadset
 from runtime.bundle import read_bundle
 from runtime.calibration.run import calibrate
-from tests.runtime.calibration.drifting import SHAPE, devices, drifted_bench, headset, ideal_bundle
+from tests.runtime.calibration.drifting import SHAPE, drifted_bench, headset, ideal_bundle, opened
 
 
 def failing_at(device: VirtualHeadset, capture: int, error: BaseException) -> VirtualHeadset:
@@ -34,7 +34,7 @@ def test_lasers_are_off_after_an_error(tmp_path: Path, capture: int, error: Base
     bundle = read_bundle(ideal_bundle(tmp_path / "bundle", (64, 80)))
     device = failing_at(headset(drifted_bench(shape=(64, 80))), capture, error)
     with pytest.raises(type(error)):
-        calibrate(devices(device), bundle)
+        calibrate(opened(device), bundle)
     assert device.lasers.power("green") == 0
 
 
@@ -43,7 +43,7 @@ def test_a_dark_bench_is_said_and_left_dark(tmp_path: Path) -> None:
     bundle = read_bundle(ideal_bundle(tmp_path / "bundle", (64, 80)))
     device.lasers.set_power = lambda channel, fraction: None  # type: ignore[method-assign]
     with pytest.raises(InputError, match="sees no light"):
-        calibrate(devices(device), bundle)
+        calibrate(opened(device), bundle)
 
 
 def test_lasers_are_on_only_for_pictures_that_need_them(tmp_path: Path) -> None:
@@ -61,6 +61,6 @@ def test_lasers_are_on_only_for_pictures_that_need_them(tmp_path: Path) -> None:
 
     device.camera.capture = take  # type: ignore[method-assign]
     with pytest.raises(RuntimeError, match="enough"):
-        calibrate(devices(device), bundle)
+        calibrate(opened(device), bundle)
     assert seen[:2] == [0, 0] and set(seen[2:]) == {1.0}
     assert SHAPE != (64, 80)

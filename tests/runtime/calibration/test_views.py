@@ -1,0 +1,116 @@
+"""Cameras that do not look at the panel's own pixels, or see unevenly; and several colours."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_iface.virtual import BenchDescription, VirtualHeadset
+from firmware_iface.virtual.description import ChannelDescription
+from firmware_iface.virtual.panel import panel_path_nm
+from runtime.bundle import read_bundle, write_bundle
+from runtime.calibrated import load_light_path, pack_light_paths
+from runtime.calibration.replacing import replace_bundle
+from runtime.calibration.run import calibrate
+from runtime.calibration.view import View, view_of
+from runtime.registration import panel_points
+from tests.runtime.benches import ideal_path
+from tests.runtime.calibration.drifting import (
+    DISTANCE_MM,
+    drifted_bench,
+    ideal_bundle,
+    opened,
+    without_tilt,
+)
+
+SHAPE = (64, 80)
+
+
+def turned_camera(bench: BenchDescription, degrees: float = 4.0, scale: float = 0.8) -> BenchDescription:
+    """The bench with a camera of its own pixels, mirrored, turned and finer than the panel's."""
+    height, width = 88, 112
+    a = np.deg2rad(degrees)
+    matrix = np.eye(3)
+    matrix[:2, :2] = scale * np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]) @ np.diag([-1, 1])
+    centre = np.array([(width - 1) / 2, (height - 1) / 2])
+    matrix[:2, 2] = np.array([(SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2]) - matrix[:2, :2] @ centre + (0.7, -0.4)
+    camera = replace(
+        bench.camera,
+        width=width,
+        height=height,
+        pixel_um=8.0 * scale,
+        registered=False,
+        homography=tuple(float(v) for v in matrix.ravel()),
+    )
+    return replace(bench, camera=camera)
+
+
+def test_a_mirrored_turned_and_finer_camera_is_found_by_its_dots_and_remembered(tmp_path: Path) -> None:
+    bench = turned_camera(drifted_bench("panel_wavefront", shape=SHAPE))
+    folder = ideal_bundle(tmp_path / "bundle", SHAPE)
+    bundle = read_bundle(folder)
+    found = calibrate(opened(VirtualHeadset(bench, 1)), bundle)
+    assert found.verdict == "recalibrated" and found.after.excess < 0.001
+    truth = np.array(bench.camera.homography).reshape(3, 3)
+    corners = np.array([[0, 0], [111, 0], [0, 87], [111, 87]], float)
+    away = panel_points(found.estimate.view.matrix(SHAPE), corners) - panel_points(truth, corners)
+    assert np.hypot(*(away - away.mean(0)).T).max() < 0.1  # but for the shift that a tilt cannot be told from
+    # its scale came from the dots, so defocus and distance are known together only: astigmatism and more are
+    wavefront = without_tilt(found.estimate.drift.wavefront(SHAPE))
+    hidden = without_tilt(panel_path_nm(bench.defects[0], *SHAPE, SHAPE[1] / SHAPE[0]))  # type: ignore[arg-type]
+    y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in SHAPE), indexing="ij")
+    bowl = without_tilt(y**2 * SHAPE[0] ** 2 + x**2 * SHAPE[1] ** 2).ravel()
+    error = (wavefront - hidden).ravel()
+    error -= bowl * (bowl @ error) / (bowl @ bowl)
+    assert error.std() < 520 / 170 < hidden.std()
+
+    replace_bundle(folder, bundle, found)
+    assert view_of(read_bundle(folder)) == found.estimate.view
+
+
+def test_what_the_camera_alone_does_never_reaches_the_headset() -> None:
+    """Fall-off, blur and laser drift explain the captures; the light path has nothing to learn from them."""
+    shape = (80, 96)
+    bench = drifted_bench("vignetting", "sensor_blur", "laser_drift", shape=shape)
+    records, arrays = pack_light_paths(
+        [("green", DISTANCE_MM, 520.0, ideal_path(shape, DISTANCE_MM * 1e-3, dtype=np.float32))]
+    )
+    from runtime.bundle import Bundle
+
+    bundle = Bundle({"paths": records, "distance_mm": DISTANCE_MM}, arrays, {})
+    found = calibrate(opened(VirtualHeadset(bench, 1)), bundle)
+    assert found.verdict == "unchanged"
+    drift, view = found.estimate.drift, found.estimate.view
+    assert drift.wavefront(shape).std() < 520 / 170 and abs(drift.distance_mm) < 0.005
+    assert np.log(drift.amplitude("green", shape)).std() < 0.03
+    assert np.ptp(view.evenness()) > 0.3 and view.blur_x_px2 > view.blur_y_px2 > 0.1
+    assert found.counts_per_ms["green"][1] > 0.05  # the wandering power is seen
+
+
+@pytest.mark.slow
+def test_three_colours_share_one_wavefront(tmp_path: Path) -> None:
+    colours = {"red": 638.0, "green": 520.0, "blue": 450.0}
+    bench = drifted_bench("panel_wavefront", "phase_response", shape=SHAPE)
+    bench = replace(bench, channels=tuple(ChannelDescription(n, w) for n, w in colours.items()))
+    paths = []
+    for name, wavelength in colours.items():
+        from tests.runtime import benches
+
+        before, benches.WAVELENGTH = benches.WAVELENGTH, wavelength * 1e-9
+        paths.append((name, DISTANCE_MM, wavelength, ideal_path(SHAPE, DISTANCE_MM * 1e-3, dtype=np.float32)))
+        benches.WAVELENGTH = before
+    records, arrays = pack_light_paths(paths)
+    folder = tmp_path / "bundle"
+    write_bundle(folder, arrays, {"paths": records, "distance_mm": DISTANCE_MM}, {})
+    bundle = read_bundle(folder)
+    found = calibrate(opened(VirtualHeadset(bench, 1)), bundle)
+    assert found.verdict == "recalibrated" and found.complete
+    hidden = panel_path_nm(bench.defects[0], *SHAPE, SHAPE[1] / SHAPE[0])  # type: ignore[arg-type]
+    assert without_tilt(found.estimate.drift.wavefront(SHAPE) - hidden).std() < 450 / 170
+    replace_bundle(folder, bundle, found)
+    full = [float(np.ptp(load_light_path(read_bundle(folder), c).response)) for c in colours]
+    assert full[0] < full[1] < full[2]  # liquid crystal delays blue most
+    assert isinstance(found.estimate.view, View)
