@@ -126,6 +126,12 @@ def _network_files(path: Path, model: Model, channels: list[str]) -> tuple[dict[
             f"{path} was trained on {', '.join(learned) or 'no known colours'} and the bundle has "
             f"{', '.join(channels)}: give the captures of the same colours"
         )
+    beyond = about.get("effects", list(model.names))
+    if sorted(beyond) != sorted(model.names):
+        raise InputError(
+            f"{path} was trained beyond {', '.join(beyond) or 'the ideal model'} and the model has "
+            f"{', '.join(model.names) or 'no effects'}: give the model that it was trained with"
+        )
     return onnx_files(network), about
 
 

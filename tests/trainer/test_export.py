@@ -242,11 +242,15 @@ def test_a_trained_network_goes_in_as_onnx(tmp_path: Path) -> None:
         read_bundle(tmp_path / "b")
 
 
-@pytest.mark.parametrize(("shape", "channels"), [((8, 8), ["green"]), ((HEIGHT, WIDTH), ["red"])])
+@pytest.mark.parametrize(
+    ("shape", "channels", "effects"),
+    [((8, 8), ["green"], []), ((HEIGHT, WIDTH), ["red"], []), ((HEIGHT, WIDTH), ["green"], ["ghost"])],
+)
 def test_a_network_of_another_bench_is_refused(
-    tmp_path: Path, shape: tuple[int, int], channels: list[str]
+    tmp_path: Path, shape: tuple[int, int], channels: list[str], effects: list[str]
 ) -> None:
-    write_approximator(tmp_path / "n.safetensors", disturbed("compact", shape, 2, 1), {"channels": channels})
+    about = {"channels": channels, "effects": effects}
+    write_approximator(tmp_path / "n.safetensors", disturbed("compact", shape, 2, 1), about)
     with pytest.raises(InputError, match="trained"):
         export_bundle(Model(bench()), None, tmp_path / "b", network=tmp_path / "n.safetensors")
     assert not (tmp_path / "b").exists()

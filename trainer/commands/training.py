@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -50,6 +51,8 @@ def run_train(args: Namespace, screen: Screen) -> Result:
             every=args.every, about=sets.about,
             progress=lambda step, loss: told(step / args.steps, f"step {step} of {args.steps}, loss {loss:.3g}"),
         )  # fmt: skip
+    if int(os.environ.get("RANK", "0")):
+        raise SystemExit(0)  # of several processes, the first one tells
     return {
         "network": str(args.out / NETWORK),
         "recipe": asdict(recipe),

@@ -198,7 +198,8 @@ def _learn(
             joined(pairs), settings.recipe, settings.steps, start=start, seed=settings.seed, judges=settings.judges,
             progress=lambda step, loss: say(begin + part * step / settings.steps, f"training, loss {loss:.3g}"),
         )  # fmt: skip
-        write_approximator(folder / file, network, {"channels": [c.name for c in model.bench.channels]})
+        about = {"channels": [c.name for c in model.bench.channels], "effects": list(model.names)}
+        write_approximator(folder / file, network, about)
         return network
 
     folder.mkdir(parents=True, exist_ok=True)

@@ -211,10 +211,13 @@ class _Run:
         self.fabric.log_dict(values, step=self.step)
 
     def _settings(self) -> dict[str, Any]:
+        """What a run that is gone on with must have in common with this one."""
         return {
             "recipe": asdict(self.recipe),
             "seed": self.seed,
             "shape": list(self.pairs.shape),
+            "perceptual": self.judges.perceptual is not None,
+            "teacher": self.teacher is not None,
             **self.about,
         }
 
