@@ -187,6 +187,24 @@ def test_a_stack_of_planes_shows_each_part_in_its_plane() -> None:
         retrieve(Model(bench), wanted, "gerchberg_saxton")
 
 
+def test_a_depth_map_says_on_which_plane_each_pixel_counts() -> None:
+    flat = photographs(("astronaut",), known(fringed()))[0]
+    depth = np.zeros(SHAPE)
+    depth[:10] = 1.0
+    weight = in_depth(flat, (4.0, 5.0, 6.0), depth).weight
+    assert weight[2, :10].all() and weight[0, 10:].all() and weight.sum() == np.prod(SHAPE)
+
+
+def test_a_cycle_in_depth_gets_better(tmp_path: Path) -> None:
+    """Both planes are captured, learned from and shown."""
+    headset = fringed()
+    bench = known(headset)
+    wanted = [in_depth(one, (5.0, 7.0)) for one in photographs(("astronaut", "coffee"), bench)]
+    settings = Settings(1, COMPACT, 150, iterations=30, method="wirtinger", good=NEVER)
+    cycle = run_cycle(Model(bench), wanted, settings, tmp_path, Stage(headset, bench, Model(bench)))
+    assert psnr(cycle, 1) > psnr(cycle, 0) + 1
+
+
 def test_three_colours_are_solved_together() -> None:
     bench = known(fringed(True))
     picture = photographs(("astronaut",), bench)[0]

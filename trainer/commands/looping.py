@@ -12,6 +12,7 @@ from trainer.commands.command import (
     Result,
     comma_list,
     command_line,
+    distances,
     effects_option,
     model_options,
     number,
@@ -23,6 +24,9 @@ from trainer.commands.screen import Screen
 from trainer.commands.training import judge_options, seed_option
 
 if TYPE_CHECKING:
+    import numpy as np
+
+    from trainer.bench_file import Bench
     from trainer.cycle.loop import Settings
 
 
@@ -32,7 +36,7 @@ def run_loop(args: Namespace, screen: Screen) -> Result:
 
     from trainer.captures import read_captures
     from trainer.cycle.loop import run_cycle
-    from trainer.cycle.pictures import LEARNED, photographs, volumes_of
+    from trainer.cycle.pictures import LEARNED, in_depth, photographs, volumes_of
     from trainer.cycle.retrieval import beside_zero_order
     from trainer.cycle.showing import Stage, with_iris_beside
     from trainer.effects.registry import catalogue
@@ -61,6 +65,9 @@ def run_loop(args: Namespace, screen: Screen) -> Result:
             model = beside_zero_order(model)
             headset = None if headset is None else with_iris_beside(headset)
         wanted = volumes_of(args.pictures, bench) if args.pictures else photographs(LEARNED, bench)
+        if args.planes:
+            depths = _depths(args, bench, len(wanted))
+            wanted = [in_depth(one, args.planes, depth) for one, depth in zip(wanted, depths, strict=True)]
         stage = None if headset is None else Stage(headset, bench, Model(bench))
         told = stack.enter_context(screen.progress("the cycle"))
         cycle = run_cycle(model, wanted, settings, args.out, stage, recorded, progress=told)
@@ -72,6 +79,21 @@ def run_loop(args: Namespace, screen: Screen) -> Result:
         "good_enough": sorted(cycle.done),
         "left_out": left_out(settings.recipe, settings.judges),
     }
+
+
+def _depths(args: Namespace, bench: Bench, count: int) -> list[np.ndarray | None]:
+    """Depth of each picture, [H, W]; None where no map is given."""
+    from runtime.targets import encode_srgb, read_target
+
+    if not args.depth:
+        return [None] * count
+    if len(args.depth) != count:
+        raise InputError(
+            f"--depth names {len(args.depth)} maps for {count} pictures: give one a picture, in order"
+        )
+    return [
+        encode_srgb(read_target(path, bench.panel.shape, fit=True)) for path in args.depth
+    ]  # as gray as they look
 
 
 def _settings(args: Namespace) -> Settings:
@@ -193,6 +215,19 @@ def _loop_options(parser: ArgumentParser) -> None:
         type=Path,
         nargs="+",
         help="pictures to show (default: some photographs)",
+    )
+    parser.add_argument(
+        "--planes",
+        metavar="MM,MM",
+        type=distances,
+        help="show pictures in depth, on these planes (default: one plane)",
+    )
+    parser.add_argument(
+        "--depth",
+        metavar="FILE",
+        type=Path,
+        nargs="+",
+        help="a depth map a picture: black is on the first plane, white on the last (default: from left to right)",
     )
     parser.add_argument(
         "--recorded",

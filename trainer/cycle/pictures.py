@@ -45,13 +45,16 @@ def photographs(names: Sequence[str], bench: Bench, mirrored: bool = False) -> l
     return found
 
 
-def in_depth(flat: Volume, planes_mm: Sequence[float]) -> Volume:
-    """A picture cut into upright strips, one a plane: each is in focus, and counts, on its own."""
-    height, width = flat.irradiance.shape[-2:]
-    edges = np.linspace(0, width, len(planes_mm) + 1).round().astype(int)
-    weight = np.zeros((len(planes_mm), height, width), np.float32)
-    for k in range(len(planes_mm)):
-        weight[k, :, edges[k] : edges[k + 1]] = 1
+def in_depth(flat: Volume, planes_mm: Sequence[float], depth: np.ndarray | None = None) -> Volume:
+    """A picture in depth: each pixel is in focus, and counts, on the plane that its depth falls to.
+
+    depth : [H, W], 0 (the first plane) .. 1 (the last); none: rising from left to right, so planes are upright strips
+    """
+    shape, count = flat.irradiance.shape[-2:], len(planes_mm)
+    if depth is None:
+        depth = np.broadcast_to((np.arange(shape[1]) + 0.5) / shape[1], shape)
+    nearest = np.minimum((count * depth).astype(int), count - 1)
+    weight = np.stack([nearest == k for k in range(count)]).astype(np.float32)
     return Volume(flat.name, tuple(planes_mm), np.repeat(flat.irradiance, len(planes_mm), 0), weight)
 
 

@@ -5,7 +5,8 @@
     wirtinger_no_zero_order                     the same, with the iris beside the zero order and a ramp on the pattern
     hardware_in_the_loop                        Wirtinger descent through light path and network (seed eq. 14-23)
 
-The last is the torch light path and the network differentiated together; all others are the headset's own solver.
+All but the last are the headset's own solver. The last, and every stack of planes, is the trainer's light path and
+network differentiated together: a network that is still learning has no ONNX file, and the solver's stacks have no D.
 """
 
 from __future__ import annotations
@@ -92,21 +93,24 @@ def retrieve(
     model = told_to_display(model)
     if method == "wirtinger_no_zero_order":
         model = beside_zero_order(model)
-    paths = [[baked_path(model, c.name, plane) for plane in wanted.planes_mm] for c in model.bench.channels]
-    if method == "hardware_in_the_loop" and (network is not None or len(wanted.planes_mm) > 1):
+    if method != "hardware_in_the_loop":
+        network = None
+    if network is not None or (len(wanted.planes_mm) > 1 and SOLVERS[method] == "default"):
         return _through(model, wanted, network, iterations, progress)
-    return np.stack([_solved(stack, wanted, c, method, iterations)[0] for c, stack in enumerate(paths)])
+    if len(wanted.planes_mm) > 1:
+        raise InputError(
+            f"'{method}' shows one plane and {wanted.name} has {len(wanted.planes_mm)}: use wirtinger or "
+            "hardware_in_the_loop"
+        )
+    baked = [baked_path(model, c.name, wanted.planes_mm[0]) for c in model.bench.channels]
+    return np.stack([_solved(path, wanted, c, method, iterations)[0] for c, path in enumerate(baked)])
 
 
 def _solved(
-    stack: list[LightPath], wanted: Volume, colour: int, method: str, iterations: int
+    path: LightPath, wanted: Volume, colour: int, method: str, iterations: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Gray levels and phase [H, W] of one colour, by the headset's solver."""
-    if len(stack) > 1:
-        raise InputError(
-            f"'{method}' shows one plane and {wanted.name} has {len(stack)}: use hardware_in_the_loop"
-        )
-    solution = solve(stack[0], wanted.irradiance[0, colour], iterations, method=SOLVERS[method])
+    """Gray levels and phase [H, W] of one colour and plane, by the headset's solver."""
+    solution = solve(path, wanted.irradiance[0, colour], iterations, method=SOLVERS[method])
     return solution.gray.copy(), solution.phase.copy()
 
 
@@ -125,7 +129,7 @@ def _through(
     plane = wanted.planes_mm[first]
     flat = Volume.flat(wanted.name, plane, np.sum(wanted.weight[:, None] * wanted.irradiance, 0))
     baked = [baked_path(model, c.name, plane) for c in model.bench.channels]
-    start = [_solved([path], flat, c, "wirtinger", iterations)[1] for c, path in enumerate(baked)]
+    start = [_solved(path, flat, c, "wirtinger", iterations)[1] for c, path in enumerate(baked)]
     phase = torch.tensor(np.stack(start), dtype=torch.float32).requires_grad_(True)
     paths = [[torch_path(model, c.name, z) for c in model.bench.channels] for z in wanted.planes_mm]
     target = torch.as_tensor(wanted.irradiance, dtype=torch.float32)

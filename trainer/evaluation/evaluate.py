@@ -208,10 +208,8 @@ class _Comparison:
             model, network = self.through(method)
             return retrieve(model, wanted, "hardware_in_the_loop", network, count)
         if method == "physics":
-            return retrieve(
-                self.physics, wanted, "wirtinger" if len(wanted.planes_mm) == 1 else _DEEP, None, count
-            )
-        return retrieve(self.ideal, wanted, method if len(wanted.planes_mm) == 1 else _DEEP, None, count)
+            return retrieve(self.physics, wanted, "wirtinger", None, count)
+        return retrieve(self.ideal, wanted, method, None, count)
 
     def displayed(self, method: str) -> Likeness:
         """What the camera sees of a method's patterns for the held-out pictures."""
@@ -300,6 +298,3 @@ class _Comparison:
         result["oracle"] = self.oracle().as_json()
         say(1.0, "done")
         return result
-
-
-_DEEP = "hardware_in_the_loop"  # without a network: Wirtinger descent for all planes at once

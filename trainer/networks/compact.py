@@ -25,7 +25,7 @@ class Compact(nn.Module):
     """
 
     def __init__(
-        self, shape: tuple[int, int], filters: int = 8, planes: int = 3, cell: int = 4, patch: int = 4
+        self, shape: tuple[int, int], filters: int = 8, planes: int = 3, cell: int = 2, patch: int = 4
     ) -> None:
         super().__init__()
         self.shape, self.patch, self.cell = shape, patch, cell
