@@ -12,7 +12,10 @@ import torch
 
 from firmware_iface.errors import InputError
 from firmware_iface.virtual import BenchDescription, VirtualHeadset, make_defect
-from runtime.solver import quality
+from runtime.approximator import approximator_of
+from runtime.bundle import read_bundle
+from runtime.calibrated import load_light_path
+from runtime.solver import Solver, quality
 from tests.trainer.taught import SHAPE, captured, fringed, known
 from tests.trainer.test_networks import disturbed
 from trainer.cli import main
@@ -21,9 +24,12 @@ from trainer.cycle.pictures import in_depth, photographs
 from trainer.cycle.retrieval import METHODS, Volume, beside_zero_order, loss_of, retrieve, torch_path
 from trainer.cycle.showing import Stage, with_iris_beside
 from trainer.evaluation.evaluate import DISPLAY, PREDICTION, Sizes, run_evaluation
+from trainer.export import export_bundle
 from trainer.model import Model
 from trainer.networks.approximator import Approximator, Architecture
 from trainer.training.recipe import RECIPES
+from trainer.training.sets import training_sets
+from trainer.training.train import NETWORK, train
 
 COMPACT = replace(RECIPES["compact"], filters=2)
 NEVER = 2.0  # no likeness is that good
@@ -93,6 +99,23 @@ def run_shown(stage: Stage, patterns: dict[str, np.ndarray], wanted: Volume, fol
     captures = stage.show(patterns, wanted.planes_mm, folder)
     seen = seen_pairs(captures, with_gains(captures, stage.model, captures.captures))
     return display_likeness(seen[wanted.name], wanted).psnr_db
+
+
+def test_the_headset_shows_better_through_the_exported_network(tmp_path: Path) -> None:
+    """Trained, exported as ONNX, and looked through by the headset's own solver, without torch: seen by the camera."""
+    captures = captured(tmp_path / "captures", patterns=12)
+    model = Model(captures.bench)
+    train(
+        training_sets(captures, model).fitted, COMPACT, 200, tmp_path / "run", about={"channels": ["green"]}
+    )
+    export_bundle(model, captures, tmp_path / "bundle", network=tmp_path / "run" / NETWORK)
+    bundle = read_bundle(tmp_path / "bundle")
+    path, wanted = load_light_path(bundle), photographs(("astronaut",), captures.bench)[0]
+    stage, shown = Stage(fringed(), captures.bench, model), {}
+    for name, d in (("without", None), ("through", approximator_of(bundle, (1, *SHAPE)))):
+        gray = Solver(path, approximator=d).solve(wanted.irradiance[0, 0], 40).gray.copy()
+        shown[name] = run_shown(stage, {wanted.name: gray.reshape(1, *SHAPE)}, wanted, tmp_path / name)
+    assert shown["through"] > shown["without"] + 3
 
 
 # Phase retrieval
