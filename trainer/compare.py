@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -23,6 +23,9 @@ from trainer.localise import BrightnessSums, FieldSums, FrequencySums, Seen
 from trainer.model import Model
 from trainer.photon_transfer import compare_repeats
 from trainer.scene import scene_for, stages_for
+
+if TYPE_CHECKING:
+    from trainer.budget import Budget
 
 PICTURES = 3  # held-out captures whose pictures are kept for the report
 PAIRS = 12  # pairs of repeats that the noise is checked on
@@ -72,6 +75,8 @@ class Comparison:
     brightness: list[dict[str, Any]]
     noise_from_repeats: float | None
     pictures: tuple[Picture, ...] = ()
+    budget: Budget | None = None
+    """Where the ideal model's error goes; None where nobody asked, or there is no contrast."""
 
     def by_capture(self) -> list[dict[str, Any]]:
         """One row a held-out capture, in the order of the set."""
@@ -98,6 +103,7 @@ class Comparison:
             "by_channel": self._by(channels),
             "by_plane": self._by(planes),
             "by_capture": rows,
+            "budget": None if self.budget is None else vars(self.budget),
             "noise_from_repeats": self.noise_from_repeats,
             "where": {
                 "field": self.field,

@@ -50,7 +50,9 @@ def test_the_command_shows_it(
     budget = json.loads(capsys.readouterr().out)["budget"]
     assert set(budget) == {"named_physics", "network", "noise", "unexplained"}
     assert budget["network"] < 0  # weights drawn at random make it worse
-    assert main(["compare", str(captures.folder), "--network", str(path)]) == 0
+    report = tmp_path / "report.html"
+    assert main(["compare", str(captures.folder), "--network", str(path), "--report", str(report)]) == 0
     assert "unexplained" in capsys.readouterr().out
+    assert "the network explains" in report.read_text(encoding="utf-8")
     with pytest.raises(InputError, match="train one"):
         error_budget(captures, Model(captures.bench), disturbed("compact", (8, 8), 2, 1))

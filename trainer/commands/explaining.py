@@ -63,6 +63,8 @@ def run_compare(args: Namespace, screen: Screen) -> Result:
     """How far a model is from the captures."""
     refuse_folder(args.report, "--report")
     captures, _, model = inputs_of(args)
+    from dataclasses import replace
+
     from trainer.budget import error_budget
     from trainer.compare import compare
     from trainer.networks.approximator import read_approximator
@@ -71,14 +73,14 @@ def run_compare(args: Namespace, screen: Screen) -> Result:
     use_every_core()
     with screen.progress("comparing") as told:
         found = compare(captures, model, lambda done: told(0.6 * done))
-        budget = None
         if found.as_json()["heldout"]["excess"] is not None:
             budget = error_budget(captures, found.model, network, lambda done: told(0.6 + 0.4 * done))
+            found = replace(found, budget=budget)
     if args.report:
         from trainer.report import write_report
 
         write_report(args.report, f"Comparison: {captures.folder.name}", comparison=found, model=found.model)
-    return {**found.as_json(), "budget": None if budget is None else vars(budget)}
+    return found.as_json()
 
 
 def run_diagnose(args: Namespace, screen: Screen) -> Result:

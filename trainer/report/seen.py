@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -39,9 +39,27 @@ def facts(compared: Any, heldout: Any, found: Any) -> list[tuple[str, str, str]]
         ratio = compared["noise_from_repeats"]
         agrees = "agrees with bench.toml" if 0.8 < ratio < 1.25 else "bench.toml's noise is off"
         rows.append(("noise seen in repeats", f"{number(ratio)} ×", agrees))
+    if compared and compared.get("budget"):
+        rows += _budget(compared["budget"])
     if found and found.get("ideal_excess") is not None and not compared:
         rows.append(("excess of the ideal model", number(found["ideal_excess"]), "bench.toml alone"))
     return rows
+
+
+def _budget(budget: Mapping[str, float]) -> list[tuple[str, str, str]]:
+    """The parts of the ideal model's error, the network's only where there is one."""
+    words = {
+        "named_physics": "named physics explains",
+        "network": "the network explains",
+        "noise": "the camera's noise is",
+        "unexplained": "unexplained",
+    }
+    total = sum(budget.values())
+    return [
+        (words[name], percent(part / total), "of the ideal model's squared error")
+        for name, part in budget.items()
+        if name != "network" or part
+    ]
 
 
 def pictures(shown: Sequence[Any]) -> list[dict[str, Any]]:
