@@ -174,6 +174,11 @@ def _parser() -> ArgumentParser:
         type=_millimetres,
         help="image plane, mm from the panel (default: the bench's)",
     )
+    solve.add_argument(
+        "--beside-zero-order",
+        action="store_true",
+        help="for a bench whose iris is moved off the axis, so that undiffracted light does not reach the picture",
+    )
     solve.add_argument("--fit", action="store_true", help="crop and resize pictures of another size")
     solve.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
     refit = parts.add_parser(
@@ -274,12 +279,14 @@ def run_solve(args: Namespace) -> dict[str, Any]:
     from runtime.approximator import approximator_of
     from runtime.bundle import INITIALISER, read_bundle
     from runtime.calibrated import bundle_channels, load_light_path, plane_of
-    from runtime.solver import Solver
+    from runtime.solver import Solver, beside_zero_order
 
     bundle = read_bundle(args.bundle)
     every = bundle_channels(bundle)
     channels = every if args.channel is None else [args.channel]
     paths = {c: load_light_path(bundle, c, args.plane) for c in channels}
+    if args.beside_zero_order:
+        paths = {c: beside_zero_order(path) for c, path in paths.items()}
     planned = jobs(args.targets, channels, args.out)
     shape = next(iter(paths.values())).grid.shape
     d = approximator_of(bundle, (len(every), *shape))

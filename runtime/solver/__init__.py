@@ -6,6 +6,7 @@ from runtime.solver.penalty import PENALTIES
 from runtime.solver.quality import Quality, quality, quality_of, shown
 from runtime.solver.solver import Solution, Solver, solve
 from runtime.solver.start import motion_between
+from runtime.solver.zero_order import beside_zero_order
 
 __all__ = [
     "DriveRange",
@@ -14,6 +15,7 @@ __all__ = [
     "Quality",
     "Solution",
     "Solver",
+    "beside_zero_order",
     "motion_between",
     "quality",
     "quality_of",

@@ -116,6 +116,30 @@ def test_colours_get_a_pattern_each_of_their_own_part_of_the_picture(
     assert (tmp_path / "b.png").read_bytes() == (tmp_path / "p-blue.png").read_bytes()
 
 
+def test_a_deadline_names_of_solvers_and_an_iris_beside_the_axis(
+    green: Path, picture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "p.png"
+    (timed,) = solved(capsys, green, picture, "--out", out, "--deadline-ms", 400)
+    assert timed["iterations"] > 2
+    assert (
+        timed["psnr_db"] > solved(capsys, green, picture, "--out", out, "--iterations", 0)[0]["psnr_db"] + 2
+    )
+    (alone,) = solved(capsys, green, picture, "--out", out, "--solver", "double_phase")
+    assert alone["iterations"] == 0
+    kinds = [
+        ("--solver", "adam"), ("--solver", "gerchberg_saxton"), ("--penalty", "l1"), ("--grid", "panel"),
+        ("--beside-zero-order",),
+    ]  # fmt: skip
+    patterns = {out.read_bytes()}
+    for words in kinds:
+        solved(capsys, green, picture, "--out", out, "--iterations", 4, *words)
+        patterns.add(out.read_bytes())
+    assert len(patterns) == len(
+        kinds
+    )  # Gerchberg-Saxton finds nothing better than the double phase it begins with
+
+
 def test_several_pictures_go_to_a_folder(
     green: Path, picture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -165,6 +189,8 @@ def test_bad_input_is_one_line_and_exit_code_2(
         (("solve", green, picture, "--out", picture), "overwritten by its own pattern"),
         (("solve", green, tmp_path / "dark.npy", *out), "all dark"),
         (("solve", green, picture, *out, "--magic"), "--magic"),
+        (("solve", green, picture, *out, "--deadline-ms", "0"), "'0' is not a time in ms"),
+        (("solve", green, picture, *out, "--solver", "newton"), "invalid choice: 'newton'"),
         (("slove", green), "did you mean 'solve'"),
     ]:
         code, said, err = run(capsys, *words)
