@@ -10,7 +10,7 @@ NEW_ENOUGH := -c 'import sys; sys.exit(sys.version_info < (3, 11))'
 help:
 	@echo "make install     make .venv and install hololoop in it, with exactly the versions of constraints.txt"
 	@echo "make test        check the style and the types, run the tests"
-	@echo "make demo        the whole loop on a virtual bench, then on its headset emulated down to the bytes"
+	@echo "make demo        the whole loop on a virtual bench"
 	@echo "make benchmark   measure the runtime on this machine"
 	@echo "make clean       remove caches and build products (.venv stays; rm -r .venv removes it)"
 
@@ -44,12 +44,7 @@ test: install
 	$(BIN)/python -m pytest
 
 demo: install
-	@set -e; \
-	number=1; folder=hololoop-demo; \
-	while [ -e $$folder ]; do number=$$((number + 1)); folder=hololoop-demo-$$number; done; \
-	$(BIN)/hololoop-trainer demo --out $$folder; \
-	echo "The same patterns on the bench's headset, emulated down to the bytes of its buses:"; \
-	$(BIN)/hololoop-runtime show $$folder/patterns/*-after.png --headset virtual:demo --emulated --out $$folder/headset
+	$(BIN)/hololoop-trainer demo
 
 benchmark: install
 	$(BIN)/python -m pytest tests/benchmarks -n 0

@@ -25,10 +25,10 @@ from firmware_iface.virtual import VirtualHeadset, open_headset
 from firmware_iface.virtual.served import PREFIX, running
 from runtime.bundle import read_bundle
 from runtime.calibrated import load_light_path
-from runtime.cli import write_gray
 from runtime.devices import Devices, driven
 from runtime.files import whole_file
 from runtime.solver import Quality, quality, solve
+from runtime.solving import write_gray
 from runtime.targets import decode_srgb, encode_srgb, fit_area
 from trainer.bench_file import Bench
 from trainer.effects.registry import catalogue

@@ -40,11 +40,11 @@ def run(args: Namespace) -> dict[str, Any]:
     from runtime.calibrated import bundle_channels, load_light_path
     from runtime.calibration.taking import Taker
     from runtime.calibration.view import View, view_of
-    from runtime.cli import write_gray
     from runtime.devices import open_devices
     from runtime.refinement.eye import Eye
     from runtime.refinement.refine import Refinement, refine
     from runtime.solver import solve
+    from runtime.solving import write_gray
     from runtime.targets import read_target
 
     if args.captures < 1:

@@ -35,7 +35,7 @@ def run_register(args: Namespace, screen: Screen) -> Result:
             raise InputError(
                 "say where the dot pattern goes (--out DOTS.png), or give its picture as IMAGE.png"
             )
-        from runtime.cli import write_gray
+        from runtime.solving import write_gray
         from trainer.patterns import dots_to_show
 
         write_gray(args.out, dots_to_show(bench, channel, args.plane or bench.distance_mm, args.spacing))

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 
 from firmware_iface.errors import InputError
-from runtime.cli import write_gray
+from runtime.solving import write_gray
 from trainer.captures import CaptureSet
 from trainer.compare import with_gains
 from trainer.cycle.retrieval import ITERATIONS, Volume, retrieve
