@@ -9,15 +9,11 @@ import json
 import sys
 from argparse import ArgumentParser, RawDescriptionHelpFormatter
 from collections.abc import Sequence
+from types import ModuleType
 from typing import NoReturn
 
 from firmware_iface.errors import DeviceError, InputError, nearest
-<<<<<<< HEAD
-from runtime import doctor
-from runtime import show as showing
-=======
 from runtime import doctor, showing, solving
->>>>>>> b05cebf (Give solve a module of its own, as the other commands have)
 from runtime.benchmark import command as benchmark
 from runtime.calibration import command as calibration
 from runtime.refinement import command as refinement
@@ -33,6 +29,17 @@ The usual way:
   hololoop-runtime show pattern.png --headset headset.toml --out seen/
 
 A bundle comes from the workstation: hololoop-trainer export --model model.toml --out bundle/"""
+
+# Each command's module says what it is about, declares its arguments, runs, and shows what came out.
+COMMANDS: dict[str, tuple[ModuleType, str]] = {
+    "solve": (solving, "compute the pattern for each picture"),
+    "show": (showing, "show patterns on a headset and save what its camera sees"),
+    "serve": (service, "run the headset's service"),
+    "calibrate": (calibration, "find what has drifted and put it into the bundle"),
+    "refine": (refinement, "make a picture better while a camera looks at it"),
+    "devices": (doctor, "say what is attached, what is wrong and what to do"),
+    "benchmark": (benchmark, "measure the solver on this machine"),
+}
 
 
 class _Parser(ArgumentParser):
@@ -78,12 +85,12 @@ def _main(argv: list[str]) -> int:
     if args.command is None:
         parser.print_help()
         return BAD_INPUT if argv else DONE
-    run, show = COMMANDS[args.command]
-    result = run(args)
+    command, _ = COMMANDS[args.command]
+    result = command.run(args)
     if args.json:
         print(json.dumps(result, allow_nan=False))
     else:
-        show(result)
+        command.show(result)
     return DONE
 
 
@@ -91,105 +98,19 @@ def _parser() -> ArgumentParser:
     parser = _Parser(prog=PROGRAM, description=ABOUT, formatter_class=RawDescriptionHelpFormatter)
     parser.add_argument("--version", action="store_true", help="print the version and stop")
     parts = parser.add_subparsers(metavar="COMMAND", dest="command", title="commands", parser_class=_Parser)
-    solve = parts.add_parser(
-        "solve",
-        help="compute the pattern for each picture",
-        description=solving.ABOUT,
-        formatter_class=RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    solving.arguments(solve)
-    solve.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
-    refit = parts.add_parser(
-        "calibrate",
-        help="find what has drifted and put it into the bundle",
-        description=calibration.ABOUT,
-        formatter_class=RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    calibration.arguments(refit)
-    refit.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
-    refine = parts.add_parser(
-        "refine",
-        help="make a picture better while a camera looks at it",
-        description=refinement.ABOUT,
-        formatter_class=RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    refinement.arguments(refine)
-    refine.add_argument(
-        "--json", action="store_true", help="print one JSON object on stdout and nothing else"
-    )
-    look = parts.add_parser(
-        "show",
-        help="show patterns on a headset and save what its camera sees",
-        description=showing.ABOUT,
-        formatter_class=RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    showing.arguments(look)
-    look.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
-    serve = parts.add_parser(
-        "serve",
-        help="run the headset's service",
-        description=service.SERVE,
-        formatter_class=RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    service.add_options(serve)
-    serve.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
-    devices = parts.add_parser(
-        "devices",
-        help="say what is attached, what is wrong and what to do",
-        description=doctor.ABOUT,
-        formatter_class=RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    doctor.arguments(devices)
-<<<<<<< HEAD
-    devices.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
-=======
-    devices.add_argument(
-        "--json", action="store_true", help="print one JSON object on stdout and nothing else"
-    )
-    display = parts.add_parser(
-        "show",
-        help="show a pattern on the panel",
-        description=showing.ABOUT,
-        formatter_class=RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    showing.arguments(display)
-    display.add_argument(
-        "--json", action="store_true", help="print one JSON object on stdout and nothing else"
-    )
->>>>>>> b05cebf (Give solve a module of its own, as the other commands have)
-    measure = parts.add_parser(
-        "benchmark",
-        help="measure the solver on this machine",
-        description=benchmark.ABOUT,
-        formatter_class=RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    measure.add_argument(
-        "--json", action="store_true", help="print one JSON object on stdout and nothing else"
-    )
+    for name, (command, about) in COMMANDS.items():
+        one = parts.add_parser(
+            name,
+            help=about,
+            description=command.ABOUT,
+            formatter_class=RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+        )
+        command.arguments(one)
+        one.add_argument(
+            "--json", action="store_true", help="print one JSON object on stdout and nothing else"
+        )
     return parser
-
-
-COMMANDS = {
-<<<<<<< HEAD
-    "solve": (run_solve, show_solve),
-    "show": (showing.run, showing.show),
-=======
-    "solve": (solving.run, solving.show),
->>>>>>> b05cebf (Give solve a module of its own, as the other commands have)
-    "calibrate": (calibration.run, calibration.show),
-    "refine": (refinement.run, refinement.show),
-    "serve": (service.run_serve, service.show_serve),
-    "devices": (doctor.run, doctor.show),
-    "benchmark": (benchmark.run, benchmark.show),
-}
 
 
 if __name__ == "__main__":

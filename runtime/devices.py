@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from firmware_iface.errors import InputError
@@ -77,6 +80,31 @@ def driven(tables: Mapping[str, Any]) -> Iterator[Devices]:
         stack.enter_context(lasers.beating())
         stack.callback(lasers.off)
         yield Devices(panel, lasers, camera, laser_power(tables["lasers"]))
+
+
+@contextmanager
+def emulated(bench: str, seed: int = 0) -> Iterator[Devices]:
+    """A virtual bench inside hardware emulated down to the bytes of its buses, driven through a real headset's drivers.
+
+    bench: `virtual:NAME` or a virtual bench's TOML file. The camera is an emulated OAK where depthai is installed, and
+    without a link of its own elsewhere. Raises as `open_devices`.
+    """
+    from firmware_iface.virtual import load_bench
+    from firmware_iface.virtual.served import PREFIX, running
+
+    colours = [c.name for c in load_bench(bench).channels]
+    with TemporaryDirectory(prefix="hololoop-") as folder:
+        socket = Path(folder) / "hardware.sock"
+        bus = f"{PREFIX}{socket}"
+        # Addresses of this run's own: others may be running.
+        address = f"127.{os.getpid() >> 16 & 255}.{os.getpid() >> 8 & 255}.{os.getpid() % 254 + 1}"
+        camera = (
+            {"kind": "oak", "address": address} if find_spec("depthai") else {"kind": "virtual", "bus": bus}
+        )
+        with running(socket, bench, seed, address):
+            lasers = {"bus": bus, "power": dict.fromkeys(colours, FULL)}
+            with driven({"panel": {"bus": bus}, "lasers": lasers, "camera": camera}) as devices:
+                yield devices
 
 
 def configuration_of(spec: str) -> dict[str, Any] | None:

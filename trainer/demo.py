@@ -8,13 +8,9 @@ lasers over I2C (smbus2, safety controller and heartbeat included), the camera o
 
 from __future__ import annotations
 
-import importlib.util
-import os
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -22,10 +18,9 @@ from PIL import Image
 
 from firmware_iface.errors import InputError
 from firmware_iface.virtual import VirtualHeadset, open_headset
-from firmware_iface.virtual.served import PREFIX, running
 from runtime.bundle import read_bundle
 from runtime.calibrated import load_light_path
-from runtime.devices import Devices, driven
+from runtime.devices import Devices, emulated
 from runtime.files import whole_file
 from runtime.solver import Quality, quality, solve
 from runtime.solving import write_gray
@@ -102,7 +97,7 @@ def run_demo(
         headset, captures.bench, bundles, pictures, patterns, lambda d, w: say(0.62 + 0.25 * d, w)
     )
     say(0.88, "showing")
-    with _devices(spec) as devices:
+    with emulated(spec, seed=2) as devices:
         shown = [_show(devices, captures.bench, *each, patterns) for each in found_patterns]
 
     say(0.94, "writing the report")
@@ -146,27 +141,6 @@ def _make_empty(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder} cannot be made ({error.strerror}): give another --out") from None
-
-
-@contextmanager
-def _devices(spec: str) -> Iterator[Devices]:
-    """The same bench once more, inside emulated hardware, with a real headset's drivers in front of it."""
-    with TemporaryDirectory(prefix="hololoop-") as folder:
-        socket = Path(folder) / "hardware.sock"
-        bus = f"{PREFIX}{socket}"
-        # An address of this run's own: another demo may be running.
-        address = f"127.{os.getpid() >> 16 & 255}.{os.getpid() >> 8 & 255}.{os.getpid() & 255 or 1}"
-        camera = {"kind": "virtual", "bus": bus}
-        if importlib.util.find_spec("depthai"):
-            camera = {"kind": "oak", "address": address}
-        with running(socket, spec, seed=2, oak=address):
-            tables = {
-                "panel": {"bus": bus},
-                "lasers": {"bus": bus, "power": {"green": 1.0}},
-                "camera": camera,
-            }
-            with driven(tables) as devices:
-                yield devices
 
 
 def _patterns(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from argparse import Namespace
+from argparse import ArgumentParser, Namespace
 from typing import Any
 
 ABOUT = """Measure the solver on this machine, in one run of some minutes.
@@ -11,6 +11,10 @@ ABOUT = """Measure the solver on this machine, in one run of some minutes.
 An iteration against its transforms alone, convergence by iteration and by time against Adam and Gerchberg-Saxton,
 deadlines, a warm-started video, memory and sizes; at 1080 x 1920 and two smaller sizes, on scikit-image's pictures,
 520 nm, 8 um, 200 mm. Times are medians; compare ratios of one run, not milliseconds of two."""
+
+
+def arguments(parser: ArgumentParser) -> None:
+    """There are none but --json."""
 
 
 def run(args: Namespace) -> dict[str, Any]:

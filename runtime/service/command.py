@@ -6,7 +6,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import Any
 
-SERVE = """Run the service that owns the headset's panel, lasers and camera, until it is stopped.
+ABOUT = """Run the service that owns the headset's panel, lasers and camera, until it is stopped.
 
 CONFIG is one TOML file:
 
@@ -36,7 +36,7 @@ With --dark nothing is served: the lasers are switched off, for ExecStopPost= in
 in the folder that `hololoop-runtime serve --units DIR` writes."""
 
 
-def add_options(parser: ArgumentParser) -> None:
+def arguments(parser: ArgumentParser) -> None:
     """The options of `serve`."""
     parser.add_argument("config", metavar="CONFIG", type=Path, help="the headset's TOML file")
     only = parser.add_mutually_exclusive_group()
@@ -46,7 +46,7 @@ def add_options(parser: ArgumentParser) -> None:
     )
 
 
-def run_serve(args: Namespace) -> dict[str, Any]:
+def run(args: Namespace) -> dict[str, Any]:
     """Serve until stopped; returns what `--json` prints."""
     from firmware_iface.assembled import open_lasers
     from runtime.service.configuration import read_configuration
@@ -67,7 +67,7 @@ def run_serve(args: Namespace) -> dict[str, Any]:
     return {"served": supervisor.counts}
 
 
-def show_serve(result: dict[str, Any]) -> None:
+def show(result: dict[str, Any]) -> None:
     """What was done, in a line or two."""
     if "dark" in result:
         print("the lasers are off")

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-import tempfile
 import time
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from firmware_iface.errors import InputError
-from runtime.devices import open_devices
+from runtime.devices import emulated, open_devices
 from runtime.files import whole_file
 
 ABOUT = """Show patterns on a headset, one after the other, and save what its camera sees of each.
@@ -30,20 +26,6 @@ pyusb, smbus2 and depthai libraries, as real hardware would be.
 examples:
   hololoop-runtime show pattern.png --headset headset.toml --out seen/
   hololoop-runtime show pattern.png --headset virtual:demo --emulated"""
-
-START_S = 20.0
-
-EMULATED = """
-schema = 1
-bundle = "bundle"
-[panel]
-bus = "virtual:{socket}"
-[lasers]
-bus = "virtual:{socket}"
-power = {{ {channel} = 1.0 }}
-[camera]
-{camera}
-"""
 
 
 def arguments(parser: ArgumentParser) -> None:
@@ -67,8 +49,8 @@ def run(args: Namespace) -> dict[str, Any]:
     """Show and capture; returns what `--json` prints. Raises InputError, and DeviceError where a device fails."""
     grays = [read_pattern(path) for path in args.patterns]
     with ExitStack() as stack:
-        spec = stack.enter_context(emulated(args.headset)) if args.emulated else args.headset
-        devices = stack.enter_context(open_devices(spec))
+        opened = emulated(args.headset) if args.emulated else open_devices(args.headset)
+        devices = stack.enter_context(opened)
         channel = _channel(args.channel, devices)
         if args.exposure_ms is not None:
             devices.camera.exposure_ms = args.exposure_ms
@@ -120,43 +102,6 @@ def read_pattern(path: Path) -> np.ndarray:
         raise InputError(f"{path} is missing: give a pattern as `solve` writes it") from None
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"{path} is not a picture ({error}): give a pattern as `solve` writes it") from None
-
-
-@contextmanager
-def emulated(bench: str) -> Iterator[str]:
-    """A configuration whose devices are emulated buses around a virtual bench, in a process that ends with this.
-
-    bench : `virtual:NAME` or the path of a bench's TOML file
-    The camera is an emulated OAK where depthai is installed, and without a link of its own elsewhere.
-    """
-    from importlib.util import find_spec
-
-    from firmware_iface.virtual import load_bench
-
-    channel = load_bench(bench).channels[0].name
-    oak = f"127.0.{time.monotonic_ns() // 1000 % 250 + 1}.{time.monotonic_ns() // 250 % 250 + 1}"
-    with tempfile.TemporaryDirectory() as folder:
-        socket = f"{folder}/hardware"
-        command = [sys.executable, "-m", "firmware_iface.virtual.served", socket, "--bench", bench]
-        camera = f'kind = "virtual"\nbus = "virtual:{socket}"'
-        if find_spec("depthai") is not None:
-            command += ["--oak", oak]
-            camera = f'kind = "oak"\naddress = "{oak}"'
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-        try:
-            end = time.monotonic() + START_S
-            while not Path(socket).exists():
-                if process.poll() is not None or time.monotonic() > end:
-                    raise InputError(
-                        f"the hardware of {bench} could not be emulated; run {' '.join(command)}"
-                    )
-                time.sleep(0.02)
-            file = Path(folder) / "headset.toml"
-            file.write_text(EMULATED.format(socket=socket, channel=channel, camera=camera), encoding="utf-8")
-            yield str(file)
-        finally:
-            process.kill()
-            process.wait()
 
 
 def _channel(asked: str | None, devices: Any) -> str:
