@@ -103,13 +103,20 @@ def show(result: dict[str, Any]) -> None:
     for name, c in result["channels"].items():
         print(
             f"{name:<11} response up to {c['response_change_rad']:.3f} rad from what was believed; beam "
-            f"{100 * c['illumination_rms']:.1f} % rms; power steady to {100 * c['power_spread']:.2f} %; picture "
+            f"{100 * c['illumination_rms']:.1f} % rms; power {_power(c)}; picture "
             f"{c['picture_psnr_db']['before']:.1f} -> {c['picture_psnr_db']['after']:.1f} dB"
         )
     if result["replaced"]:
         print(
             f"\nThe old light path is {result['previous']}; to put it back: calibrate {result['bundle']} --restore"
         )
+
+
+def _power(colour: dict[str, Any]) -> str:
+    """A colour's power in words."""
+    steady = f"steady to {100 * colour['power_spread']:.2f} %"
+    change = colour["power_change"]
+    return steady if change is None else f"{100 * change:+.1f} % since the last calibration, {steady}"
 
 
 def sentence_of(found: dict[str, Any], replaced: bool) -> str:

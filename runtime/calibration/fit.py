@@ -29,6 +29,7 @@ from runtime.lightpath import (
 # What is thought possible before anything is seen, as standard deviations; keeps what no light shows at rest.
 LIKELY = {"wavefront": 1000.0, "amplitude": 1.0, "distance": 5.0, "view": 3.0}
 LIKELY_STRETCH = 0.01  # of a homography that dots gave
+SHARPEST = -0.05  # square pixels: a lens cannot sharpen; this much is room for noise
 HELD = 1e30  # precision of what is not to move
 VIEW = (
     ("shift_y_px", 0.02),
@@ -217,6 +218,8 @@ class _Layout:
             distance_mm=float(distance[0]),
         )
         values: dict[str, Any] = dict(zip((name for name, _ in self.view), map(float, seen), strict=False))
+        for name in ("blur_y_px2", "blur_x_px2"):
+            values[name] = max(values[name], SHARPEST)
         sensitivity = tuple(float(v) for v in seen[len(self.view) : -1])
         view = replace(estimate.view, sensitivity=sensitivity, stray=float(seen[-1]), **values)
         return Estimate(drift, view)

@@ -26,6 +26,7 @@ def numbers(found: Calibration) -> dict[str, Any]:
     for channel, base in found.bases.items():
         sweep, was, now = found.sweeps[channel], base.path.response, drift.response[channel]
         counts, spread = found.counts_per_ms[channel]
+        known = found.known_counts_per_ms.get(channel)
         terms = np.asarray(drift.log_amplitude[channel])
         beam = drift.amplitude(channel, shape)
         colours[channel] = {
@@ -38,6 +39,7 @@ def numbers(found: Calibration) -> dict[str, Any]:
             "response_error_rad": float(np.median(sweep.error)),
             "grating_visibility": float(np.median(sweep.visibility)),
             "counts_per_ms": counts,
+            "power_change": counts / known - 1 if known else None,
             "power_spread": spread,
             "exposure_ms": found.shots[channel].exposure_ms,
             "picture_psnr_db": {name: psnr for name, (_, psnr) in found.pictures[channel].items()},

@@ -58,7 +58,8 @@ class Calibration:
     verdict: see `check.verdict`. estimate: what was fitted, and errors: its standard errors. sweeps: the measured
     responses. shots: captures a colour. before, after: errors on held-out captures. pictures: for each colour the
     picture as the camera saw it before and after, on the panel's pixels, float32 [H, W], with amplitude PSNR in dB.
-    counts_per_ms: of each colour, and the relative spread over captures.
+    counts_per_ms: of each colour, and the relative spread over captures; known_counts_per_ms: what it was at the last
+    calibration.
     """
 
     verdict: str
@@ -75,6 +76,7 @@ class Calibration:
     plane_mm: float
     captures: int
     seconds: Mapping[str, float]
+    known_counts_per_ms: Mapping[str, float]
 
 
 def calibrate(
@@ -139,6 +141,7 @@ def calibrate(
         plane,
         taker.taken,
         {"capturing": captured - started, "fitting": done - captured},
+        (bundle.description.get("camera") or {}).get("counts_per_ms") or {},
     )
 
 
