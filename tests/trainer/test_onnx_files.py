@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 import onnxruntime
@@ -48,11 +48,17 @@ def far(a: Tensor | np.ndarray, b: Tensor) -> float:
     return float((torch.as_tensor(a).double() - b).norm() / b.norm())
 
 
-def check_parity(network: Approximator, shape: Sequence[int]) -> None:
+@lru_cache(maxsize=1)
+def exported(network: str, shape: tuple[int, int], filters: int) -> dict[str, bytes]:
+    return onnx_files(disturbed(network, shape, filters))
+
+
+def check_parity(name: str, shape: tuple[int, int], filters: int = 4) -> None:
     """Each output is within a few times torch's own single-precision error of double precision."""
+    network = disturbed(name, shape, filters)
     generator = torch.Generator().manual_seed(1)
     irradiance, target = (torch.rand(1, 3, *shape, generator=generator) * 2 for _ in range(2))
-    files = onnx_files(network)
+    files = exported(name, shape, filters)
     adapters = safetensors.numpy.load(files[ADAPTERS])
     found = run(files[APPROXIMATOR], {"irradiance": irradiance.numpy()})
     found |= run(files[GRADIENT], {"irradiance": irradiance.numpy(), "target": target.numpy(), **adapters})
@@ -64,24 +70,23 @@ def check_parity(network: Approximator, shape: Sequence[int]) -> None:
         assert far(found[name], value) < 3 * far(single[name], value) + ROUNDING, name
 
 
-@pytest.mark.parametrize(("network", "shape"), [("compact", (67, 121)), ("published", (67, 121))])
+@pytest.mark.parametrize(("network", "shape"), [("published", (67, 121)), ("compact", (67, 121))])
 def test_onnxruntime_gives_the_networks_result_and_gradients(network: str, shape: tuple[int, int]) -> None:
-    check_parity(disturbed(network, shape), shape)
+    check_parity(network, shape)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("network", "filters"), [("compact", 8), ("published", 4)])
 def test_parity_at_the_size_of_a_panel(network: str, filters: int) -> None:
-    check_parity(disturbed(network, (1080, 1920), filters), (1080, 1920))
+    check_parity(network, (1080, 1920), filters)
 
 
 def test_adapters_are_inputs_whose_change_is_followed() -> None:
     """Stepping an adapter down its gradient lowers the loss that the file itself reports, as much as it says."""
-    network = disturbed("compact", (32, 48))
-    files = onnx_files(network)
+    files = exported("compact", (67, 121), 4)
     adapters = safetensors.numpy.load(files[ADAPTERS])
     given = {
-        name: np.random.default_rng(5).random((1, 3, 32, 48)).astype(np.float32)
+        name: np.random.default_rng(5).random((1, 3, 67, 121)).astype(np.float32)
         for name in ("irradiance", "target")
     }
     before = run(files[GRADIENT], given | adapters)
