@@ -12,11 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from firmware_iface.errors import InputError
 from tests.conftest import ROOT
 from tests.trainer.made_sets import bench_tables, counted, irradiance
 from tests.trainer.taught import SHAPE, captured
+from tests.trainer.test_perceptual import random_weights
 from trainer.bench_file import read_bench
 from trainer.captures import CaptureSet, read_captures, write_captures
 from trainer.cli import main
@@ -25,6 +27,7 @@ from trainer.effects import catalogue
 from trainer.evidence import load_batch
 from trainer.model import Model, absent
 from trainer.networks.approximator import read_approximator
+from trainer.networks.weights import ALEXNET, VGG19
 from trainer.scene import scene_for, stages_for
 from trainer.training.losses import Critic, content_loss, matching_loss, picture, where_seen
 from trainer.training.metrics import evaluate, likeness, noise_floor
@@ -223,6 +226,7 @@ import os, signal, sys
 from dataclasses import replace
 from pathlib import Path
 import torch
+from safetensors.torch import save_file
 torch.set_num_threads(1)
 from trainer.captures import read_captures
 from trainer.model import Model
@@ -297,6 +301,30 @@ def test_the_command(captures: CaptureSet, tmp_path: Path, capsys: pytest.Captur
     assert "every loss" in capsys.readouterr().err
     assert main([*words, "--network", "publsihed"]) == 2
     assert "published" in capsys.readouterr().err
+
+
+def test_weights_that_are_named_are_used(
+    captures: CaptureSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With VGG-19's and LPIPS's weights nothing is left out, and 1 - LPIPS is a number of at most 1."""
+    vgg, lpips = tmp_path / "vgg.safetensors", tmp_path / "lpips.safetensors"
+    save_file(random_weights(VGG19), vgg)
+    heads = {f"lin{k}.model.1.weight": torch.rand(1, w, 1, 1) for k, w in enumerate((64, 192, 384, 256, 256))}
+    save_file(random_weights(ALEXNET) | heads, lpips)
+    words = [
+        "train",
+        str(captures.folder),
+        "--out",
+        str(tmp_path / "run"),
+        "--network",
+        "published",
+        "--filters",
+        "2",
+    ]
+    assert main([*words, "--steps", "1", "--vgg", str(vgg), "--lpips", str(lpips), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["left_out"] == []
+    assert all(0 < found["one_minus_lpips"] <= 1 for found in result["heldout"].values())
 
 
 @pytest.mark.slow
