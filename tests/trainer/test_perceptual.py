@@ -124,7 +124,7 @@ class Trap:
 
 def test_nothing_in_a_pytorch_file_is_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "vgg.pth").write_bytes(pickle.dumps(Trap()))
+    (tmp_path / "vgg.pth").write_bytes(pickle.dumps(Trap(), protocol=2))
     with pytest.raises(InputError, match="tensors alone"):
         read_weights(tmp_path / "vgg.pth")
     assert not (tmp_path / "sprung").exists()
