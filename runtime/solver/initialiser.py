@@ -6,8 +6,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from firmware_iface.errors import InputError
@@ -27,10 +25,10 @@ class Initialiser:
             )
         self._session.bind(target=self._target, phase=self._phase)
 
-    def fill(self, amplitude: np.ndarray, phase: Any) -> None:
-        """Write the network's phase (rad) [H, W] for an amplitude [H, W]."""
+    def phase(self, amplitude: np.ndarray) -> np.ndarray:
+        """The network's phase (rad) [H, W] for an amplitude [H, W]; written again by the next call."""
         self._target[0, 0] = amplitude
         self._session.run()
         cosine, sine = self._phase[0]
         np.arctan2(sine, cosine, out=cosine)
-        phase[...] = cosine
+        return cosine

@@ -288,7 +288,7 @@ class Solver:
             )
             np.sqrt(self.amplitude, out=self.amplitude)
             if self.initialiser is not None:
-                self.initialiser.fill(self.amplitude, phase)
+                phase[...] = self.on.xp.asarray(self.initialiser.phase(self.amplitude))
             elif drive.gapless:
                 start.double_phase(self.amplitude, phase)
             else:

@@ -234,10 +234,10 @@ def main() -> None:
     for name in args.names:
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder, "solved.npz")
-            command = [sys.executable, __file__, name, "--shape", args.shape, "--child", str(out)]
-            done = subprocess.run(
-                [*command, "--iterations", str(args.iterations)], capture_output=True, text=True
-            )
+            command = [sys.executable, str(Path(__file__).resolve()), name, "--shape", args.shape]
+            command += ["--child", str(out), "--iterations", str(args.iterations)]
+            # In a folder of its own: odak leaves a log where it runs.
+            done = subprocess.run(command, capture_output=True, text=True, cwd=folder)
             if done.returncode:
                 print(f"{name}: {done.stderr.strip().splitlines()[-1]}", file=sys.stderr)
                 continue
