@@ -132,7 +132,7 @@ class Display(threading.Thread):
                 self.answered_ns = time.monotonic_ns()
         except DEVICE_ERRORS as error:
             self._events.panel_fault(error)
-            if isinstance(error, DeviceGoneError):
+            if isinstance(error, DeviceGoneError | OSError):
                 with suppress(*DEVICE_ERRORS):
                     self._panel.close()
                 self._panel = None

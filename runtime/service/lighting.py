@@ -121,6 +121,9 @@ class Lighting(threading.Thread):
         requests, self._requests = self._requests, []
         for request in requests:
             request.answer(self._do(request.what))
+        if self._lasers is None:
+            self._lost(DeviceError("the laser board could not be opened"))
+            return
         if not self.armed:
             if time.monotonic() - self._looked_at >= LOOK_S:
                 self._look()
@@ -160,6 +163,9 @@ class Lighting(threading.Thread):
                 self._lasers.trip()
                 self._look()
             elif what == "clear":
+                # a board that was without power has lost its ceilings and limits: set everything anew
+                self._close()
+                self._lasers = self._open()
                 self._lasers.clear()
                 self._cleared_at = now
                 self._look()
@@ -171,8 +177,9 @@ class Lighting(threading.Thread):
                 self._cleared_at = -CLEAR_TO_ARM_S
                 self._lasers.arm()
                 self.state = Lasers.ARMED
-        except (DeviceError, InputError) as error:
-            self._look()
+        except DEVICE_ERRORS as error:
+            if self._lasers is not None:
+                self._look()
             return str(error)
         return None
 

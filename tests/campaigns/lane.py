@@ -20,7 +20,7 @@ from tests.campaigns.service import noted
 
 PICTURES = 16
 REFRESH_HZ, SOLVE_MS, STALE_MS = 100.0, 3.0, 80.0
-RECOVERY_S = 20.0
+RECOVERY_S = 15.0
 
 
 class Lane:
