@@ -13,6 +13,8 @@ width = 1920
 [lasers]                      three lasers on an I2C bus
 bus = "/dev/i2c-1"            or virtual:SOCKET
 power = { green = 0.5 }       fraction of full while something is shown; other lasers stay dark
+mrad_per_pixel = 0.5          angle of a pixel at the eye: patterns' bright spots are predicted and budgeted;
+                              without it, all light is taken to be one spot
 [[lasers.channel]]            calibration of each, in the order of the DAC's outputs; virtual: may be left out
 name = "green"
 wavelength_nm = 520.0
@@ -21,9 +23,10 @@ threshold_ma = 40.0
 slope_uw_per_ma = 4.0
 
 [camera]
-kind = "virtual"
-bus = "virtual:SOCKET"
+kind = "oak"                  the Luxonis OAK line; "virtual" with bus: emulated hardware without the camera's link
+address = "10.0.0.5"          its IP address, MX ID or USB path; without it, the first that is found
 exposure_ms = 10.0
+frames_per_s = 60.0
 """
 
 from __future__ import annotations

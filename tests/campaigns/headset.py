@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -22,20 +22,19 @@ from tests.runtime.benches import converted, ideal_path
 
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
 SHAPE = (24, 32)
-
-
-def _urgent() -> list[str]:
-    """What to start a process with so that it is scheduled as the unit file asks, where that is allowed."""
-    command = ["chrt", "--rr", "10"]
-    try:
-        allowed = subprocess.run([*command, "true"], capture_output=True, check=False).returncode == 0
-    except OSError:
-        return []
-    return command if allowed else []
-
-
-URGENT = _urgent()
 DISTANCE_MM = 6.0
+
+
+@contextmanager
+def urgent() -> Iterator[None]:
+    """What is started in the block is scheduled as the unit file asks, where that is allowed."""
+    with suppress(PermissionError):
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(10))
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
 
 BENCH = f"""
 [panel]
@@ -96,21 +95,28 @@ def write_configuration(
     return file
 
 
-def hardware(folder: Path, seed: int = 0, oak: str | None = None) -> AbstractContextManager[Remote]:
+@contextmanager
+def hardware(folder: Path, seed: int = 0, oak: str | None = None) -> Iterator[Remote]:
     """Emulated hardware for the configuration in `folder`, in a process of its own."""
-    return running(folder / "hardware.sock", str(folder / "bench.toml"), seed, oak)
+    with ExitStack() as stack:
+        with urgent():
+            remote = stack.enter_context(
+                running(folder / "hardware.sock", str(folder / "bench.toml"), seed, oak)
+            )
+        yield remote
 
 
 @contextmanager
 def served(file: Path, **environment: str) -> Iterator[subprocess.Popen[str]]:
     """The service of a configuration, ready; ends with the block, by SIGTERM."""
-    process = subprocess.Popen(
-        [*URGENT, sys.executable, "-m", "runtime.cli", "serve", str(file), "--json"],
-        env={**ENVIRONMENT, **environment},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    with urgent():
+        process = subprocess.Popen(
+            [sys.executable, "-m", "runtime.cli", "serve", str(file), "--json"],
+            env={**ENVIRONMENT, **environment},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
     try:
         yield process
     finally:

@@ -15,7 +15,7 @@ import numpy as np
 from firmware_iface.virtual.served import Remote
 from runtime.service.client import Client, Lost, RefusedError
 from runtime.service.protocol import Lasers, Part, Shown
-from tests.campaigns.headset import ENVIRONMENT, URGENT, connected, hardware, picture, write_configuration
+from tests.campaigns.headset import ENVIRONMENT, connected, hardware, picture, urgent, write_configuration
 from tests.campaigns.service import noted
 
 PICTURES = 16
@@ -59,8 +59,8 @@ class Lane:
 
     def start_service(self) -> subprocess.Popen[bytes]:
         """Start it, as systemd does after each end."""
-        with (self.folder / "service.log").open("ab") as log:
-            command = [*URGENT, sys.executable, "-m", "tests.campaigns.service", str(self.file)]
+        with (self.folder / "service.log").open("ab") as log, urgent():
+            command = [sys.executable, "-m", "tests.campaigns.service", str(self.file)]
             return subprocess.Popen(command, env=ENVIRONMENT, stderr=log)
 
     def end_service(self, number: int) -> None:

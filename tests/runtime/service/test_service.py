@@ -8,6 +8,7 @@ import signal
 import socket
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -61,11 +62,16 @@ def show(client: Client, frames: int) -> list[Shown | Lost]:
     return outcomes
 
 
-def light_up(client: Client) -> None:
-    client.clear()
-    client.arm()
-    until(lambda: show(client, 3) and client.status().lasers == Lasers.EMITTING)
-    show(client, 12)  # the ramp
+def light_up(client: Client, remote: Remote) -> None:
+    """Clear, arm and show until there is light; again where a busy machine let something go stale meanwhile."""
+    end = time.monotonic() + 30
+    while emitted_uw(remote) == 0:
+        assert time.monotonic() < end, client.status()
+        if client.status().lasers in (Lasers.OFF, Lasers.FAULT):
+            with suppress(RefusedError):
+                client.clear()
+                client.arm()
+        show(client, 3)
 
 
 def emitted_uw(remote: Remote) -> float:
@@ -78,8 +84,8 @@ def test_every_frame_is_shown_and_what_the_panel_displays_is_what_was_solved(
     outcomes = show(client, 20)
     assert [o.frame for o in outcomes] == list(range(1, 21))
     assert all(isinstance(o, Shown) and o.psnr_db > 10 for o in outcomes)
-    displayed = headset.remote.whole()
-    assert {o.pattern_crc for o in outcomes if isinstance(o, Shown)} <= displayed
+    made = {o.pattern_crc for o in outcomes if isinstance(o, Shown)}
+    until(lambda: made <= headset.remote.whole())
 
 
 def test_light_needs_clear_and_arm_and_a_fresh_picture(headset: Headset, client: Client) -> None:
@@ -87,25 +93,24 @@ def test_light_needs_clear_and_arm_and_a_fresh_picture(headset: Headset, client:
     assert emitted_uw(headset.remote) == 0 and client.status().lasers in (Lasers.OFF, Lasers.FAULT)
     with pytest.raises(RefusedError, match="Clear first"):
         client.arm()
-    light_up(client)
-    assert emitted_uw(headset.remote) == pytest.approx(50, rel=0.02)
+    light_up(client, headset.remote)
+    until(lambda: show(client, 1) and emitted_uw(headset.remote) == pytest.approx(50, rel=0.02))
     until(lambda: emitted_uw(headset.remote) == 0, 3)  # nothing new is shown
-    assert client.status().lasers == Lasers.ARMED
-    show(client, 15)
-    assert emitted_uw(headset.remote) > 0  # without clearing or arming: nothing was wrong
+    until(lambda: client.status().lasers == Lasers.ARMED, 3)
+    # nothing was wrong, so nobody has to clear and arm
+    until(lambda: show(client, 2) and emitted_uw(headset.remote) > 0)
     client.dark()
     assert emitted_uw(headset.remote) == 0
 
 
 def test_the_camera_sees_what_the_lasers_light(headset: Headset, client: Client) -> None:
     dark = client.capture().mean()
-    light_up(client)
-    assert client.capture().mean() > dark + 20
-    show(client, 1)
+    light_up(client, headset.remote)
+    until(lambda: show(client, 1) and client.capture().mean() > dark + 20)
 
 
 def test_an_open_interlock_is_dark_and_latches(headset: Headset, client: Client) -> None:
-    light_up(client)
+    light_up(client, headset.remote)
     opened = headset.remote.set_to("interlock", False)
     assert emitted_uw(headset.remote) == 0
     assert all(at < opened + 0.02 for at, power in headset.remote.light(opened) if power)
@@ -115,14 +120,13 @@ def test_an_open_interlock_is_dark_and_latches(headset: Headset, client: Client)
     headset.remote.set_to("interlock", True)
     show(client, 10)
     assert emitted_uw(headset.remote) == 0  # closing it is not enough
-    light_up(client)
-    assert emitted_uw(headset.remote) > 0
+    light_up(client, headset.remote)
 
 
 def test_a_panel_that_is_unplugged_is_dark_and_comes_back_without_a_restart(
     headset: Headset, client: Client
 ) -> None:
-    light_up(client)
+    light_up(client, headset.remote)
     headset.remote.break_part("panel", "unplug")
     until(lambda: emitted_uw(headset.remote) == 0, 3)
     lost = show(client, 3)
@@ -130,18 +134,16 @@ def test_a_panel_that_is_unplugged_is_dark_and_comes_back_without_a_restart(
     until(lambda: client.status().panel == Part.LOST)
     headset.remote.mend("panel")
     until(lambda: client.status().panel == Part.FRESH)
-    light_up(client)
-    assert emitted_uw(headset.remote) > 0
+    light_up(client, headset.remote)
 
 
 @pytest.mark.parametrize("name", ["solver", "camera"])
 def test_a_killed_process_is_dark_and_is_started_again(headset: Headset, client: Client, name: str) -> None:
-    light_up(client)
+    light_up(client, headset.remote)
     os.kill(child(client, name), signal.SIGKILL)
     until(lambda: emitted_uw(headset.remote) == 0, 3)
     until(lambda: getattr(client.status(), name) == Part.FRESH)
-    light_up(client)
-    assert emitted_uw(headset.remote) > 0
+    light_up(client, headset.remote)
 
 
 def child(client: Client, name: str) -> int:
@@ -166,7 +168,7 @@ def test_a_slot_that_is_written_after_end_is_not_shown(client: Client) -> None:
 
 
 def test_one_program_has_the_display_and_others_may_look_and_darken(headset: Headset, client: Client) -> None:
-    light_up(client)
+    light_up(client, headset.remote)
     with connected(headset.file) as other:
         with pytest.raises(RefusedError) as refused:
             other.wait()
@@ -265,9 +267,8 @@ def test_sigterm_is_dark_first_and_tells_programs(tmp_path: Path) -> None:
             assert notify.recv(500) == b"WATCHDOG=1"
             with connected(file) as client:
                 until(lambda: client.status().panel == Part.FRESH and client.status().camera == Part.FRESH)
-                light_up(client)
+                light_up(client, remote)
                 client.show(picture(client))
-                assert emitted_uw(remote) > 0
                 process.send_signal(signal.SIGTERM)
                 out, err = process.communicate(timeout=10)
             assert process.returncode == 0, err
@@ -280,8 +281,7 @@ def test_a_service_that_is_killed_is_dark_by_the_dead_man_and_can_be_started_aga
     with hardware(tmp_path) as remote:
         with served(file) as process, connected(file) as client:
             until(lambda: client.status().panel == Part.FRESH and client.status().camera == Part.FRESH)
-            light_up(client)
-            assert emitted_uw(remote) > 0
+            light_up(client, remote)
             killed = time.monotonic()
             process.kill()
             process.wait()
@@ -289,8 +289,7 @@ def test_a_service_that_is_killed_is_dark_by_the_dead_man_and_can_be_started_aga
             assert max(at for at, _ in remote.light(killed)) < killed + 0.15
         with served(file), connected(file) as client:
             until(lambda: client.status().panel == Part.FRESH and client.status().camera == Part.FRESH)
-            light_up(client)
-            assert emitted_uw(remote) > 0
+            light_up(client, remote)
 
 
 def test_a_broken_bundle_ends_the_service_with_a_sentence(tmp_path: Path) -> None:
