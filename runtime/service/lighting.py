@@ -161,14 +161,14 @@ class Lighting(threading.Thread):
                 self._lasers.expect(dict.fromkeys(self._power, self._expected))
             elif what == "dark":
                 self._lasers.trip()
-                self._look()
+                self._dark()
             elif what == "clear":
                 # a board that was without power has lost its ceilings and limits: set everything anew
                 self._close()
                 self._lasers = self._open()
                 self._lasers.clear()
                 self._cleared_at = now
-                self._look()
+                self.state, self.faults = Lasers.OFF, 0
             elif now - self._cleared_at > CLEAR_TO_ARM_S:
                 return f"send Clear first, at most {CLEAR_TO_ARM_S:g} s before Arm"
             elif silent := self._silent(time.monotonic_ns()):
@@ -178,8 +178,7 @@ class Lighting(threading.Thread):
                 self._lasers.arm()
                 self.state = Lasers.ARMED
         except DEVICE_ERRORS as error:
-            if self._lasers is not None:
-                self._look()
+            self._dark()
             return str(error)
         return None
 
@@ -189,7 +188,15 @@ class Lighting(threading.Thread):
     def _fallen(self, kind: str, text: str) -> None:
         """The lasers are dark because of this."""
         self._fault(kind, text)
-        self._look()
+        self._dark()
+
+    def _dark(self) -> None:
+        """The driver has darkened everything; what the board says of that is asked at the next turn."""
+        self._ramp = None
+        self.level = dict.fromkeys(self._power, 0.0)
+        self._looked_at = 0.0
+        if self.armed:
+            self.state = Lasers.FAULT
 
     def _look(self) -> None:
         """What the board says of itself. Raises DeviceError where it says nothing."""

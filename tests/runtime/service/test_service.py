@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -20,7 +23,7 @@ from runtime.service import protocol
 from runtime.service.client import Client, Lost, RefusedError
 from runtime.service.messages import HEADER
 from runtime.service.protocol import Code, Lasers, Part, Shown
-from tests.campaigns.headset import connected, hardware, picture, served, write_configuration
+from tests.campaigns.headset import ENVIRONMENT, connected, hardware, picture, served, write_configuration
 
 
 class Headset(NamedTuple):
@@ -254,6 +257,63 @@ def test_a_passed_pipe_or_unsealed_memory_is_refused_as_a_ring(client: Client) -
         for fd in (reading, writing, loose):
             os.close(fd)
     assert len(show(client, 2)) == 2
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
+def test_a_program_in_c_shows_a_frame(headset: Headset, tmp_path: Path) -> None:
+    """With the header alone."""
+    source, header = Path(__file__).with_name("client.c"), Path(protocol.__file__).parent
+    program = tmp_path / "client"
+    command = [
+        "cc",
+        "-std=c11",
+        "-Wall",
+        "-Wextra",
+        "-Werror",
+        f"-I{header}",
+        str(source),
+        "-o",
+        str(program),
+    ]
+    subprocess.run(command, check=True)
+    path = headset.file.parent / "service.sock"
+    done = subprocess.run([program, path], capture_output=True, text=True, timeout=30, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("24 x 32, frame 1 in slot 1, ") and done.stdout.endswith("solver 1\n")
+
+
+def test_a_black_picture_is_dark_at_once_and_light_comes_back_without_arming(
+    headset: Headset, client: Client
+) -> None:
+    """No pattern shows black: all light goes somewhere."""
+    light_up(client, headset.remote)
+    client.show(np.zeros(client.shape, np.uint16))
+    until(lambda: list(client.outcomes(0.5)) is not None and emitted_uw(headset.remote) == 0, 0.4)
+    assert client.status().lasers == Lasers.ARMED
+    until(lambda: show(client, 2) and emitted_uw(headset.remote) > 0)
+
+
+def test_a_socket_that_systemd_passes_is_served(tmp_path: Path) -> None:
+    """sd_listen_fds: the listener is descriptor 3, and connections wait in it until the service is there."""
+    file = write_configuration(tmp_path)
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with listener, hardware(tmp_path):
+        listener.bind(str(tmp_path / "service.sock"))
+        listener.listen(4)
+        start = (
+            "import os, sys; os.dup2(int(sys.argv[1]), 3); os.set_inheritable(3, True); "
+            "os.environ.update(LISTEN_FDS='1', LISTEN_PID=str(os.getpid())); "
+            "os.execv(sys.executable, [sys.executable, '-m', 'runtime.cli', 'serve', sys.argv[2]])"
+        )
+        command = [sys.executable, "-c", start, str(listener.fileno()), str(file)]
+        process = subprocess.Popen(command, pass_fds=[listener.fileno()], env=ENVIRONMENT)
+        try:
+            with connected(file) as client:
+                assert len(show(client, 2)) == 2
+        finally:
+            process.terminate()
+            process.wait(10)
+    assert process.returncode == 0
 
 
 def test_sigterm_is_dark_first_and_tells_programs(tmp_path: Path) -> None:

@@ -1,0 +1,182 @@
+"""The lasers' thread with a board of the test's own: what makes it dark, and what light it allows a pattern."""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from firmware_iface.errors import DeviceError
+from firmware_iface.lasers.eye_safety import SIZES_MRAD
+from runtime.service.lighting import Lighting
+from runtime.service.protocol import Lasers
+
+SHARES = tuple(0.01 * (k + 1) for k in range(len(SIZES_MRAD)))
+
+
+class Board:
+    """Notes what it is told; fails as it is told."""
+
+    def __init__(self) -> None:
+        self.told: list[Any] = []
+        self.state, self.level, self.fails = "off", 0.0, ""
+
+    def _do(self, what: str) -> None:
+        if self.fails == what:
+            self.trip()
+            raise DeviceError(f"{what} failed")
+        if what not in ("status", "heartbeat"):
+            self.told.append(what)
+
+    def open(self) -> Board:
+        self._do("open")
+        return self
+
+    def heartbeat(self) -> None:
+        self._do("heartbeat")
+
+    def clear(self) -> None:
+        self._do("clear")
+        self.state = "off"
+
+    def arm(self) -> None:
+        self._do("arm")
+        self.state = "armed"
+
+    def trip(self) -> None:
+        self.told.append("trip")
+        self.state, self.level = "fault", 0.0
+
+    def off(self) -> None:
+        self._do("off")
+        self.level = 0.0
+
+    def close(self) -> None:
+        self.told.append("close")
+        self.state, self.level = "off", 0.0
+
+    def expect(self, shares: Any) -> float:
+        self.told.append(shares)
+        return 1.0
+
+    def power(self, channel: str) -> float:
+        return self.level
+
+    def ramp(self, channel: str, fraction: float) -> Iterator[None]:
+        for step in range(1, 5):
+            self.level = fraction * step / 4
+            yield
+
+    def status(self) -> dict[str, Any]:
+        self._do("status")
+        return {
+            "state": self.state,
+            "faults": ["host"] if self.state == "fault" else [],
+            "power": {"green": self.level},
+        }
+
+
+class Bench:
+    def __init__(self) -> None:
+        self.board, self.faults = Board(), []
+        self.solver_until = self.lit_until = time.monotonic_ns() + 10**12
+        self.lighting = Lighting(
+            self.board.open,
+            {"green": 0.5},
+            lambda: {"solver": self.solver_until},
+            lambda: self.lit_until,
+            lambda kind, text: self.faults.append(kind),
+        )
+
+    def ask(self, what: str) -> str | None:
+        answers: list[str | None] = []
+        self.lighting.ask(what, answers.append)
+        until(lambda: answers)
+        return answers[0]
+
+    def light_up(self) -> None:
+        assert self.ask("clear") is None and self.ask("arm") is None
+        until(lambda: self.board.level == 0.5)
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    bench = Bench()
+    bench.lighting.start()
+    yield bench
+    bench.lighting.stop()
+
+
+def until(condition, within_s: float = 5.0) -> None:
+    end = time.monotonic() + within_s
+    while not condition():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.002)
+
+
+def test_nothing_is_armed_without_clear_and_what_was_cleared_is_armed_once(bench: Bench) -> None:
+    assert "Clear first" in (bench.ask("arm") or "")
+    bench.light_up()
+    assert bench.ask("dark") is None
+    assert "Clear first" in (bench.ask("arm") or "") and bench.board.level == 0
+
+
+def test_a_loop_without_a_sign_of_life_latches(bench: Bench) -> None:
+    bench.light_up()
+    bench.solver_until = 0
+    until(lambda: bench.lighting.state == Lasers.FAULT)
+    assert bench.board.told[-1] == "trip" and bench.faults == ["silent"]
+    assert bench.ask("clear") is None and "solver" in (bench.ask("arm") or "")
+    bench.solver_until = time.monotonic_ns() + 10**12
+    bench.light_up()
+
+
+def test_what_is_stale_is_not_lit_and_nothing_latches(bench: Bench) -> None:
+    bench.light_up()
+    bench.lit_until = 0
+    until(lambda: bench.board.level == 0)
+    assert bench.lighting.state == Lasers.ARMED and bench.faults == []
+    bench.lit_until = time.monotonic_ns() + 10**12
+    until(lambda: bench.board.level == 0.5)
+
+
+@pytest.mark.parametrize("what", ["heartbeat", "off"])
+def test_a_board_that_fails_is_not_lit_again_by_itself(bench: Bench, what: str) -> None:
+    bench.light_up()
+    bench.board.fails = what
+    bench.lit_until = 0
+    until(lambda: bench.lighting.state == Lasers.FAULT)
+    bench.board.fails, bench.lit_until = "", time.monotonic_ns() + 10**12
+    time.sleep(0.1)
+    assert bench.board.level == 0 and bench.faults == ["lasers"]
+    bench.light_up()
+
+
+def test_a_board_that_says_nothing_is_opened_again(bench: Bench) -> None:
+    bench.light_up()
+    bench.board.fails = "status"
+    assert bench.ask("dark") is None  # it was told to go dark; that nothing is known of it then comes after
+    until(lambda: bench.lighting.state == Lasers.LOST)
+    bench.board.fails = ""
+    until(lambda: bench.lighting.state == Lasers.OFF)
+    bench.light_up()
+
+
+def test_a_pattern_waits_for_the_power_that_its_bright_spots_allow(bench: Bench) -> None:
+    bench.light_up()
+    shown: list[str] = []
+    bench.lighting.expect(struct.pack("<13f", *SHARES), lambda: shown.append("pattern"))
+    until(lambda: shown)
+    assert bench.board.told[-1] == {"green": pytest.approx(SHARES)}
+    told = len(bench.board.told)
+    bench.lighting.expect(bytes(52), lambda: shown.append("unpredicted"))
+    assert shown[-1] == "unpredicted" and len(bench.board.told) == told
+
+
+def test_the_end_is_dark(bench: Bench) -> None:
+    bench.light_up()
+    bench.lighting.stop()
+    assert bench.board.told[-1] == "close" and bench.board.level == 0
