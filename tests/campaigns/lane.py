@@ -105,11 +105,11 @@ class Lane:
         self.lost += sum(isinstance(o, Lost) for o in self.outcomes)
         return self.outcomes
 
-    def reconnect(self) -> None:
+    def reconnect(self, within_s: float = RECOVERY_S) -> None:
         """A new program in place of the one that went."""
         with suppress(OSError):
             self.client.close()
-        self.client = connected(self.file)
+        self.client = connected(self.file, within_s)
 
     def unanswered(self, within_s: float = 5.0) -> int:
         """How many accepted frames have no outcome, once there was time for one."""
@@ -131,9 +131,9 @@ class Lane:
             return None
         return max(at_s, changes[-1][0])
 
-    def light_up(self, arm: bool = True) -> bool:
+    def light_up(self, arm: bool = True, within_s: float = RECOVERY_S) -> bool:
         """Bring the headset to light, as a program does; whether that succeeded. arm: clear and arm where needed."""
-        end = time.monotonic() + RECOVERY_S
+        end = time.monotonic() + within_s
         while time.monotonic() < end:
             state = self.client.status()
             parts = {state.panel, state.solver, state.camera}
