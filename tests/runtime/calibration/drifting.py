@@ -10,7 +10,7 @@ import numpy as np
 
 from firmware_iface.virtual import BenchDescription, VirtualHeadset
 from firmware_iface.virtual.defects import make_defect
-from runtime.bundle import write_bundle
+from runtime.bundle import INITIALISER, write_bundle
 from runtime.calibrated import pack_light_paths
 from runtime.calibration.fit import Base
 from runtime.devices import Devices
@@ -46,7 +46,10 @@ def base(shape: tuple[int, int] = SHAPE) -> Base:
 
 def ideal_bundle(folder: Path, shape: tuple[int, int] = SHAPE) -> Path:
     records, arrays = pack_light_paths([("green", DISTANCE_MM, WAVELENGTH_NM, base(shape).path)])
-    write_bundle(folder, arrays, {"paths": records, "distance_mm": DISTANCE_MM}, {"bench": "ideal"})
+    networks = {INITIALISER: b"a network that calibration does not read"}
+    write_bundle(
+        folder, arrays, {"paths": records, "distance_mm": DISTANCE_MM}, {"bench": "ideal"}, networks=networks
+    )
     return folder
 
 

@@ -112,6 +112,7 @@ def test_the_bundle_is_replaced_and_the_old_one_is_kept(ran: Ran, capsys: pytest
     (record,) = new.provenance["calibrations"]
     assert record["heldout"] == ran.result["heldout"] and new.provenance["bench"] == "ideal"
     assert new.description["camera"]["counts_per_ms"]["green"] > 0
+    assert new.networks == old.networks != {}
     run(capsys, folder, "--restore")
     np.testing.assert_array_equal(load_light_path(read_bundle(folder)).source, np.ones(SHAPE))
     run(capsys, folder, "--restore")  # and back again
