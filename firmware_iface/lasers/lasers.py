@@ -35,7 +35,7 @@ from .wire import open_bus
 if TYPE_CHECKING:
     from smbus2 import SMBus
 
-BEAT_S, LATEST_BEAT_S, SOONEST_BEAT_S = 0.025, 0.050, 0.006
+BEAT_S, SOONEST_BEAT_S = 0.025, 0.006
 RAMP_S, RAMP_STEPS = 0.100, 20  # a rise of 5 ms a step is twice as slow as the safety controller's limiter
 TOLERANCE, FLOOR_V = 0.2, 0.02  # of the photodiode's voltage
 
@@ -109,15 +109,25 @@ class Lasers:
             self._wait(RAMP_S / RAMP_STEPS)
 
     def off(self) -> None:
-        """Every laser to 0, at once; the board stays armed. Where the DAC fails, everything is told to go dark."""
+        """Every laser to 0, at once, and read back; the board stays armed.
+
+        Raises DeviceError where the DAC does not do it; everything has then been told to go dark.
+        """
         self._forget()
         with self._dark_on_failure():
             self.parts.dac.dark()
+            now, _ = self.parts.dac.read()
+            if not all(output.dark for output in now):
+                raise DeviceError(
+                    "the DAC did not go dark when told to, so the lasers were switched off otherwise."
+                )
+        self._changed_at = self._clock()
 
     # --- arming and staying alive
 
     def clear(self) -> None:
         """First act after a fault: forget it. Raises DeviceError that says what holds it."""
+        self._forget()
         with self._dark_on_failure():
             self.parts.dac.dark()
             self.parts.controller.command(Command.CLEAR)
@@ -132,6 +142,7 @@ class Lasers:
         with self._dark_on_failure():
             state = self.parts.controller.state()
             if state is State.OFF:
+                self._forget()
                 self.parts.dac.dark()
                 self.parts.expander.enable((1 << len(self._lasers)) - 1)
                 self._beat()
@@ -241,9 +252,11 @@ class Lasers:
             )
 
     def _exposure(self, fractions: Mapping[str, float]) -> dict[str, float]:
-        power_uw = {c.name: c.full_power_uw * fractions[c.name] for c in self._lasers}
-        found = exposure(power_uw, self._wavelengths, self._shares)
+        found = exposure(self._power_uw(fractions), self._wavelengths, self._shares)
         return {"thermal": found.thermal, "photochemical": found.photochemical, "worst": found.worst}
+
+    def _power_uw(self, fractions: Mapping[str, float]) -> dict[str, float]:
+        return {c.name: c.full_power_uw * fractions[c.name] for c in self._lasers}
 
     # --- what is seen
 
@@ -259,7 +272,9 @@ class Lasers:
                 "power": fractions,
                 "celsius": round(self.parts.thermometer.celsius(), 2),
                 "class1": self._exposure(fractions),
-                "class1_at_full_power": self._exposure(dict.fromkeys(self.channels, 1.0))["worst"],
+                "class1_at_full_power": exposure(
+                    self._power_uw(dict.fromkeys(self.channels, 1.0)), self._wavelengths
+                ).worst,
             }
 
     def _look(self) -> None:
@@ -304,9 +319,9 @@ class Lasers:
         self._beat_at = self._clock()
 
     def _put(self, k: int, code: int) -> None:
-        self._changed_at = self._clock()
         self._codes[k] = code
         self.parts.dac.set_code(k, code)
+        self._changed_at = self._clock()
 
     def _select(self, k: int) -> None:
         self.parts.converter.select(k)
@@ -325,11 +340,8 @@ class Lasers:
                 f"the laser board does not answer ({error.strerror or error}), so the lasers were switched off; "
                 "check its power and its bus, then clear() and arm()."
             ) from error
-        except (InputError, LatchedError):
-            self._go_dark(Command.OFF)
-            raise
-        except BaseException:
-            self._go_dark()
+        except BaseException as error:
+            self._go_dark(Command.OFF if isinstance(error, InputError | LatchedError) else Command.FAULT)
             raise
 
     def trip(self) -> None:

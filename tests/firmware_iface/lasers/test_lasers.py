@@ -404,7 +404,10 @@ def test_the_budget_is_kept_across_channels_and_by_prediction(bench: Bench) -> N
     factor = lasers.expect(None)  # the next pattern may be one spot
     assert factor == pytest.approx(390 / 600)
     assert bench.light_uw <= 390
-    assert lasers.status()["class1"]["worst"] == pytest.approx(1)
+    status = lasers.status()
+    assert status["class1"]["worst"] == pytest.approx(1)
+    lasers.expect({"red": flat, "green": flat})
+    assert lasers.status()["class1_at_full_power"] == pytest.approx(600 / 390), "whatever is predicted"
 
 
 @pytest.mark.parametrize(
@@ -432,6 +435,27 @@ def test_an_exception_and_a_close_end_dark_and_disarmed(bench: Bench) -> None:
     assert bench.light_uw == 0 and not bench.board.controller.armed
     lasers.close()
     with pytest.raises(DeviceError, match="closed"):
+        lasers.heartbeat()
+
+
+@pytest.mark.parametrize("after", [0, 1])
+def test_an_off_that_noise_garbles_is_noticed(bench: Bench, after: int) -> None:
+    """The DAC has no packet error code, so it is read back."""
+    lasers = bench.armed()
+    lasers.set_power("green", 1.0)
+    bench.board.bus.faults.arm("garbage", after=after)
+    with pytest.raises(DeviceError, match="DAC"):
+        lasers.off()
+    assert bench.light_uw == 0 and not bench.board.controller.armed
+
+
+def test_clearing_while_it_emits_is_an_off_that_the_photodiodes_agree_with(bench: Bench) -> None:
+    lasers = bench.armed()
+    lasers.set_power("red", 1.0)
+    lasers.clear()
+    assert bench.light_uw == 0 and lasers.power("red") == 0
+    for _ in range(4):
+        bench.pass_time(0.025)
         lasers.heartbeat()
 
 

@@ -345,6 +345,7 @@ class FailingBus(RuleBasedStateMachine):
             return
         try:
             getattr(self.lasers, act)(*given)
+            assert act != "off" or self.bench.light_uw == 0, "off, and light"
         except InputError:
             return
         except DeviceError:
