@@ -120,6 +120,14 @@ class Solver:
         self.stacks = _stacks(paths)
         self.shape = self.stacks[0][0].grid.shape
         self.drives = [DriveRange(stack[0], levels) for stack in self.stacks]
+        if approximator is not None and (
+            len(self.stacks[0]) > 1 or approximator.shape != (len(self.stacks), *self.shape)
+        ):
+            raise InputError(
+                f"the approximator sees {' x '.join(map(str, approximator.shape))} (colours, height, width) in one "
+                f"plane, and there are {len(self.stacks)} colours of {self.shape[0]} x {self.shape[1]} in "
+                f"{len(self.stacks[0])} planes: export it for these"
+            )
         self.approximator, self.through = approximator, through
         self.region = _checked_region(region, self.shape)
         self.on = on or backend()

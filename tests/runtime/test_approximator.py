@@ -130,6 +130,16 @@ def test_three_colours_go_through_one_d() -> None:
         assert solution.qualities[k].psnr_db > untold.psnr_db + 4
 
 
+def test_a_d_of_another_panel_or_for_planes_is_refused(path: LightPath) -> None:
+    for paths, d in (
+        (path, made(fall_off((32, 40)))),
+        ([path, path], made(fall_off(SHAPE))),
+        ([[path, path]], made(fall_off(SHAPE))),
+    ):
+        with pytest.raises(InputError, match="export it for these"):
+            Solver(paths, approximator=d)
+
+
 def test_the_command_sees_through_the_bundles_d(
     path: LightPath, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
