@@ -19,6 +19,7 @@ from firmware_iface.errors import InputError
 from runtime.bundle import ADAPTERS, APPROXIMATOR, GRADIENT, Bundle
 from runtime.sessions import Session
 
+CORRECTIONS = 2  # of a target that is pre-distorted
 EPSILON = 1e-3  # under the square roots of the loss that is in the gradient's network
 
 
@@ -113,6 +114,26 @@ def approximator_of(bundle: Bundle, shape: tuple[int, int, int]) -> Approximator
                 f"{ADAPTERS} cannot be read as arrays: {error}; export the bundle again"
             ) from error
     return Approximator(shape, bundle.networks[APPROXIMATOR], bundle.networks.get(GRADIENT), adapters)
+
+
+def predistorted(d: Approximator, targets: np.ndarray) -> np.ndarray:
+    """Targets [C, 1, H, W] that D turns into the given ones, as nearly as two corrections find.
+
+    Where D is near the identity, t - D(J) is about what J lacks.
+    """
+    for c, (target,) in enumerate(targets):
+        np.multiply(target, 1 / float(np.mean(target, dtype=np.float64)), out=d.target[c])
+    d.irradiance[...] = d.target
+    for _ in range(CORRECTIONS):
+        d.correct()
+        for c in range(len(targets)):
+            made, wanted = d.corrected[c], d.target[c]
+            scale = float(np.vdot(made, wanted)) / max(float(np.vdot(made, made)), 1e-30)
+            made *= -scale
+            made += wanted
+            d.irradiance[c] += made
+            np.maximum(d.irradiance[c], 0, out=d.irradiance[c])
+    return d.irradiance[:, None]
 
 
 def _check(session: Session, inputs: set[str], outputs: set[str], shape: tuple[int, ...]) -> None:

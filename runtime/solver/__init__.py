@@ -4,7 +4,8 @@ from runtime.solver.drive import DriveRange
 from runtime.solver.method import METHODS
 from runtime.solver.penalty import PENALTIES
 from runtime.solver.quality import Quality, quality, quality_of, shown
-from runtime.solver.solver import Solution, Solver, solve
+from runtime.solver.solution import Solution
+from runtime.solver.solver import Solver, solve
 from runtime.solver.start import motion_between
 from runtime.solver.zero_order import beside_zero_order
 

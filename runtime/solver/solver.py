@@ -15,14 +15,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from firmware_iface.errors import InputError, nearest
-from runtime.approximator import Approximator
+from runtime.approximator import Approximator, predistorted
 from runtime.backend import Backend, backend
 from runtime.lightpath import LightPath
 from runtime.solver.budget import Pace
@@ -32,54 +31,14 @@ from runtime.solver.method import METHODS, Method
 from runtime.solver.objective import Objective, needs_fine_grid
 from runtime.solver.penalty import PENALTIES
 from runtime.solver.quality import Quality, quality, shown
+from runtime.solver.solution import Solution
 from runtime.solver.start import Start, entering, is_cut, motion_between, shifted
 
 Progress = Callable[[int, float], None]
 GRIDS = ("panel", "fine")
 WAYS = ("gradient", "predistorted")
 ITERATIONS = 20
-CORRECTIONS = 2  # of a target, for D
 _ENDLESS = 1 << 30
-
-
-@dataclass
-class Solution:
-    """Patterns for the colours of one picture; one colour has no axis of its own.
-
-    gray: uint8 [C, H, W] or [H, W]. phase: what was asked of the panel before rounding, rad. psnr_db: amplitude PSNR
-    before rounding, at the start and after each iteration, on the solver's own grid. milliseconds: from the
-    target to the gray levels. Both arrays are the solver's own: `gray` is written again by its second next
-    solve, `phase` by the next.
-    """
-
-    gray: np.ndarray
-    phase: np.ndarray
-    psnr_db: tuple[float, ...]
-    milliseconds: float
-    _judge: Callable[[], tuple[Quality, ...]] = field(repr=False)
-
-    @property
-    def iterations(self) -> int:
-        """Steps that were made."""
-        return len(self.psnr_db) - 1
-
-    @property
-    def expected_psnr_db(self) -> float:
-        """The pattern's error as the solver saw it, known at once: the best of `psnr_db`."""
-        return max(self.psnr_db)
-
-    @cached_property
-    def qualities(self) -> tuple[Quality, ...]:
-        """Of the gray levels, through the whole padded light path on the fine grid, a colour and plane each.
-
-        Computed when first asked for. Raises InputError where the arrays have been written again by then.
-        """
-        return self._judge()
-
-    @property
-    def quality(self) -> Quality:
-        """The first of `qualities`: the only one where there is one colour and plane."""
-        return self.qualities[0]
 
 
 class Solver:
@@ -366,26 +325,6 @@ def solve(
     deadline_ms = options.pop("deadline_ms", None)
     solver = Solver(path, levels, **options)
     return solver.solve(target, iterations, deadline_ms=deadline_ms, start=start, progress=progress)
-
-
-def predistorted(d: Approximator, targets: np.ndarray) -> np.ndarray:
-    """Targets [C, 1, H, W] that D turns into the given ones, as nearly as two corrections find.
-
-    Where D is near the identity, t - D(J) is about what J lacks.
-    """
-    for c, (target,) in enumerate(targets):
-        np.multiply(target, 1 / float(np.mean(target, dtype=np.float64)), out=d.target[c])
-    d.irradiance[...] = d.target
-    for _ in range(CORRECTIONS):
-        d.correct()
-        for c in range(len(targets)):
-            made, wanted = d.corrected[c], d.target[c]
-            scale = float(np.vdot(made, wanted)) / max(float(np.vdot(made, made)), 1e-30)
-            made *= -scale
-            made += wanted
-            d.irradiance[c] += made
-            np.maximum(d.irradiance[c], 0, out=d.irradiance[c])
-    return d.irradiance[:, None]
 
 
 def _stacks(paths: Any) -> list[list[LightPath]]:
