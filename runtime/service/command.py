@@ -20,14 +20,24 @@ CONFIG is one TOML file:
   stale_limit_ms = 80.0                  # what is older than this is not lit
   metrics_port = 9464                    # http://127.0.0.1:9464/metrics; 0: none
   users = [1000]                         # besides root and the service's own user, who may connect
+  channel = "green"                      # the colour to show, where the bundle has several
 
   [panel]
-  kind = "virtual"
+  kind = "board"                         # or dlpc900, mirrored
   [lasers]
-  kind = "virtual"
+  bus = "/dev/i2c-1"
   power = { green = 0.5 }                # fraction of full while something is shown
+  [[lasers.channel]]                     # calibration of each, in the order of the DAC's outputs
+  name = "green"
+  wavelength_nm = 520.0
+  full_power_uw = 100.0
+  threshold_ma = 40.0
+  slope_uw_per_ma = 4.0
   [camera]                               # may be left out
-  kind = "virtual"
+  kind = "oak"
+
+Without hardware: python -m firmware_iface.virtual.served SOCKET emulates it, and bus = "virtual:SOCKET" in [panel],
+[lasers] and (with kind = "virtual") [camera] leads there. firmware_iface/assembled.py lists all keys of the devices.
 
 Programs connect as runtime.service.client does in Python; hololoop_service.h, beside it, is for C. The lasers are
 dark until a program clears and arms them, and after every fault until it does so again.

@@ -36,7 +36,7 @@ class Lane:
         self, folder: Path, seed: int, oak: str | None = None, refresh_hz: float = REFRESH_HZ
     ) -> None:
         self.folder, self.seed = folder, seed
-        solve_ms = min(SOLVE_MS, 600 / refresh_hz)
+        solve_ms = min(SOLVE_MS, 300 / refresh_hz)
         self.file = write_configuration(folder, refresh_hz, solve_ms, STALE_MS, oak)
         self.accepted = self.shown = self.lost = 0
         self.outcomes: list[Shown | Lost] = []

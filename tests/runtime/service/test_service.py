@@ -19,10 +19,14 @@ import numpy as np
 import pytest
 
 from firmware_iface.virtual.served import Remote
+from runtime.cli import main
 from runtime.service import protocol
 from runtime.service.client import Client, Lost, RefusedError
+from runtime.service.configuration import read_configuration
+from runtime.service.link import Link, Peer
 from runtime.service.messages import HEADER
 from runtime.service.protocol import Code, Lasers, Part, Shown
+from runtime.service.supervisor import Supervisor
 from tests.campaigns.headset import ENVIRONMENT, connected, hardware, picture, served, write_configuration
 
 
@@ -291,6 +295,34 @@ def test_a_black_picture_is_dark_at_once_and_light_comes_back_without_arming(
     until(lambda: list(client.outcomes(0.5)) is not None and emitted_uw(headset.remote) == 0, 0.4)
     assert client.status().lasers == Lasers.ARMED
     until(lambda: show(client, 2) and emitted_uw(headset.remote) > 0)
+
+
+def test_a_user_who_is_not_listed_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the credentials that the kernel gives, before anything is read."""
+    supervisor = Supervisor(read_configuration(write_configuration(tmp_path)))
+    monkeypatch.setattr(Link, "peer", lambda link: Peer(1, 12345, 12345))
+    with (
+        socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener,
+        socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as program,
+    ):
+        listener.bind(str(tmp_path / "here"))
+        listener.listen(1)
+        program.connect(str(tmp_path / "here"))
+        supervisor._accept(listener)
+        _, error = protocol.PROTOCOL.unpack(program.recv(512))
+        assert error.code == Code.REFUSED and "12345" in error.text
+        assert program.recv(512) == b"" and not supervisor.sessions
+
+
+def test_the_lasers_are_switched_off_by_a_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What the unit runs after every end of the service."""
+    file = write_configuration(tmp_path)
+    with hardware(tmp_path) as remote:
+        assert main(["serve", "--dark", str(file), "--json"]) == 0
+        assert json.loads(capsys.readouterr().out) == {"dark": True}
+        assert emitted_uw(remote) == 0
+    assert main(["serve", "--dark", str(file)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_a_socket_that_systemd_passes_is_served(tmp_path: Path) -> None:
