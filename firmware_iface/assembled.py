@@ -37,6 +37,7 @@ from typing import Any
 
 from .errors import InputError, nearest
 from .lasers import VIRTUAL_CHANNELS, LaserChannel
+from .lasers.eye_safety import exposure
 from .virtual.tables import parameter, read_table
 
 Table = Mapping[str, Any]
@@ -142,8 +143,23 @@ def check_tables(tables: Mapping[str, Table]) -> None:
     ):
         if part in tables:
             read_table(kind, tables[part], f"[{part}]", ignore=others)
-    laser_channels(tables["lasers"])
-    laser_power(tables["lasers"])
+    _check_budget(tables["lasers"])
+
+
+def _check_budget(table: Table) -> None:
+    """Without a prediction, all light counts as one spot, and must be within the budget as it is."""
+    power, lasers = laser_power(table), {laser.name: laser for laser in laser_channels(table)}
+    if mrad_per_pixel(table):
+        return
+    used = exposure(
+        {name: fraction * lasers[name].full_power_uw for name, fraction in power.items()},
+        {name: lasers[name].wavelength_nm for name in power},
+    ).worst
+    if used > 1:
+        raise InputError(
+            f"power in [lasers] is {used:.2f} of the Class 1 budget of one spot; lower it, or write mrad_per_pixel, "
+            "so that the light of each pattern is predicted"
+        )
 
 
 def mrad_per_pixel(table: Table) -> float:

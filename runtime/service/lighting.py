@@ -24,6 +24,7 @@ from runtime.service.protocol import Lasers
 BEAT_S, RAMP_STEP_S = 0.020, 0.005
 LOOK_S = 0.1  # a board that is not armed is asked for its state so often
 AGAIN_S = 0.05  # between attempts to open the lasers
+RISE_AGAIN_S = 1.0  # after a pattern had the power lowered
 CLEAR_TO_ARM_S = 5.0
 DEVICE_ERRORS = (DeviceError, InputError, OSError)
 STATES = {"off": Lasers.OFF, "armed": Lasers.ARMED, "emit": Lasers.EMITTING, "fault": Lasers.FAULT}
@@ -68,6 +69,7 @@ class Lighting(threading.Thread):
         self._stopping = False
         self._cleared_at = -CLEAR_TO_ARM_S
         self._looked_at = 0.0
+        self._risen_at = 0.0
         self._expected: tuple[float, ...] = ()
         self.state, self.faults = Lasers.LOST, 0
         self.level = dict.fromkeys(power, 0.0)
@@ -146,12 +148,22 @@ class Lighting(threading.Thread):
             if self.state == Lasers.EMITTING:
                 self._lasers.off()
                 self.state = Lasers.ARMED
-        elif self.state == Lasers.ARMED and self._ramp is None:
+        elif self._ramp is None and (self.state == Lasers.ARMED or self._may_rise()):
             self._ramp = chain.from_iterable(self._lasers.ramp(c, p) for c, p in self._power.items())
+            self._risen_at = time.monotonic()
             self.state = Lasers.EMITTING
-        if self._ramp is not None and next(self._ramp, self) is self:
+        try:
+            if self._ramp is not None and next(self._ramp, self) is self:
+                self._ramp = None
+        except InputError as error:  # the pattern's bright spots do not allow it
             self._ramp = None
+            self._fault("budget", str(error))
         self.level = {channel: self._lasers.power(channel) for channel in self._power}
+
+    def _may_rise(self) -> bool:
+        """Whether a pattern had the power lowered, and enough time has passed for another to allow more."""
+        lowered = any(self.level[channel] < power for channel, power in self._power.items())
+        return lowered and time.monotonic() - self._risen_at > RISE_AGAIN_S
 
     def _do(self, what: str) -> str | None:
         """Do what was asked; what is wrong, or None."""

@@ -36,6 +36,12 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
         ("[panel]", "[panel]\nkind = 'slm'", "'kind' in [panel]"),
         ("[lasers]", "[lasers]\nbuss = 1", "did you mean 'bus'"),
         ('kind = "virtual"', 'kind = "webcam"', "'kind' in [camera]"),
+        (
+            "power = { green = 0.5 }",
+            "power = { hot = 1 }\nchannel = [{ name = 'hot', wavelength_nm = 450.0, full_power_uw = 50.0, "
+            "threshold_ma = 30.0, slope_uw_per_ma = 4.0 }]",
+            "1.28 of the Class 1 budget",  # 50 of 39 microwatts at 450 nm
+        ),
         ("[panel]", "[panel", "is not TOML"),
     ],
 )

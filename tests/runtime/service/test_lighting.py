@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
-from firmware_iface.errors import DeviceError
+from firmware_iface.errors import DeviceError, InputError
 from firmware_iface.lasers.eye_safety import SIZES_MRAD
 from runtime.service.lighting import Lighting
 from runtime.service.protocol import Lasers
 
-SHARES = tuple(0.01 * (k + 1) for k in range(len(SIZES_MRAD)))
+SHARES = tuple(0.02 + 0.001 * (k + 1) for k in range(len(SIZES_MRAD)))
 
 
 class Board:
@@ -23,6 +23,7 @@ class Board:
     def __init__(self) -> None:
         self.told: list[Any] = []
         self.state, self.level, self.fails = "off", 0.0, ""
+        self.allowed = 1.0
 
     def _do(self, what: str) -> None:
         if self.fails == what:
@@ -60,12 +61,16 @@ class Board:
 
     def expect(self, shares: Any) -> float:
         self.told.append(shares)
+        self.allowed = 0.2 if shares["green"][0] > 0.1 else 1.0
+        self.level = min(self.level, self.allowed)
         return 1.0
 
     def power(self, channel: str) -> float:
         return self.level
 
     def ramp(self, channel: str, fraction: float) -> Iterator[None]:
+        if fraction > self.allowed:
+            raise InputError("more than the budget of this pattern")
         for step in range(1, 5):
             self.level = fraction * step / 4
             yield
@@ -174,6 +179,18 @@ def test_a_pattern_waits_for_the_power_that_its_bright_spots_allow(bench: Bench)
     told = len(bench.board.told)
     bench.lighting.expect(bytes(52), lambda: shown.append("unpredicted"))
     assert shown[-1] == "unpredicted" and len(bench.board.told) == told
+
+
+def test_power_that_a_bright_spot_lowered_comes_back_when_a_pattern_allows_it(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("runtime.service.lighting.RISE_AGAIN_S", 0.05)
+    bench.light_up()
+    bench.lighting.expect(struct.pack("<13f", *(10 * s for s in SHARES)), lambda: None)
+    until(lambda: "budget" in bench.faults)
+    assert bench.board.level == pytest.approx(0.2) and bench.lighting.state == Lasers.EMITTING
+    bench.lighting.expect(struct.pack("<13f", *SHARES), lambda: None)
+    until(lambda: bench.board.level == 0.5)
 
 
 def test_the_end_is_dark(bench: Bench) -> None:
