@@ -297,6 +297,17 @@ def test_a_black_picture_is_dark_at_once_and_light_comes_back_without_arming(
     until(lambda: show(client, 2) and emitted_uw(headset.remote) > 0)
 
 
+def test_frames_are_lit_by_all_lasers_when_the_light_of_each_pattern_is_predicted(tmp_path: Path) -> None:
+    """Every pattern then waits for the lasers' word before it is shown."""
+    file = write_configuration(tmp_path)
+    power = "power = { red = 1.0, green = 1.0, blue = 1.0 }\nmrad_per_pixel = 5.0"
+    file.write_text(file.read_text().replace("power = { green = 0.5 }", power))
+    with hardware(tmp_path) as remote, served(file), connected(file) as client:
+        until(lambda: client.status().panel == Part.FRESH and client.status().camera == Part.FRESH)
+        light_up(client, remote)
+        until(lambda: show(client, 2) and emitted_uw(remote) == pytest.approx(235, rel=0.02))
+
+
 def test_a_user_who_is_not_listed_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By the credentials that the kernel gives, before anything is read."""
     supervisor = Supervisor(read_configuration(write_configuration(tmp_path)))
