@@ -1,7 +1,11 @@
-"""The service that owns the headset's devices: programs hand it pictures, it shows them by the displays' clock.
+"""The service that owns the headset's devices: programs hand it pictures, it shows them by the display's clock.
 
-supervisor       this process: sockets, panel, lasers, heartbeat, metrics
-solver_process   pictures to patterns
+supervisor       the service's own process: sockets and programs (sessions, frames), metrics, systemd
+pipeline         from an accepted frame to the panel (display), through the solver's process
+lighting         the lasers and their heartbeat
+eye              the camera's process, as the supervisor sees it
+solver_process   pictures to patterns (solving)
 camera_process   the camera and its library
-client           what a program uses; hololoop_service.h is the same for C
+protocol         what programs and the service say; hololoop_service.h is the same for C
+client           what a program uses
 """

@@ -11,6 +11,7 @@ from __future__ import annotations
 import struct
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -64,7 +65,7 @@ class Lighting(threading.Thread):
         self._lit_until_ns, self._fault = lit_until_ns, fault
         self._lasers: Any = None
         self._ramp: Iterator[None] | None = None
-        self._requests: list[Request] = []
+        self._requests: deque[Request] = deque()
         self._wake = threading.Event()
         self._stopping = False
         self._cleared_at = -CLEAR_TO_ARM_S
@@ -120,8 +121,8 @@ class Lighting(threading.Thread):
 
     def _turn(self) -> None:
         """One beat: what was asked, whether all is fresh, the heartbeat, the light."""
-        requests, self._requests = self._requests, []
-        for request in requests:
+        while self._requests:
+            request = self._requests.popleft()
             request.answer(self._do(request.what))
         if self._lasers is None:
             self._lost(DeviceError("the laser board could not be opened"))
@@ -224,9 +225,8 @@ class Lighting(threading.Thread):
         if self.state != Lasers.LOST:
             self._fault("laser_bus", str(error))
         self.state, self.faults = Lasers.LOST, 0
-        requests, self._requests = self._requests, []
-        for request in requests:
-            request.answer(f"the lasers do not answer: {error}")
+        while self._requests:
+            self._requests.popleft().answer(f"the lasers do not answer: {error}")
         self._close()
 
     def _close(self) -> None:
