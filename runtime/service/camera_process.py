@@ -60,7 +60,7 @@ def main(fd: str, configuration: str) -> None:
     while True:
         try:
             camera = open_camera(table)
-        except (DeviceError, InputError) as error:
+        except (DeviceError, InputError, OSError) as error:
             link.send(Missing(str(error)))
         else:
             watchdog.fed()
