@@ -211,10 +211,22 @@ def running(path: Path, bench: str, seed: int = 0, oak: str | None = None) -> It
         process.wait()
 
 
+_backends: dict[str, tuple[Remote, VirtualUsb]] = {}  # opening a panel again makes no second connection
+
+
 def usb_backend(bus: str) -> VirtualUsb:
     """A pyusb backend with the panel board of `virtual:SOCKET` on it. Raises DeviceGoneError."""
-    model: Any = _RemoteModel(reach(bus))
-    return _RemoteUsb(model)
+    known = _backends.get(bus)
+    if known is not None:
+        try:
+            known[0].ask({"usb": "present"})
+            return known[1]
+        except OSError:  # its process has ended; there may be another
+            known[0].close()
+    remote = reach(bus)
+    model: Any = _RemoteModel(remote)
+    _backends[bus] = remote, _RemoteUsb(model)
+    return _backends[bus][1]
 
 
 def i2c_bus(bus: str) -> str:

@@ -9,6 +9,7 @@ import threading
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from .board import LaserBoard
 from .bus import Message, failure
@@ -71,24 +72,58 @@ class BoardServer:
 
 
 class RemoteBus:
-    """The bus of a board that another process serves."""
+    """The bus of a board that another process serves; connected again at the next transfer where that was lost."""
 
     def __init__(self, path: str) -> None:
+        self._path = path
         self._lock = threading.Lock()
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._socket.connect(path)
+        self._socket: socket.socket | None = None
 
     def transfer(self, messages: Sequence[Message]) -> list[bytes]:
         """Carry the messages; the bytes read. Raises OSError as an adapter."""
         asked = [(m.address, None if m.data is None else m.data.hex(), m.length) for m in messages]
         with self._lock:
-            self._socket.send(json.dumps(asked).encode())
-            answer = json.loads(self._socket.recv(PACKET) or str(errno.ENODEV))
+            answer = self._ask(json.dumps(asked).encode())
         if isinstance(answer, int):
             raise failure(answer)
         return [bytes.fromhex(reply) for reply in answer]
 
+    def reach(self) -> None:
+        """Connect, unless it is connected. Raises OSError where nobody serves the bus."""
+        if self._socket is None:
+            opened = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            try:
+                opened.connect(self._path)
+            except OSError:
+                opened.close()
+                raise
+            self._socket = opened
+
+    def _ask(self, packet: bytes) -> Any:
+        try:
+            self.reach()
+            assert self._socket is not None
+            self._socket.send(packet)
+            reply = self._socket.recv(PACKET)
+        except OSError:
+            reply = b""
+        if not reply:
+            if self._socket is not None:
+                self._socket.close()
+                self._socket = None
+            return errno.ENODEV
+        return json.loads(reply)
+
+
+_nodes: dict[str, tuple[RemoteBus, str]] = {}  # by socket: opening a bus again makes no second connection
+
 
 def connect(path: str) -> str:
     """A node for smbus2.SMBus, with the bus that is served at `path` behind it. Raises OSError."""
-    return attach(RemoteBus(path))
+    if path not in _nodes:
+        bus = RemoteBus(path)
+        bus.reach()
+        _nodes[path] = bus, attach(bus)
+    bus, node = _nodes[path]
+    bus.reach()
+    return node
