@@ -68,7 +68,7 @@ def strike(lane: Lane, kind: Kind) -> tuple[float | None, bool]:
             time.sleep(0.002)
         dark = lane.dark_since(at)
     kind.heal(lane)
-    return None if dark is None else dark - at, lane.light_up(kind.arm)
+    return None if dark is None else dark - at, lane.light_up()
 
 
 def run_lane(number: int, plan: list[str], seed: int, oak: bool) -> Result:

@@ -20,7 +20,6 @@ class Kind:
 
     weight : how often, of all. strike : makes the fault; when, monotonic s. dark : light is not allowed after it.
     heal : takes the cause away, or nothing. shows : the program goes on showing meanwhile (it would wait otherwise).
-    arm : light comes back only after Clear and Arm
     """
 
     name: str
@@ -29,7 +28,6 @@ class Kind:
     dark: bool
     heal: Callable[[Lane], object] = lambda lane: None
     shows: bool = True
-    arm: bool = True
 
 
 def _part(part: str, kind: str, weight: float, dark: bool, count: int | None = 1) -> Kind:
@@ -174,8 +172,8 @@ KINDS = (
         lambda lane: lane.service.send_signal(signal.SIGCONT),
         shows=False,
     ),
-    Kind("program gone", 1, _program_gone, True, Lane.reconnect, shows=False, arm=False),
-    Kind("program pauses", 2, _program_pauses, True, shows=False, arm=False),
+    Kind("program gone", 1, _program_gone, True, Lane.reconnect, shows=False),
+    Kind("program pauses", 2, _program_pauses, True, shows=False),
     Kind("torn slot", 3, _torn_slot, False),
     Kind("garbage from a program", 3, _garbage_program, False),
 )

@@ -131,15 +131,15 @@ class Lane:
             return None
         return max(at_s, changes[-1][0])
 
-    def light_up(self, arm: bool = True, within_s: float = RECOVERY_S) -> bool:
-        """Bring the headset to light, as a program does; whether that succeeded. arm: clear and arm where needed."""
+    def light_up(self, within_s: float = RECOVERY_S) -> bool:
+        """Bring the headset to light, as a program does: show, clear and arm where needed. Whether that succeeded."""
         end = time.monotonic() + within_s
         while time.monotonic() < end:
             state = self.client.status()
             parts = {state.panel, state.solver, state.camera}
             if state.lasers == Lasers.EMITTING and parts == {Part.FRESH} and self.lit():
                 return True
-            if arm and parts == {Part.FRESH} and state.lasers in (Lasers.OFF, Lasers.FAULT):
+            if parts == {Part.FRESH} and state.lasers in (Lasers.OFF, Lasers.FAULT):
                 with suppress(RefusedError):
                     self.client.clear()
                     self.client.arm()
