@@ -11,7 +11,7 @@ help:
 	@echo "make install     make .venv and install hololoop in it, with exactly the versions of constraints.txt"
 	@echo "make test        check the style and the types, run the tests"
 	@echo "make demo        the whole loop on a virtual bench"
-	@echo "make benchmark   measure the runtime on this machine"
+	@echo "make benchmark   measure how fast the trainer is on this machine (hololoop-runtime benchmark: the solver)"
 	@echo "make clean       remove caches and build products (.venv stays; rm -r .venv removes it)"
 
 install: $(STAMP)

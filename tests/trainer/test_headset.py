@@ -6,11 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tomlkit
 
 from firmware_iface.errors import InputError
+from firmware_iface.virtual import open_headset
+from tests.campaigns.headset import hardware, write_configuration
+from tests.trainer.hidden import ran
 from tests.trainer.taught import SHAPE, fringed, known
+from trainer.bench_file import bench_tables
 from trainer.capture import capture_set
-from trainer.headset import RealHeadset, open_bench
+from trainer.headset import RealHeadset, nominal_bench, open_bench
 
 
 def test_real_lasers_stay_within_the_power_that_is_set(tmp_path: Path) -> None:
@@ -45,3 +50,18 @@ def test_a_real_headset_needs_a_description_of_its_bench(tmp_path: Path) -> None
     with open_bench("virtual:mixed", 1) as opened:
         assert opened.bench.panel.shape == (96, 128) == opened.headset.panel.shape
         assert np.prod(SHAPE) < 96 * 128
+
+
+def test_a_set_is_captured_through_the_drivers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """USB panel and I2C lasers, emulated down to their bytes: what comes out is a set of that bench."""
+    configuration = write_configuration(tmp_path)
+    described = tmp_path / "known.toml"
+    described.write_text(tomlkit.dumps(bench_tables(nominal_bench(open_headset(str(tmp_path / "bench.toml"))))))
+    captures = tmp_path / "captures"
+    with hardware(tmp_path) as remote:
+        options = ["--known", described, "--out", captures, "--patterns", 4]
+        taken = ran(capsys, "capture", "--bench", configuration, *options)
+        light = [power for _, power in remote.light()]
+    assert taken["captures"] == 5
+    assert light[-1] == 0 and max(light) == pytest.approx(50, rel=0.02)  # the configuration's half of full power
+    assert ran(capsys, "compare", captures)["heldout"]["excess"] < 0.01
