@@ -53,6 +53,9 @@ class Result:
     accepted: int = 0
     shown: int = 0
     lost: int = 0
+    stored: int = (
+        0  # times that garbage had got into the DAC's EEPROM, which was then written dark with the key off
+    )
     troubles: list[str] = field(default_factory=list)
 
 
@@ -95,6 +98,7 @@ def run_lane(number: int, plan: list[str], seed: int, oak: bool) -> Result:
             result.unanswered += lane.unanswered()
             result.torn = lane.torn()
             result.accepted, result.shown, result.lost = lane.accepted, lane.shown, lane.lost
+            result.stored = lane.stored
         finally:
             lane.close()
     return result
@@ -132,7 +136,7 @@ def campaign(count: int, seed: int, lanes: int, oak: bool) -> Result:
                 for key in ("faults", "dark_required", "dark_in_time", "recovered"):
                     setattr(into, key, getattr(into, key) + getattr(tally, key))
                 into.worst_dark_s = max(into.worst_dark_s, tally.worst_dark_s)
-            for key in ("torn", "unanswered", "accepted", "shown", "lost"):
+            for key in ("torn", "unanswered", "accepted", "shown", "lost", "stored"):
                 setattr(total, key, getattr(total, key) + getattr(part, key))
             total.troubles += part.troubles
     return total
@@ -197,6 +201,7 @@ def main() -> int:
         print(table(result))
         print(*(f"{key}: {value}" for key, value in found.items() if key != "by_kind"), sep="\n")
         print(f"{result.accepted} frames accepted, {result.shown} shown, {result.lost} lost with an error")
+        print(f"the DAC's EEPROM written dark again: {result.stored}")
         print(f"{time.monotonic() - began:.0f} s")
     kept = found["dark_in_time"] == found["dark_required"] and found["not_recovered"] == 0
     return 0 if kept and found["torn_frames"] == found["lost_without_error"] == 0 else 1

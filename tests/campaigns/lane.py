@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_iface.virtual.served import Remote
+from firmware_iface.virtual.served import Remote, i2c_bus
 from runtime.service.client import Client, Lost, RefusedError
 from runtime.service.protocol import Lasers, Part, Shown
 from tests.campaigns.headset import ENVIRONMENT, connected, hardware, picture, urgent, write_configuration
@@ -21,6 +21,7 @@ from tests.campaigns.service import noted
 PICTURES = 16
 REFRESH_HZ, SOLVE_MS, STALE_MS = 100.0, 3.0, 80.0
 RECOVERY_S = 15.0
+LOST_FOR_S = 1.0  # without the safety controller, before a person looks at the laser board
 
 
 class Lane:
@@ -29,7 +30,8 @@ class Lane:
     oak : loopback address of an emulated OAK camera, or none for the camera without a link
 
     Attributes: remote (the hardware), client, service (the process), accepted, shown and lost (numbers of frames),
-    latest (number of the frame that was accepted last), outcomes (those that were taken last).
+    latest (number of the frame that was accepted last), outcomes (those that were taken last), stored (how often the
+    DAC's EEPROM was written dark again).
     """
 
     def __init__(
@@ -40,7 +42,7 @@ class Lane:
         self.file = write_configuration(folder, refresh_hz, solve_ms, STALE_MS, oak)
         self.accepted = self.shown = self.lost = 0
         self.outcomes: list[Shown | Lost] = []
-        self.latest = 0
+        self.latest = self.stored = 0
         self._stack = ExitStack()
         self.remote: Remote = self._stack.enter_context(hardware(folder, seed, oak))
         self.service = self.start_service()
@@ -134,8 +136,14 @@ class Lane:
     def light_up(self, within_s: float = RECOVERY_S) -> bool:
         """Bring the headset to light, as a program does: show, clear and arm where needed. Whether that succeeded."""
         end = time.monotonic() + within_s
+        answered = time.monotonic()
         while time.monotonic() < end:
             state = self.client.status()
+            if state.lasers != Lasers.LOST:
+                answered = time.monotonic()
+            elif time.monotonic() > answered + LOST_FOR_S:
+                self.store_dark()
+                answered = time.monotonic()
             parts = {state.panel, state.solver, state.camera}
             if state.lasers == Lasers.EMITTING and parts == {Part.FRESH} and self.lit():
                 return True
@@ -145,6 +153,15 @@ class Lane:
                     self.client.arm()
             self.frame()
         return False
+
+    def store_dark(self) -> None:
+        """What a person is asked to do where noise on the bus has got into the DAC's EEPROM: write it dark, key off."""
+        bus = i2c_bus(f"virtual:{self.folder / 'hardware.sock'}")
+        self.remote.set_to("key", False)
+        command = [sys.executable, "-m", "firmware_iface.lasers.store_dark", bus]
+        subprocess.run(command, env=ENVIRONMENT, capture_output=True)
+        self.remote.set_to("key", True)
+        self.stored += 1
 
     def torn(self) -> int:
         """How many different images the panel has displayed that are no pattern of the solver's."""

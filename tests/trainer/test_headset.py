@@ -56,12 +56,16 @@ def test_a_set_is_captured_through_the_drivers(tmp_path: Path, capsys: pytest.Ca
     """USB panel and I2C lasers, emulated down to their bytes: what comes out is a set of that bench."""
     configuration = write_configuration(tmp_path)
     described = tmp_path / "known.toml"
-    described.write_text(tomlkit.dumps(bench_tables(nominal_bench(open_headset(str(tmp_path / "bench.toml"))))))
+    described.write_text(
+        tomlkit.dumps(bench_tables(nominal_bench(open_headset(str(tmp_path / "bench.toml")))))
+    )
     captures = tmp_path / "captures"
     with hardware(tmp_path) as remote:
         options = ["--known", described, "--out", captures, "--patterns", 4]
         taken = ran(capsys, "capture", "--bench", configuration, *options)
         light = [power for _, power in remote.light()]
     assert taken["captures"] == 5
-    assert light[-1] == 0 and max(light) == pytest.approx(50, rel=0.02)  # the configuration's half of full power
+    assert light[-1] == 0 and max(light) == pytest.approx(
+        50, rel=0.02
+    )  # the configuration's half of full power
     assert ran(capsys, "compare", captures)["heldout"]["excess"] < 0.01

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
-import pytest
+from pathlib import Path
 
+import pytest
+import smbus2
+
+from firmware_iface.lasers.wire import open_bus
+from firmware_iface.virtual.served import i2c_bus
 from tests.campaigns.faults import campaign, plans, summary
 from tests.campaigns.kinds import KINDS
+from tests.campaigns.lane import Lane
 from tests.campaigns.soak import soak
 
 
@@ -46,3 +52,17 @@ def test_a_run_without_faults_loses_nothing_and_does_not_grow() -> None:
         found["lost"] <= 2
     )  # a machine that does other things may stop everything for longer than a frame may wait
     assert all(memory["end"] - memory["settled"] < 3 for memory in found["memory_mb"].values())
+
+
+def test_noise_in_the_dacs_memory_keeps_the_light_off_until_it_is_written_dark(tmp_path: Path) -> None:
+    """As garbage on the bus can write it. Opening the lasers refuses until a person has mended it."""
+    lane = Lane(tmp_path, 0)
+    try:
+        assert lane.light_up()
+        with open_bus(i2c_bus(f"virtual:{tmp_path / 'hardware.sock'}")) as bus:
+            bus.i2c_rdwr(smbus2.i2c_msg.write(0x60, [0x50, 0x81, 0x00, 0x81, 0x00, 0x81, 0x00, 0x81, 0x00]))
+        lane.remote.break_part("lasers", "nack")
+        assert lane.light_up()
+        assert lane.stored == 1
+    finally:
+        lane.close()
