@@ -219,7 +219,9 @@ def _guesses(points: np.ndarray, first: int, second: int, dots: Dots) -> list[np
         if np.hypot(*(near - wanted)) > 0.45 * np.hypot(*along):
             continue
         camera = np.stack([points[first], points[second], near])
-        guesses.append(_fitted_map(camera, dots.xy[[0, 1, dots.columns]], perspective=False))
+        guess = _fitted_map(camera, dots.xy[[0, 1, dots.columns]], perspective=False)
+        if guess is not None:
+            guesses.append(guess)
     return guesses
 
 
@@ -243,7 +245,7 @@ def _refined(points: np.ndarray, guess: np.ndarray, dots: Dots) -> tuple[float, 
         camera, panel = points[keep], dots.xy[index[keep]]
         # too few for a perspective: an affine map, which does not bend
         found = _fitted_map(camera, panel, len(keep) >= 9, max(0.05 * dots.spacing, 1.0))
-        if not np.isfinite(found).all():
+        if found is None or not np.isfinite(found).all():
             return None
         homography = found
     error = np.hypot(*(panel_points(homography, camera) - panel).T)
@@ -251,32 +253,19 @@ def _refined(points: np.ndarray, guess: np.ndarray, dots: Dots) -> tuple[float, 
 
 
 def _fitted_map(
-    camera: np.ndarray, panel: np.ndarray, perspective: bool, tolerance: float = math.inf
-) -> np.ndarray:
-    """The homography, or affine map, [3, 3], that takes camera points [n, 2] to panel points [n, 2].
+    camera: np.ndarray, panel: np.ndarray, perspective: bool, tolerance: float = 3.0
+) -> np.ndarray | None:
+    """The homography, or affine map, [3, 3], that takes camera points [n, 2] to panel points [n, 2], by OpenCV.
 
-    Least squares of the equations that are linear in its eight (six) numbers, weighted again and again so that points
-    far beyond `tolerance` (panel pixels) lose their say.
+    Points farther off than `tolerance` (panel pixels) have no say (RANSAC). None where there is no such map.
     """
-    middle, size = (
-        camera.mean(0),
-        max(float(camera.std()), 1e-9),
-    )  # near 0 and of order one, or it is ill-posed
-    u, v = ((camera - middle) / size).T
-    one, none = np.ones_like(u), np.zeros_like(u)
-    rows = [
-        np.stack([u, v, one, none, none, none, -u * panel[:, 0], -v * panel[:, 0]], 1),
-        np.stack([none, none, none, u, v, one, -u * panel[:, 1], -v * panel[:, 1]], 1),
-    ]
-    equations = np.concatenate(rows)[:, : 8 if perspective else 6]
-    wanted, weight = panel.T.ravel(), np.ones(2 * len(panel))
-    into = np.diag([1 / size, 1 / size, 1.0])
-    into[:2, 2] = -middle / size
-    for _ in range(8 if math.isfinite(tolerance) else 1):
-        numbers = np.linalg.lstsq(equations * weight[:, None], wanted * weight, rcond=None)[0]
-        found = np.append(numbers, np.zeros(9 - len(numbers)))
-        found[8] = 1.0
-        found = found.reshape(3, 3) @ into
-        away = np.hypot(*(panel_points(found, camera) - panel).T) / tolerance
-        weight = np.tile(1 / (1 + away**2), 2)
-    return found
+    import cv2  # the headset needs it for a dot pattern alone
+
+    if perspective:
+        found, _ = cv2.findHomography(camera, panel, cv2.RANSAC, tolerance)
+        return None if found is None else np.asarray(found)
+    if len(camera) == 3:
+        affine = cv2.getAffineTransform(camera.astype(np.float32), panel.astype(np.float32))
+    else:
+        affine, _ = cv2.estimateAffine2D(camera, panel, ransacReprojThreshold=tolerance)
+    return None if affine is None else np.vstack([affine, [0, 0, 1]])
