@@ -66,7 +66,7 @@ def arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--iterations",
         metavar="N",
-        type=_whole(0, 100000),
+        type=whole(0, 100000),
         help="steps a pattern (default 20, or as many as the deadline allows; 0: double phase alone)",
     )
     parser.add_argument(
@@ -100,7 +100,9 @@ def arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--fit", action="store_true", help="crop and resize pictures of another size")
 
 
-def _whole(low: int, high: int) -> Callable[[str], int]:
+def whole(low: int, high: int) -> Callable[[str], int]:
+    """An option's whole number within a range."""
+
     def read(text: str) -> int:
         try:
             value = int(text)

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from typing import NoReturn
 
-from firmware_iface.errors import InputError, nearest
+from firmware_iface.errors import DeviceError, InputError, nearest
 from trainer.commands import explaining, looping, making, registering, starting, training
 from trainer.commands.command import PROGRAM, Command, Interrupted, release
 from trainer.commands.screen import Screen, one_line
@@ -77,7 +77,7 @@ def main(argv: list[str] | None = None) -> int:
             return _main(arguments)
     except _NoReader:
         return NO_READER
-    except InputError as error:
+    except (DeviceError, InputError) as error:
         return _stopped(str(error), BAD_INPUT)
     except Interrupted as stop:
         return _stopped(str(stop), INTERRUPTED)

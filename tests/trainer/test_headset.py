@@ -15,6 +15,7 @@ from tests.trainer.hidden import ran
 from tests.trainer.taught import SHAPE, fringed, known
 from trainer.bench_file import bench_tables
 from trainer.capture import capture_set
+from trainer.cli import main
 from trainer.headset import RealHeadset, nominal_bench, open_bench
 
 
@@ -69,3 +70,18 @@ def test_a_set_is_captured_through_the_drivers(tmp_path: Path, capsys: pytest.Ca
         50, rel=0.02
     )  # the configuration's half of full power
     assert ran(capsys, "compare", captures)["heldout"]["excess"] < 0.01
+
+
+def test_a_headset_that_is_not_there_is_said_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    configuration = write_configuration(tmp_path)
+    described = tmp_path / "known.toml"
+    described.write_text(
+        tomlkit.dumps(bench_tables(nominal_bench(open_headset(str(tmp_path / "bench.toml")))))
+    )
+    words = ["capture", "--bench", configuration, "--known", described, "--out", tmp_path / "captures"]
+    assert main([*map(str, words)]) == 2
+    said = capsys.readouterr().err
+    assert "there is no emulated hardware" in said and said.count("\n") == 1
+    assert not (tmp_path / "captures").exists()

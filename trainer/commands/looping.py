@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from firmware_iface.errors import InputError
+from runtime.solving import whole
 from trainer.commands.command import (
     Command,
     Result,
@@ -17,7 +18,6 @@ from trainer.commands.command import (
     model_options,
     number,
     out_option,
-    whole,
     workers_of,
 )
 from trainer.commands.screen import Screen

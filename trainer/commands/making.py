@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from firmware_iface.errors import InputError, nearest
+from runtime.solving import whole
 from trainer.commands.command import (
     Command,
     Result,
@@ -18,7 +19,6 @@ from trainer.commands.command import (
     effects_option,
     out_option,
     use_every_core,
-    whole,
     worker_options,
 )
 from trainer.commands.screen import Screen, plain

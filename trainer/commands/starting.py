@@ -5,7 +5,8 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from trainer.commands.command import Command, Result, out_option, use_every_core, whole
+from runtime.solving import whole
+from trainer.commands.command import Command, Result, out_option, use_every_core
 from trainer.commands.screen import Screen
 from trainer.commands.training import seed_option
 

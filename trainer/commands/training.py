@@ -7,6 +7,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from runtime.solving import whole
 from trainer.commands.command import (
     Command,
     Result,
@@ -17,7 +18,6 @@ from trainer.commands.command import (
     number,
     out_option,
     use_every_core,
-    whole,
 )
 from trainer.commands.screen import Screen
 
