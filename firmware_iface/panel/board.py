@@ -260,8 +260,8 @@ class BulkFrames:
             except DeviceError as error:
                 refusal = self._control.recover()
                 raise DeviceError(
-                    f"{self._link.name} did not take frame {self._sequence}: it refused {refusal}; "
-                    f"check its cable. ({error})"
+                    f"{error} Frame {self._sequence} was sent twice and not taken: "
+                    f"the board refused {refusal}; check its cable."
                 ) from error
         return self._sequence
 
