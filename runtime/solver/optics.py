@@ -59,6 +59,7 @@ class Optics:
         self.transfers = [xp.asarray(t.astype(pair)) for t in transfers]
         self.conjugates = [t.conj() for t in self.transfers]
         self.weights = [float(w) for w in path.weights]
+        self.strongest = int(np.argmax(path.weights))
 
         first = fine * grid.margin if integrate else 0
         height, width = (fine * n + 2 * first for n in grid.shape)
@@ -115,7 +116,7 @@ class Optics:
 
         The adjoint of the strongest mode: its inverse, up to a constant, where the pupil passes all.
         """
-        mode = int(np.argmax(self.weights))
+        mode = self.strongest
         self.fields[mode][...] = 0
         self.fields[mode][self.at_pixels] = wave
         self._off_image(mode, None)

@@ -32,7 +32,7 @@ from runtime.solver.objective import Objective, needs_fine_grid
 from runtime.solver.penalty import PENALTIES
 from runtime.solver.quality import Quality, quality, shown
 from runtime.solver.solution import Solution
-from runtime.solver.start import Start, entering, is_cut, motion_between, shifted
+from runtime.solver.start import Start, is_cut, motion_between, renewed, shifted
 
 Progress = Callable[[int, float], None]
 GRIDS = ("panel", "fine")
@@ -93,7 +93,10 @@ class Solver:
         fine = needs_fine_grid(self.stacks) if grid is None else grid == "fine"
         seen_through = approximator if through == "gradient" else None
         self.objective = Objective(self.stacks, 2 if fine else 1, penalty, self.region, seen_through, self.on)
-        self.starts = [Start(self.objective, stack[0], c) for c, stack in enumerate(self.stacks)]
+        self.starts = [
+            Start(self.objective, stack[0], c, drive.gapless and initialiser is None)
+            for c, (stack, drive) in enumerate(zip(self.stacks, self.drives, strict=True))
+        ]
         made = METHODS[method]
         self.method: Method | None = made(self.objective, self.drives, **options) if made else None
         if method == "gerchberg_saxton" and (penalty != "amplitude" or seen_through):
@@ -172,8 +175,9 @@ class Solver:
             if any(motion):
                 other = next(phase for phase in self.phases if phase is not self.phases[0])
                 self._cold(optics_targets, other)
-                for part in entering(motion, self.shape):
-                    self.phases[0][part] = other[part]
+                for phase, fresh, start in zip(self.phases[0], other, self.starts, strict=True):
+                    for part in renewed(motion, start.edges, self.shape):
+                        phase[part] = fresh[part]
         else:
             self._cold(optics_targets, self.phases[0])
         return self._improve(targets, begun, iterations, deadline_ms, None)

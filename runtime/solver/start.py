@@ -17,16 +17,21 @@ LOUD = 0.98  # share of pixels whose amplitude double phase reproduces; brighter
 LOOKED_AT = 5  # every so many pixels, an axis, are ranked for that
 CUT = 0.7  # of the contrast: a frame that differs by more from the one before, moved, is another scene
 PATCH = 512  # side of the part that motion is found in
+FAINTEST = 0.7  # of the amplitude in the middle: fainter edges of the image are not made up for any further
+EDGES = (
+    3  # edges of a frame begin anew this many times as far in as the panel's own edge darkens an even image
+)
 
 
 class Start:
     """First phases for an objective, in place.
 
     ramp: tilt (cycles a pixel; rows, columns) of the light in the image, for a pupil whose opening is off the
-    axis: the middle of what it passes.
+    axis: the middle of what it passes. lift [H, W]: what an amplitude is multiplied by, since the panel ends and
+    the edges of an image get only part of their light. edges: how far in that goes, pixels (rows, columns).
     """
 
-    def __init__(self, objective: Objective, path: LightPath, colour: int) -> None:
+    def __init__(self, objective: Objective, path: LightPath, colour: int, doubled: bool) -> None:
         xp = objective.backend.xp
         self.backend, self.objective, self.colour = objective.backend, objective, colour
         self.optics: Optics = objective.optics[colour][0]
@@ -44,9 +49,10 @@ class Start:
         self.ramp = [
             _turns(cycles, n, pair) for cycles, n in zip(middle_of(path), (height, width), strict=True)
         ]
-        sign = np.ones((2, 2), path.response.dtype)
-        sign[0, 1] = sign[1, 0] = -1
-        self.chequer = sign
+        self.lift: Array = None
+        self.edges = 0, 0
+        if doubled:
+            self._see_edges()
 
     def double_phase(self, amplitude: np.ndarray, phase: Array) -> None:
         """Fill `phase` (rad) [H, W] with a pattern that shows an amplitude [H, W] at once, without iterations.
@@ -92,14 +98,39 @@ class Start:
 
         self.backend.over_rows(len(phase), self.objective.strip, work)
 
+    def _see_edges(self) -> None:
+        """Find `lift` and `edges` from an even image taken back to the panel and forth again.
+
+        What goes forth is complex: the mean of the fields of the two phases that double phase is made of.
+        """
+        xp, optics, wave = self.backend.xp, self.optics, self.wave
+        self._wave(np.ones(wave.shape, np.float32))
+        size, angle = xp.abs(wave), xp.arctan2(wave.imag, wave.real)
+        size /= size.max()
+        xp.arccos(size, out=size)
+        light, mode = xp.zeros(wave.shape, angle.dtype), optics.strongest
+        optics.forward(angle + size, light)
+        wave[...] = optics.fields[mode][optics.at_pixels]
+        optics.forward(angle - size, light)
+        wave += optics.fields[mode][optics.at_pixels]
+        reached = xp.abs(wave)
+        reached /= max(float(xp.median(reached[::LOOKED_AT, ::LOOKED_AT])), 1e-30)
+        down, across = (n // 2 for n in wave.shape)
+        whole = (int(xp.argmax(along >= 1)) for along in (reached[:, across], reached[down]))
+        self.edges = tuple(min(EDGES * n, middle) for n, middle in zip(whole, (down, across), strict=True))
+        xp.clip(reached, FAINTEST, 1 / FAINTEST, out=reached)
+        self.lift = 1 / reached
+
     def _wave(self, amplitude: np.ndarray) -> None:
         """What the pixels would have to do to the beam, of any scale."""
         xp, wave, over = self.backend.xp, self.wave, self.over_source
-        given = xp.asarray(amplitude)
+        given, lift = xp.asarray(amplitude), self.lift
 
         def tilt(worker: int, rows: slice) -> None:
             xp.multiply(given[rows], self.ramp[0][rows, None], out=wave[rows])
             wave[rows] *= self.ramp[1]
+            if lift is not None:
+                wave[rows] *= lift[rows]
 
         def unlit(worker: int, rows: slice) -> None:
             wave[rows] *= over[rows]
@@ -135,14 +166,18 @@ def shifted(before: Array, motion: tuple[int, int], out: Array) -> None:
             out[..., to_rows, to] = before[..., from_rows, of]
 
 
-def entering(motion: tuple[int, int], shape: tuple[int, int]) -> list[tuple[Any, ...]]:
-    """The parts of a panel [..., H, W] where content that moves by (down, right) comes in."""
+def renewed(motion: tuple[int, int], edges: tuple[int, int], shape: tuple[int, int]) -> list[tuple[Any, ...]]:
+    """The parts of a panel [..., H, W] that begin anew where content moves by (down, right).
+
+    Where content comes in there is nothing to go on from; and along its edges a pattern makes up for the
+    panel's end, which does not move. Left alone, both grow into speckle within a few frames.
+    """
     parts: list[tuple[Any, ...]] = []
-    for axis, (step, count) in enumerate(zip(motion, shape, strict=True)):
-        if step:
-            width = min(abs(step), count)
-            edge = slice(0, width) if step > 0 else slice(count - width, count)
-            parts.append((..., edge, slice(None)) if axis == 0 else (..., edge))
+    for axis, (step, edge, count) in enumerate(zip(motion, edges, shape, strict=True)):
+        first, last = (min(max(edge, way * step), count) for way in (1, -1))
+        for part in (slice(0, first), slice(count - last, count)):
+            if part.stop > part.start:
+                parts.append((..., part, slice(None)) if axis == 0 else (..., part))
     return parts
 
 

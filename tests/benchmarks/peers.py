@@ -6,6 +6,7 @@
 1080 x 1920, 8 um, 520 nm, 200 mm, an iris of half the panel's band, 256 gray levels, scikit-image's astronaut.
 
     hololoop         this solver, 20 iterations
+    hololoop_longer  this solver, 60 iterations
     adam_published   torch, autograd, Adam as neural-holography publishes it (rate 8e-3, learned scale of rate 2e-3),
                      zero-padded to twice the size, from the same double phase
     adam_tuned       the same loop with the best rate and betas found (0.1; 0.9, 0.999), scale in closed form
@@ -58,14 +59,18 @@ def double_phase(target: np.ndarray, distance: float) -> np.ndarray:
     return solve(path, target, 0).phase.copy()
 
 
-def hololoop(target: np.ndarray, distance: float, iterations: int) -> Solved:
+def hololoop(target: np.ndarray, distance: float, iterations: int, most: int = 20) -> Solved:
     from runtime.ideal import ideal_path, single
     from runtime.solver import Solver
 
     solver = Solver(single(ideal_path(target.shape, PITCH, WAVELENGTH, distance, IRIS)))
     solver.rehearse(target)
-    solution = solver.solve(target, min(iterations, 20))
+    solution = solver.solve(target, min(iterations, most))
     return solution.phase, solution.milliseconds / 1e3, solution.iterations
+
+
+def hololoop_longer(target: np.ndarray, distance: float, iterations: int) -> Solved:
+    return hololoop(target, distance, iterations, 60)
 
 
 def _torch_adam(
@@ -179,7 +184,8 @@ def torchoptics(target: np.ndarray, distance: float, iterations: int) -> Solved:
 
 
 PEERS: dict[str, Callable[[np.ndarray, float, int], Solved]] = {
-    f.__name__: f for f in (hololoop, adam_published, adam_tuned, adam_random, odak, torchoptics)
+    f.__name__: f
+    for f in (hololoop, hololoop_longer, adam_published, adam_tuned, adam_random, odak, torchoptics)
 }
 
 

@@ -91,11 +91,13 @@ def torch_path(path: LightPath) -> LightPath:
     return replace(path, **{name: one(getattr(path, name)) for name in ARRAYS})
 
 
-def padded_irradiance(phase: np.ndarray, distance: float, oversampling: int = 4, pad: int = 3) -> np.ndarray:
+def padded_irradiance(
+    phase: np.ndarray, distance: float, oversampling: int = 4, pad: int = 3, iris: float = 1.0
+) -> np.ndarray:
     """What panel-sized pixels integrate, [H, W], of square pixels of this phase: an independent simulation.
 
     Plain double-precision FFTs of the panel drawn on sub-pixels, each a square, `pad` times larger all round;
-    the exact transfer function of free space; only the panel's own band passes.
+    the exact transfer function of free space; the panel's own band passes, or the `iris` share of it.
     """
     height, width = phase.shape
     q = oversampling
@@ -104,7 +106,7 @@ def padded_irradiance(phase: np.ndarray, distance: float, oversampling: int = 4,
     fy = np.fft.fftfreq(field.shape[0], PITCH / q)[:, None]
     fx = np.fft.fftfreq(field.shape[1], PITCH / q)[None, :]
     square = np.sinc(fy * PITCH / q) * np.sinc(fx * PITCH / q)
-    edge = 1 / (2 * PITCH) * (1 + 1e-9)
+    edge = iris / (2 * PITCH) * (1 + 1e-9)
     passed = (np.abs(fy) <= edge) & (np.abs(fx) <= edge)
     root = np.sqrt(np.maximum(1 / WAVELENGTH**2 - fy**2 - fx**2, 0))
     image = np.fft.ifft2(np.fft.fft2(field) * square * passed * np.exp(2j * np.pi * distance * root))

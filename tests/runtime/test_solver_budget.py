@@ -214,6 +214,37 @@ def test_video_begins_with_the_frame_before_moved() -> None:
         assert warm.quality.psnr_db > unmoved.quality.psnr_db + 3
 
 
+def test_a_long_pan_does_not_decay() -> None:
+    """One iteration a frame: within 1 dB of ten cold ones inside a border, no worse than one cold one to the edge."""
+    shape = (160, 200)
+    path = ideal_path(shape, 0.01, 0.5, np.float32)
+    whole = scene((shape[0] + 40, shape[1] + 60), 7)
+
+    def frame(k: int) -> np.ndarray:
+        return np.ascontiguousarray(whole[k : k + shape[0], 2 * k : 2 * k + shape[1]])
+
+    region = np.zeros(shape)
+    region[30:-30, 30:-30] = 1
+    for weight, cold_iterations, within in ((region, 10, 1.0), (None, 1, 0.5)):
+        solver = Solver(path, region=weight)
+        solver.frame(frame(0), 10)
+        for k in range(1, 25):
+            warm = solver.frame(frame(k), 1)
+        cold = Solver(path, region=weight).solve(frame(24), cold_iterations)
+        assert warm.quality.psnr_db > cold.quality.psnr_db - within
+
+
+def test_the_start_lights_an_even_picture_evenly_to_its_edges() -> None:
+    """Where the panel ends, light from beyond is missing; the start makes up for it, judged by a padded propagation."""
+    shape = (160, 200)
+    path = ideal_path(shape, 0.01, 0.5, np.float32)
+    light = padded_irradiance(solve(path, np.ones(shape), 0).phase, 0.01, oversampling=2, iris=0.5)
+    middle = np.sqrt(light[40:-40, 40:-40]).mean()
+    edges = [light[:4, 40:-40], light[-4:, 40:-40], light[40:-40, :4], light[40:-40, -4:]]
+    for edge in edges:
+        assert np.sqrt(edge).mean() > 0.9 * middle
+
+
 def test_motion_is_found_and_a_cut_begins_cold(half: LightPath) -> None:
     whole = scene((160, 200), 3)
     before, after = whole[20:116, 30:158], whole[13:109, 35:163]
