@@ -18,8 +18,10 @@ if PARALLEL:  # before NumPy and torch are imported: workers that each take ever
 # after the variables: Hypothesis may bring NumPy in
 import hypothesis  # noqa: E402
 
-# a deadline measures the neighbours on a busy machine, not the code
-hypothesis.settings.register_profile("hololoop", deadline=None)
+# A deadline measures the neighbours on a busy machine, not the code. A run tries the same examples as the one before;
+# `pytest --hypothesis-profile search` looks for others.
+hypothesis.settings.register_profile("hololoop", deadline=None, derandomize=True)
+hypothesis.settings.register_profile("search", deadline=None)
 hypothesis.settings.load_profile("hololoop")
 
 
