@@ -1,7 +1,8 @@
 """The devices that a configuration names, opened: one table each, one function each.
 
 [panel]                       a panel board over USB (firmware_iface/panel/PROTOCOL.md)
-kind = "board"                or "dlpc900", TI's phase light modulator, or "mirrored", a panel that is a screen
+kind = "board"                or "dlpc900", TI's phase light modulator, or "mirrored", a panel that is a screen, or
+                              "MODULE:FUNCTION", a function of yours that opens one (firmware_iface.own_device)
 bus = "virtual:SOCKET"        emulated hardware (firmware_iface.virtual.served); without it, the host's USB
 serial = "HL0001"             where several are attached
 refresh_hz = 60.0             of the panel itself
@@ -23,7 +24,8 @@ threshold_ma = 40.0
 slope_uw_per_ma = 4.0
 
 [camera]
-kind = "oak"                  the Luxonis OAK line; "virtual" with bus: emulated hardware without the camera's link
+kind = "oak"                  the Luxonis OAK line; "virtual" with bus: emulated hardware without the camera's link;
+                              or "MODULE:FUNCTION"
 address = "10.0.0.5"          its IP address, MX ID or USB path; without it, the first that is found
 exposure_ms = 10.0
 frames_per_s = 60.0
@@ -38,16 +40,19 @@ from typing import Any
 from .errors import InputError, nearest
 from .lasers import VIRTUAL_CHANNELS, LaserChannel
 from .lasers.eye_safety import exposure
+from .own_device import check_kind, open_own
 from .virtual.tables import parameter, read_table
 
 Table = Mapping[str, Any]
+
+KINDS = {"panel": ("board", "dlpc900", "mirrored"), "camera": ("oak", "virtual")}
 
 
 @dataclass(frozen=True)
 class PanelTable:
     """[panel]"""
 
-    kind: str = parameter("board", "which panel", choices=("board", "dlpc900", "mirrored"))
+    kind: str = parameter("board", "which panel")
     bus: str = parameter("usb", "usb, or virtual:SOCKET")
     serial: str = parameter("", "serial number, where several are attached")
     refresh_hz: float = parameter(60.0, "of the panel", 10, 1000)
@@ -72,7 +77,7 @@ class LasersTable:
 class CameraTable:
     """[camera]"""
 
-    kind: str = parameter("oak", "which camera", choices=("oak", "virtual"))
+    kind: str = parameter("oak", "which camera")
     bus: str = parameter("", "virtual:SOCKET")
     address: str = parameter("", "IP address, MX ID or USB path")
     exposure_ms: float = parameter(10.0, "exposure time", 0.001, 10000)
@@ -84,7 +89,9 @@ def open_panel(table: Table) -> Any:
     from .panel import open_board, open_dlpc900, open_mirrored, plm
     from .panel.board import Timing
 
-    asked = read_table(PanelTable, table, "[panel]")
+    asked = _panel_table(table)
+    if asked.kind not in KINDS["panel"]:
+        return open_own(asked.kind, "panel")
     if asked.kind == "mirrored":
         return open_mirrored(max(0, asked.display), (asked.height, asked.width))
     if asked.kind == "dlpc900":
@@ -116,7 +123,11 @@ def open_lasers(table: Table) -> Any:
 
 def open_camera(table: Table) -> Any:
     """The camera of a configuration's [camera]. Raises InputError or DeviceError."""
-    asked = read_table(CameraTable, table, "[camera]")
+    asked = _camera_table(table)
+    if asked.kind not in KINDS["camera"]:
+        camera = open_own(asked.kind, "camera")
+        camera.exposure_ms = asked.exposure_ms
+        return camera
     if asked.kind == "oak":
         from .camera import open_oak
 
@@ -136,14 +147,24 @@ def open_camera(table: Table) -> Any:
 
 def check_tables(tables: Mapping[str, Table]) -> None:
     """Check [panel], [lasers] and [camera] without opening anything. Raises InputError."""
-    for part, kind, others in (
-        ("panel", PanelTable, ()),
-        ("lasers", LasersTable, ("power", "channel")),
-        ("camera", CameraTable, ()),
-    ):
-        if part in tables:
-            read_table(kind, tables[part], f"[{part}]", ignore=others)
+    if "panel" in tables:
+        _panel_table(tables["panel"])
+    if "camera" in tables:
+        _camera_table(tables["camera"])
+    read_table(LasersTable, tables["lasers"], "[lasers]", ignore=("power", "channel"))
     _check_budget(tables["lasers"])
+
+
+def _panel_table(table: Table) -> PanelTable:
+    asked = read_table(PanelTable, table, "[panel]")
+    check_kind(asked.kind, "panel", KINDS["panel"])
+    return asked
+
+
+def _camera_table(table: Table) -> CameraTable:
+    asked = read_table(CameraTable, table, "[camera]")
+    check_kind(asked.kind, "camera", KINDS["camera"])
+    return asked
 
 
 def _check_budget(table: Table) -> None:

@@ -23,7 +23,7 @@ CONFIG is one TOML file:
   channel = "green"                      # the colour to show, where the bundle has several
 
   [panel]
-  kind = "board"                         # or dlpc900, mirrored
+  kind = "board"                         # or dlpc900, mirrored, "my_lab:panel"
   [lasers]
   bus = "/dev/i2c-1"
   power = { green = 0.5 }                # fraction of full while something is shown

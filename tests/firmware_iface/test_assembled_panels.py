@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
-from firmware_iface.assembled import open_panel
+from firmware_iface.assembled import check_tables, open_camera, open_panel
 from firmware_iface.errors import DeviceError, InputError
 
 
@@ -26,3 +28,45 @@ def test_kinds_and_modulators_that_are_not_known_are_refused() -> None:
     for table in ({"kind": "dlpc"}, {"kind": "dlpc900", "modulator": "p50"}, {"display": 64}):
         with pytest.raises(InputError):
             open_panel(table)
+
+
+LAB = """
+class Screen:
+    shape = (3, 5)
+    def show(self, gray): self.gray = gray
+    def status(self): return {}
+    def close(self): pass
+
+class Eye:
+    shape, bit_depth, exposure_ms = (2, 2), 10, 1.0
+    def capture(self): return None
+    def close(self): pass
+
+def screen(): return Screen()
+def eye(): return Eye()
+def number(): return 3
+def broken(): raise OSError("no such port")
+nothing = None
+"""
+
+
+def test_a_function_of_the_labs_own_opens_its_panel_and_camera(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Found in the current folder; what cannot be used is said, before anything is shown."""
+    (tmp_path / "a_lab.py").write_text(LAB)
+    monkeypatch.chdir(tmp_path)
+    assert open_panel({"kind": "a_lab:screen"}).shape == (3, 5)
+    assert open_camera({"kind": "a_lab:eye", "exposure_ms": 4.0}).exposure_ms == 4.0
+    check_tables({"panel": {"kind": "a_lab:screen"}, "lasers": {"bus": "virtual:x", "power": {"green": 0.1}}})
+    for kind, error, message in (
+        ("a_lab:number", InputError, "returned int, which has no 'shape'"),
+        ("a_lab:broken", DeviceError, "cannot be opened: no such port"),
+        ("a_lab:nothing", InputError, "is no function"),
+        ("a_lab:missing", InputError, "cannot be imported"),
+        ("no_such_lab:panel", InputError, "cannot be imported"),
+        ("bord", InputError, "did you mean 'board'"),
+        ("a_lab:", InputError, "MODULE:FUNCTION"),
+    ):
+        with pytest.raises(error, match=message):
+            open_panel({"kind": kind})

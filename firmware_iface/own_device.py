@@ -1,0 +1,80 @@
+"""A device of the lab's own in a configuration: kind = "MODULE:FUNCTION", whose result is the panel or camera.
+
+# my_lab.py
+from slmsuite.hardware.slms.meadowlark import Meadowlark
+from firmware_iface.slmsuite import SlmsuitePanel
+
+def panel():
+    return SlmsuitePanel(Meadowlark(wav_um=0.52))
+
+# headset.toml
+[panel]
+kind = "my_lab:panel"
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import Any
+
+from .errors import DeviceError, InputError, nearest
+
+NEEDED = {"panel": ("shape", "show", "status", "close"), "camera": ("shape", "bit_depth", "capture", "close")}
+
+
+def check_kind(kind: str, part: str, known: Collection[str]) -> None:
+    """Raise InputError where a kind of a [panel] or [camera] is neither known nor MODULE:FUNCTION."""
+    if kind in known:
+        return
+    module, _, function = kind.partition(":")
+    if not (function.isidentifier() and all(name.isidentifier() for name in module.split("."))):
+        raise InputError(
+            f"'kind' in [{part}] is {kind!r}: {nearest(kind, known)}; a device of your own is written "
+            '"MODULE:FUNCTION".'
+        )
+
+
+def open_own(kind: str, part: str) -> Any:
+    """What the function of kind = "MODULE:FUNCTION" returns; modules of the current folder are found, too.
+
+    part : "panel" or "camera", which say what it has to have (see NEEDED). Raises InputError where it cannot be called
+    or returns something else, DeviceError where it fails.
+    """
+    function = _imported(kind, part)
+    try:
+        device = function()
+    except (InputError, DeviceError):
+        raise
+    except Exception as error:  # vendors' libraries raise what they like
+        raise DeviceError(
+            f"the {part} of {kind} cannot be opened: {error or type(error).__name__}."
+        ) from error
+    if missing := [name for name in NEEDED[part] if not hasattr(device, name)]:
+        raise InputError(
+            f"{kind} returned {type(device).__name__}, which has no '{missing[0]}': a {part} needs "
+            f"{', '.join(NEEDED[part])}."
+        )
+    return device
+
+
+def _imported(kind: str, part: str) -> Callable[[], Any]:
+    module, _, name = kind.partition(":")
+    here = str(Path.cwd())
+    sys.path.insert(0, here)
+    try:
+        function = getattr(importlib.import_module(module), name)
+    except Exception as error:  # whatever the lab's module does when it is read
+        raise InputError(
+            f"'kind' in [{part}] is {kind!r}, which cannot be imported ({error}): install the module, or start "
+            "where its file is."
+        ) from error
+    finally:
+        sys.path.remove(here)
+    if not callable(function):
+        raise InputError(
+            f"'kind' in [{part}] is {kind!r}, which is no function: name one that opens the {part}."
+        )
+    return function
