@@ -69,8 +69,8 @@ def grid_for(
 
     A ray at the edge of the iris (`half_width` as a share of the panel's band 1 / (2 pitch)) walks lambda z
     half_width / (2 pitch) sideways; six tenths more hold the tails of the aperture's own diffraction. (On a 240 x 320
-    panel at 30 mm the ideal model's held-out excess is 2.6e-4, 1.7e-4, 1.2e-4 and 0.9e-4 at 1.1, 1.25, 1.4 and 1.6 times
-    the walk. A solver alone would do with 1.1: 0.01 dB less at 540 x 960; calibration would not.)
+    panel at 30 mm the ideal model's held-out excess is 2.6e-4, 1.7e-4, 1.2e-4 and 0.9e-4 at 1.1, 1.25, 1.4 and
+    1.6 times the walk. A solver alone would do with 1.1: 0.01 dB less at 540 x 960; calibration would not.)
     """
     walk = wavelength * abs(distance) * half_width / (2 * pitch**2)
     room = max(math.ceil(1.6 * walk), 2 * margin)
