@@ -1,9 +1,7 @@
 """Free-form probes: the most general thing each stage could be doing, fitted alone.
 
 The stage whose probe removes most of the held-out excess is where the missing physics sits, also when no named
-effect fits; and a fitted probe is a picture, in which a fringe, a speck or a stripe is recognised at sight. Probes
-are fitted by L-BFGS with the light path's own gradient, from "absent", and stopped early: what one capture's noise
-asks of a map is not what the others ask, so the first iterations find what all captures share.
+effect fits; and a fitted probe is a picture, in which a fringe, a speck or a stripe is recognised at sight.
 """
 
 from __future__ import annotations
@@ -19,23 +17,18 @@ import torch
 from torch import Tensor
 
 from runtime.legendre import legendre_count, legendre_curve, legendre_surface
-from runtime.lightpath import mode_irradiance, panel_phase, panel_spectrum
 from trainer.candidates import chosen, opened
 from trainer.captures import Capture
 from trainer.evidence import Batch, load, load_batch, scenes
 from trainer.excess import Errors, Removed, errors_of, join, removed
-from trainer.fit import Predictor
+from trainer.free_form import Kind, Picture, Tensors, Working, descend
 from trainer.model import Model
-from trainer.prediction import Trace, counts, light_on_camera, light_path, trace
+from trainer.panel_field import UNITS, resized, with_field
 from trainer.scene import Stages
-
-Picture = tuple[str, np.ndarray, str]
-Tensors = dict[str, Tensor]
 
 ROUND = 2  # iterations between two looks at the capture that says when to stop
 ROUNDS = {"drive": 7, "panel": 12, "pupil": 10, "sensor": 12}
 CAPTURES = {"drive": 4, "panel": 8, "pupil": 6, "sensor": 8}  # most that the gradient sees
-PATIENCE = 3  # rounds without progress on that capture
 NODES = {"panel": 80_000, "sensor": 9_000}  # most nodes of a free map; larger pictures get coarser maps
 PUPIL_NODES = 97  # nodes of the pupil's map across its extent, an axis
 PUPIL_EXTENT = 1.3  # of the panel's band
@@ -88,55 +81,14 @@ def probe(
     each = max(1, CAPTURES[stage] // len(last))
     batches = load(captures, [c for scene in scenes(rows) for c in _of(scene, rows, last)[:each]])
     kind = PROBES[stage](model, batches[0])
-    seen = [_Working(model, b) for b in batches]
-    unseen = [_Working(model, b) for b in load(captures, last)]
     scale = sum(float(errors_of(b, torch.zeros_like(b.signal)).variance.sum()) for b in batches)
-    raw = {n: torch.zeros(shape, requires_grad=True) for n, (shape, _) in kind.shapes.items()}
-
-    def physical() -> Tensors:
-        return {n: t * kind.shapes[n][1] for n, t in raw.items()}
-
-    optimiser = torch.optim.LBFGS(
-        list(raw.values()),
-        max_iter=ROUND,
-        max_eval=2 * ROUND,
-        history_size=10,
-        tolerance_change=0,
-        line_search_fn="strong_wolfe",
-    )
-
-    def loss_and_gradient() -> float:
-        optimiser.zero_grad()
-        total = 0.0
-        for working in seen:
-            for k in range(len(working.batch.ids)):
-                loss = working.squared_error(kind, physical(), k) / scale
-                loss.backward()
-                total += float(loss.detach())
-        return total
-
-    def unseen_error() -> float:
-        with torch.no_grad():
-            found = physical()
-            return sum(
-                float(w.squared_error(kind, found, k)) for w in unseen for k in range(len(w.batch.ids))
-            )
-
     # One capture a colour and plane is kept from the gradient and says when to stop.
-    best, least = {n: t.detach().clone() for n, t in raw.items()}, unseen_error()
-    waited = 0
-    for _ in range(ROUNDS[stage]):
-        optimiser.step(loss_and_gradient)
-        error = unseen_error()
-        if error < least:
-            best, least, waited = {n: t.detach().clone() for n, t in raw.items()}, error, 0
-        elif (waited := waited + 1) == PATIENCE:
-            break
+    seen, unseen = ([Working(model, b) for b in part] for part in (batches, load(captures, last)))
+    found = descend(kind, seen, unseen, scale, ROUND, ROUNDS[stage])
     with torch.no_grad():
-        found = {n: t * kind.shapes[n][1] for n, t in best.items()}
         parts = []
         for row in chosen(captures, held_ids):
-            working = _Working(model, load_batch(captures, [row]))
+            working = Working(model, load_batch(captures, [row]))
             parts.append(errors_of(working.batch, working.predict(kind, found, 0)))
         return ProbeFit(stage, join(parts), tuple(kind.pictures(found)))
 
@@ -147,55 +99,7 @@ def _of(scene: tuple[str, float], rows: list[Capture], last: Collection[Capture]
     return [c for c in own if c not in last] or own
 
 
-class _Working:
-    """One batch under a model, ready to be predicted with a probe on top."""
-
-    def __init__(self, model: Model, batch: Batch) -> None:
-        self.predictor = Predictor(model, batch)
-        self.batch = batch
-        self.stages = self.predictor.stages(model)
-        self.gain = model.gain[batch.channel] * batch.exposure[:, None, None]
-        with torch.no_grad():
-            self.base = self.predictor.trace(model)
-
-    def predict(self, kind: _Kind, tensors: Tensors, k: int) -> Tensor:
-        """Counts [1, h, w] of capture k."""
-        scene, gray = self.predictor.scene, self.batch.gray[k : k + 1]
-        stages = kind.apply(self.stages, tensors)
-        before = Trace(self.base.spectrum[k : k + 1], self.base.image[k : k + 1])
-        if "spread" in tensors:
-            image = _spread_in_time(scene, stages, gray, tensors["spread"])
-        else:
-            image = trace(scene, stages, gray, kind.stage, before).image
-        light = light_on_camera(scene, stages, image)
-        measured = (self.batch.signal[k : k + 1], self.batch.weight[k : k + 1])
-        return counts(scene, stages, light, self.gain[k : k + 1], measured)
-
-    def squared_error(self, kind: _Kind, tensors: Tensors, k: int) -> Tensor:
-        """Weighted squared error of capture k."""
-        error = self.batch.signal[k : k + 1] - self.predict(kind, tensors, k)
-        return (self.batch.weight[k : k + 1] * error**2).sum()
-
-
-def _spread_in_time(scene: Any, stages: Stages, gray: Tensor, spread: Tensor) -> Tensor:
-    """Mean irradiance over a phase whose gain swings by +-spread while the camera looks."""
-    path = light_path(scene, stages)
-    phase = panel_phase(path, gray)
-    both = [mode_irradiance(path, panel_spectrum(path, phase * (1 + s * spread))) for s in (-1, 1)]
-    return 0.5 * (both[0] + both[1])
-
-
-@dataclass(frozen=True)
-class _Kind:
-    """A stage's probe. shapes: {name: (shape, physical units a unit of the optimiser's variable)}."""
-
-    stage: str
-    shapes: dict[str, tuple[tuple[int, ...], float]]
-    apply: Callable[[Stages, Tensors], Stages]
-    pictures: Callable[[Tensors], list[Picture]]
-
-
-def _drive(model: Model, batch: Batch) -> _Kind:
+def _drive(model: Model, batch: Batch) -> Kind:
     y, x = _field(*model.bench.panel.shape)
     channels = [c.name for c in model.bench.channels]
     taps = torch.tensor([[0.0, 0, 1, 0, 0], [0, 0, 1, 0, 0]])
@@ -225,36 +129,29 @@ def _drive(model: Model, batch: Batch) -> _Kind:
         "columns": ((2, 5), 0.5),
         "spread": ((), 0.3),
     }
-    return _Kind("drive", shapes, apply, pictures)
+    return Kind("drive", shapes, apply, pictures)
 
 
-def _panel(model: Model, batch: Batch) -> _Kind:
+def _panel(model: Model, batch: Batch) -> Kind:
     height, width = model.bench.panel.shape
     nodes = _nodes(height, width, "panel")
+    unit = math.sqrt(nodes[0] * nodes[1])
 
     def apply(stages: Stages, t: Tensors) -> Stages:
-        panel = stages.panel
-        log, phase, real, imaginary = (_resized(t[n], (height, width)) for n in names)
-        phase = phase * (panel.reference_wavelength / panel.wavelength)
-        size = torch.exp(torch.clamp(log, -4, 2))
-        factor = torch.complex(size * torch.cos(phase), size * torch.sin(phase))
-        moved = panel.multiplied(factor).leaking(torch.complex(real, imaginary))
-        return replace(stages, panel=moved)
+        return replace(stages, panel=with_field(stages.panel, t))
 
     def pictures(t: Tensors) -> list[Picture]:
-        added = torch.hypot(t["real"], t["imaginary"])
+        added = torch.hypot(t["added_real"], t["added_imaginary"])
         return [
-            ("amplitude multiplied", _array(torch.exp(t["log"])), "relative"),
+            ("amplitude multiplied", _array(torch.exp(t["log_amplitude"])), "relative"),
             ("phase multiplied", _array(t["phase"]), "rad"),
             ("amplitude added", _array(added), "of the modulated"),
         ]
 
-    names = ("log", "phase", "real", "imaginary")
-    unit = math.sqrt(nodes[0] * nodes[1])
-    return _Kind("panel", {n: (nodes, unit) for n in names}, apply, pictures)
+    return Kind("panel", {n: (nodes, unit) for n in UNITS}, apply, pictures)
 
 
-def _pupil(model: Model, batch: Batch) -> _Kind:
+def _pupil(model: Model, batch: Batch) -> Kind:
     def apply(stages: Stages, t: Tensors) -> Stages:
         pupil = stages.pupil
         log = _sampled(t["log"], pupil.v / PUPIL_EXTENT, pupil.u / PUPIL_EXTENT)
@@ -277,10 +174,10 @@ def _pupil(model: Model, batch: Batch) -> _Kind:
 
     nodes = (PUPIL_NODES, PUPIL_NODES)
     shapes = {"log": (nodes, PUPIL_NODES), "phase": (nodes, PUPIL_NODES), "extent": ((2,), 0.5)}
-    return _Kind("pupil", shapes, apply, pictures)
+    return Kind("pupil", shapes, apply, pictures)
 
 
-def _sensor(model: Model, batch: Batch) -> _Kind:
+def _sensor(model: Model, batch: Batch) -> Kind:
     height, width = model.bench.camera.shape
     nodes = _nodes(height, width, "sensor")
     full_scale = model.bench.camera.full_scale
@@ -289,9 +186,9 @@ def _sensor(model: Model, batch: Batch) -> _Kind:
 
     def apply(stages: Stages, t: Tensors) -> Stages:
         sensor = stages.sensor
-        gain = torch.exp(torch.clamp(_resized(t["gain"], (height, width)), -3, 3))
+        gain = torch.exp(torch.clamp(resized(t["gain"], (height, width)), -3, 3))
         moved = replace(sensor, free_capture_gain=True).multiplied(gain)
-        moved = moved.brightened(full_scale * _resized(t["offset"], (height, width)))
+        moved = moved.brightened(full_scale * resized(t["offset"], (height, width)))
         moved = moved.displaced(*(legendre_surface(t["shift"][k], y, x, 0) for k in (0, 1)))
         kernel = t["kernel"]
         rows = 2 * math.pi * sensor.iy * reach
@@ -333,10 +230,10 @@ def _sensor(model: Model, batch: Batch) -> _Kind:
         "kernel": ((TAPS, TAPS), 0.5),
         "bend": ((6,), 1.0),
     }
-    return _Kind("sensor", shapes, apply, pictures)
+    return Kind("sensor", shapes, apply, pictures)
 
 
-PROBES: dict[str, Callable[[Model, Batch], _Kind]] = {
+PROBES: dict[str, Callable[[Model, Batch], Kind]] = {
     "drive": _drive,
     "panel": _panel,
     "pupil": _pupil,
@@ -356,13 +253,6 @@ def _field(height: int, width: int) -> tuple[Tensor, Tensor]:
 def _nodes(height: int, width: int, stage: str) -> tuple[int, int]:
     shrink = max(1.0, math.sqrt(height * width / NODES[stage]))
     return round(height / shrink), round(width / shrink)
-
-
-def _resized(nodes: Tensor, shape: tuple[int, int]) -> Tensor:
-    if tuple(nodes.shape) == shape:
-        return nodes
-    whole = torch.nn.functional.interpolate(nodes[None, None], shape, mode="bilinear", align_corners=True)
-    return whole[0, 0]
 
 
 def _sampled(nodes: Tensor, y: Tensor, x: Tensor) -> Tensor:
