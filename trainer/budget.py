@@ -1,14 +1,14 @@
-"""Where the error of a prediction goes: named physics, a network, the camera's noise, and what is left.
+"""Where the error of a prediction goes: named physics, what was learned, the camera's noise, and what is left.
 
 All are shares of the measured signal's variance on held-out captures, and add up to the ideal model's mean squared
-error: what the named effects take from it, what the network takes after them, the noise that nothing can take, and
-the rest.
+error: what the named effects take from it, what the panel's learned field and the network take after them (both are
+booked as `network`), the noise that nothing can take, and the rest.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -55,6 +55,9 @@ def error_budget(
         _check(network, captures)
     ideal = with_gains(captures, Model(captures.bench, method=model.method), parts.fitted)
     model = with_gains(captures, model, parts.fitted)
+    named = model
+    if model.panel_field is not None:
+        named = with_gains(captures, replace(model, gain={}, panel_field=None), parts.fitted)
     stacks = stacked(captures, parts.held_out)
     rows: list[tuple[Errors, Errors, Errors]] = []
     with torch.no_grad():
@@ -68,16 +71,17 @@ def error_budget(
                 with_network = expected
                 if change is not None:
                     with_network = expected + sensitivity * onto_camera(scene, stages, change)
-                predictions = (Predictor(ideal, batch).predict(ideal), expected, with_network)
+                physical = expected if named is model else Predictor(named, batch).predict(named)
+                predictions = (Predictor(ideal, batch).predict(ideal), physical, with_network)
                 rows.append(tuple(errors_of(batch, one) for one in predictions))  # type: ignore[arg-type]
             if progress:
                 progress((k + 1) / len(stacks))
     if not rows or not float(sum(row[0].variance.sum() for row in rows)) > 0:
         raise InputError(f"the held-out captures of {captures.folder} have no contrast to compare with")
-    bare, physical, learned = (join([row[k] for row in rows]) for k in range(3))
+    bare, known, learned = (join([row[k] for row in rows]) for k in range(3))
     return Budget(
-        bare.excess - physical.excess,
-        physical.excess - learned.excess,
+        bare.excess - known.excess,
+        known.excess - learned.excess,
         learned.noise_nrmse**2,
         learned.excess,
     )

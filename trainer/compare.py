@@ -22,7 +22,7 @@ from trainer.fit import Predictor, fit, with_gain
 from trainer.localise import BrightnessSums, FieldSums, FrequencySums, Seen
 from trainer.model import Model
 from trainer.photon_transfer import compare_repeats
-from trainer.scene import scene_for, stages_for
+from trainer.scene import scene_for, stages_of
 
 if TYPE_CHECKING:
     from trainer.budget import Budget
@@ -190,7 +190,7 @@ def with_gains(
     channels = list(dict.fromkeys(c.channel for c in rows))
     found = with_gain(replace(model, gain={}), _Predictors(captures, model, rows, done))
     scene = scene_for(model, rows[0].channel, rows[0].plane_mm)
-    if stages_for(scene, model.present).sensor.response is not None:
+    if stages_of(scene, model).sensor.response is not None:
         # Counts are not proportional to light: least squares is only where the fit starts.
         found = fit(found, [], load(captures, rows)).model
     return replace(model, gain={**model.gain, **{c: found.gain[c] for c in channels}})

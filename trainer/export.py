@@ -25,7 +25,7 @@ from trainer.evidence import scenes
 from trainer.model import Model
 from trainer.parameters import json_values
 from trainer.prediction import light_path
-from trainer.scene import scene_for, stages_for
+from trainer.scene import scene_for, stages_of
 
 
 def export_bundle(
@@ -88,6 +88,7 @@ def export_bundle(
             for p in shown.present
         ],
         "effects_left_out": [_named(e) for e in left_out],
+        "panel_field": shown.panel_field is not None,
     }
     files: dict[str, bytes] = {}
     if network is not None:
@@ -101,6 +102,7 @@ def export_bundle(
         "planes_mm": description["planes_mm"],
         "effects": list(shown.names),
         "effects_left_out": [e.name for e in left_out],
+        "panel_field": shown.panel_field is not None,
         "heldout": provenance["heldout"],
         "arrays": len(arrays),
         "network": None if network is None else str(network),
@@ -126,11 +128,11 @@ def _network_files(path: Path, model: Model, channels: list[str]) -> tuple[dict[
             f"{path} was trained on {', '.join(learned) or 'no known colours'} and the bundle has "
             f"{', '.join(channels)}: give the captures of the same colours"
         )
-    beyond = about.get("effects", list(model.names))
-    if sorted(beyond) != sorted(model.names):
+    beyond = about.get("effects", list(model.parts))
+    if sorted(beyond) != sorted(model.parts):
         raise InputError(
             f"{path} was trained beyond {', '.join(beyond) or 'the ideal model'} and the model has "
-            f"{', '.join(model.names) or 'no effects'}: give the model that it was trained with"
+            f"{', '.join(model.parts) or 'no effects'}: give the model that it was trained with"
         )
     return onnx_files(network), about
 
@@ -144,7 +146,7 @@ def baked_path(model: Model, channel: str, plane_mm: float) -> LightPath:
     """A model's light path for one colour and plane, as float32 and complex64 NumPy arrays."""
     with torch.no_grad():
         scene = scene_for(model, channel, plane_mm, torch.float64)
-        path = light_path(scene, stages_for(scene, model.present))
+        path = light_path(scene, stages_of(scene, model))
     return LightPath(**{f.name: _single(getattr(path, f.name)) for f in fields(path)})
 
 

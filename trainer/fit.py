@@ -21,7 +21,7 @@ from trainer.evidence import Batch
 from trainer.excess import Errors, errors_of, join
 from trainer.model import Model, Present, Values, absent, raised
 from trainer.prediction import Trace, counts, light_on_camera, trace
-from trainer.scene import Scene, Stages, scene_for, stages_for
+from trainer.scene import Scene, Stages, scene_for, stages_of
 from trainer.starts import Evidence
 
 STEP = 0.1  # of a parameter's scale: large against single precision's rounding, small against curvature
@@ -46,7 +46,7 @@ class Predictor:
 
     def stages(self, model: Model) -> Stages:
         """The scene's stages under a model."""
-        return stages_for(self.scene, model.present)
+        return stages_of(self.scene, model)
 
     def trace(self, model: Model, start: str = "drive", before: Trace | None = None) -> Trace:
         """Spectrum and irradiance from stage `start` on, a capture at a time to stay in the processor's cache."""

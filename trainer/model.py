@@ -10,6 +10,7 @@ import numpy as np
 
 from trainer.bench_file import Bench
 from trainer.effects.definition import Effect, Parameter
+from trainer.panel_field import NAME
 
 Values = dict[str, np.ndarray]
 
@@ -36,6 +37,7 @@ class Model:
     gain : counts a unit of irradiance and millisecond, by channel; empty before anything was fitted
     method : propagation
     history : one record a step: what was added, and the held-out error after it
+    panel_field : maps of the panel's learned field by name, float32 [m, n]; None: nothing was learned
     """
 
     bench: Bench
@@ -43,11 +45,17 @@ class Model:
     gain: Mapping[str, float] = field(default_factory=dict)
     method: str = "angular_spectrum"
     history: tuple[dict[str, Any], ...] = ()
+    panel_field: Mapping[str, np.ndarray] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the effects that are present."""
         return tuple(p.effect.name for p in self.present)
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Names of all that a network learns beyond: the effects, and the learned field."""
+        return self.names if self.panel_field is None else (*self.names, NAME)
 
     def having(self, added: Present) -> Model:
         """The model with an effect added, or put in the place of one of the same name."""

@@ -28,9 +28,10 @@ from trainer.effects.definition import Parameter
 from trainer.effects.registry import Catalogue, find_effect
 from trainer.model import Model, Present
 from trainer.model_text import allowed, model_text, table_text
+from trainer.panel_field import NAME, UNITS
 
 SCHEMA = 1
-_TOP = ("schema", "about", "arrays", "bench", "propagation", "gain", "effect", "history")
+_TOP = ("schema", "about", "arrays", "bench", "propagation", "gain", "effect", NAME, "history")
 _COMPARED = ("panel", "channel", "iris", "camera")
 
 Arrays = Mapping[str, np.ndarray]
@@ -116,7 +117,41 @@ def _model(tables: Mapping[str, Any], known: Catalogue, path: Path) -> Model:
     for number, row in enumerate(_rows(tables, "history"), 1):
         _plain(row, f"history {number}")
         history.append(dict(row))
-    return Model(bench, tuple(present), _gain(tables.get("gain", {}), bench), _method(tables), tuple(history))
+    learned = _panel_field(tables[NAME], bench, arrays) if NAME in tables else None
+    gain = _gain(tables.get("gain", {}), bench)
+    return Model(bench, tuple(present), gain, _method(tables), tuple(history), learned)
+
+
+def _panel_field(given: Any, bench: Bench, arrays: Arrays) -> dict[str, np.ndarray]:
+    """The maps of the panel's learned field, each a finite number a pixel."""
+    table = _table(given, NAME)
+    _only(table, UNITS, f"{NAME}.")
+    maps = {}
+    for name in UNITS:
+        entry = table.get(name)
+        array = _array(entry, f"{NAME}.{name}", arrays)
+        if array is None:
+            raise InputError(
+                f"{NAME}.{name} is {_shown(entry)}: write {{ array = ... }}, or take [{NAME}] out"
+            )
+        if array.shape != bench.panel.shape or not np.isfinite(array).all():
+            raise InputError(
+                f"{NAME}.{name} is not a finite number for each of the panel's {bench.panel.height} x "
+                f"{bench.panel.width} pixels: learn the field again"
+            )
+        maps[name] = array.astype(np.float32)
+    return maps
+
+
+def _array(given: Any, where: str, arrays: Arrays) -> np.ndarray | None:
+    """The array that an entry names; None where it names none."""
+    if not (isinstance(given, Mapping) and list(given) == ["array"] and isinstance(given["array"], str)):
+        return None
+    if given["array"] not in arrays:
+        raise InputError(
+            f"{where} names the array {_shown(given['array'])}: {nearest(given['array'], arrays)}"
+        )
+    return arrays[given["array"]]
 
 
 def _bench(given: Any) -> Bench:
@@ -186,12 +221,8 @@ def _numbers(
     """The numbers of a value or an error, of the shape that the order asks for."""
     shape = parameter.shape(order, len(bench.channels))
     is_value = where.endswith(".value")
-    if isinstance(given, Mapping) and list(given) == ["array"] and isinstance(given["array"], str):
-        array = arrays.get(given["array"])
-        if array is None:
-            raise InputError(
-                f"{where} names the array {_shown(given['array'])}: {nearest(given['array'], arrays)}"
-            )
+    array = _array(given, where, arrays)
+    if array is not None:
         if array.shape != shape:
             raise InputError(
                 f"{where} has shape {array.shape} in the arrays' file: order {order} has {shape}"

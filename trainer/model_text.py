@@ -20,6 +20,7 @@ from trainer.bench_file import Bench, bench_tables
 from trainer.effects.definition import Effect, Parameter
 from trainer.effects.registry import BUILT_IN
 from trainer.model import Model, Present
+from trainer.panel_field import NAME
 
 LONGEST = 128  # numbers of an array that stay in the text: every built-in map and curve does
 WIDTH = 110
@@ -46,6 +47,8 @@ def model_text(model: Model, about: Mapping[str, Any] | None, store: Store) -> s
             )
         )
     parts += [_effect(p, model.bench, store) for p in model.present]
+    if model.panel_field is not None:
+        parts.append(_panel_field(model, store))
     parts += [table_text("[[history]]", record) for record in model.history]
     return "\n\n".join(parts) + "\n"
 
@@ -158,6 +161,16 @@ def _effect(present: Present, bench: Bench, store: Store) -> str:
     for parameter in effect.parameters:
         lines += ["", *_parameter(present, parameter, bench, store)]
     return "\n".join(lines)
+
+
+def _panel_field(model: Model, store: Store) -> str:
+    """Maps of a number a pixel are never text."""
+    about = (
+        "What the captures say of the wave at the panel beyond the effects, a number a pixel. Take the table "
+    )
+    assert model.panel_field is not None
+    named = {name: {"array": store(f"{NAME}.{name}", map_)} for name, map_ in model.panel_field.items()}
+    return "\n".join([*comment(about + "out to be without it."), table_text(f"[{NAME}]", named)])
 
 
 def _parameter(present: Present, parameter: Parameter, bench: Bench, store: Store) -> list[str]:

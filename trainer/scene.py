@@ -18,6 +18,7 @@ from runtime.lightpath import Grid, band_frequencies, grid_for, image_frequencie
 from runtime.propagation import Aperture, check_sampling
 from trainer.bench_file import Bench
 from trainer.model import Model, Present
+from trainer.panel_field import with_field
 from trainer.stages import Drive, Panel, Pupil, Sensor
 
 IRIS_ROOM = 1.25  # how far an effect may open or move the iris, in units of what the bench says
@@ -164,3 +165,12 @@ def stages_for(scene: Scene, present: tuple[Present, ...], tensors: Any = None) 
         stage = one.effect.stage
         stages = replace(stages, **{stage: one.effect.apply(getattr(stages, stage), **arguments)})
     return stages
+
+
+def stages_of(scene: Scene, model: Model) -> Stages:
+    """The scene's stages under a model: its effects, and the field learned at the panel after them."""
+    stages = stages_for(scene, model.present)
+    if model.panel_field is None:
+        return stages
+    maps = {name: torch.as_tensor(map_, dtype=scene.dtype) for name, map_ in model.panel_field.items()}
+    return replace(stages, panel=with_field(stages.panel, maps))

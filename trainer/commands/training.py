@@ -1,4 +1,4 @@
-"""train, loop, evaluate: what no named effect explains, learned from what the camera saw."""
+"""field, train: what no named effect explains, learned from what the camera saw."""
 
 from __future__ import annotations
 
@@ -16,13 +16,47 @@ from trainer.commands.command import (
     inputs_of,
     model_options,
     number,
+    origin,
     out_option,
+    refuse_folder,
     use_every_core,
 )
 from trainer.commands.screen import Screen
 
 if TYPE_CHECKING:
     from trainer.training.recipe import Recipe
+
+
+def run_field(args: Namespace, screen: Screen) -> Result:
+    """A field learned at the panel, in a model."""
+    refuse_folder(args.out, "--out")
+    captures, _, model = inputs_of(args)
+    from trainer.learn_field import learn_field
+    from trainer.model_file import write_model
+
+    use_every_core()
+    with screen.progress("learning the field at the panel") as told:
+        found = learn_field(captures, model, told)
+    write_model(args.out, found.model, origin(captures))
+    return {"model": str(args.out), **found.as_json()}
+
+
+def show_field(result: Result, args: Namespace, screen: Screen) -> None:
+    """What was gained on captures that were held out, and how far the maps go."""
+    before, after = result["before"]["excess"], result["after"]["excess"]
+    worse = after >= before
+    gained = "which is no gain: leave it out" if worse else f"from {before:.2g}"
+    screen.say(
+        f"With a learned field at the panel the excess on held-out captures is {after:.2g}, {gained}.",
+        style="yellow" if worse else "bold",
+    )
+    screen.table(
+        ("map", "lowest", "highest"),
+        [(name, m["lowest"], m["highest"]) for name, m in result["maps"].items()],
+    )
+    screen.say(f"\nThe model is {args.out}.")
+    model = args.model if worse else args.out
+    screen.next(command_line("train", args.captures, "--out", "run", args=args, model=model), "What is left")
 
 
 def run_train(args: Namespace, screen: Screen) -> Result:
@@ -133,6 +167,12 @@ def seed_option(parser: ArgumentParser) -> None:
     )
 
 
+def _field_options(parser: ArgumentParser) -> None:
+    captures_argument(parser)
+    model_options(parser)
+    out_option(parser, "NEW.toml", "where the model with the field goes")
+
+
 def _train_options(parser: ArgumentParser) -> None:
     captures_argument(parser)
     model_options(parser)
@@ -183,6 +223,15 @@ def commands() -> list[Command]:
     """The commands of this file."""
     show: Any = show_train
     return [
+        Command(
+            "field",
+            "Learn a complex map of the wave at the panel: stripes, dust, what no effect names there.",
+            "field captures/ --model model.toml --out learned.toml",
+            "Learn what is left: train captures/ --model learned.toml --out run/; or export --model learned.toml",
+            _field_options,
+            run_field,
+            show_field,
+        ),
         Command(
             "train",
             "Train a network on what the model does not explain.",

@@ -7,7 +7,8 @@ repeat K times
     D = trained to take what the model says of the patterns to the captures, and then frozen
 patterns = phase retrieval of the pictures through the model and D, shown and captured
 
-A picture that is good enough is left alone from then on. Online (seed section 7), each picture has a D of its own.
+A picture that is good enough is left alone from then on. Online (seed section 7), each picture has a D of its own, and
+where the model has a learned field at the panel, a field of its own; its patterns begin with the ones before.
 Captures that were recorded stand in for the camera's: one set a round, as long as there are sets.
 """
 
@@ -26,8 +27,10 @@ from runtime.solving import write_gray
 from trainer.captures import CaptureSet
 from trainer.compare import with_gains
 from trainer.cycle.retrieval import ITERATIONS, Volume, retrieve
-from trainer.cycle.showing import Stage, display_likeness, seen_pairs
+from trainer.cycle.showing import Stage, display_likeness, rows_of, seen_pairs
+from trainer.learn_field import with_refined_field
 from trainer.model import Model
+from trainer.model_file import write_model
 from trainer.networks.approximator import Approximator, write_approximator
 from trainer.training.metrics import Likeness
 from trainer.training.pairs import Pairs, pairs_of
@@ -43,9 +46,9 @@ Progress = Callable[[float, str], None]
 class Settings:
     """How a cycle is run.
 
-    rounds : K. recipe, steps : of each training. method : of phase retrieval, through the model alone in the first
-    round and through D after it. good : 1 - LPIPS (SSIM without weights) from which a picture is left alone; None:
-    GOOD_LPIPS, GOOD_SSIM. online : each picture has its own D
+    rounds : K. recipe, steps : of each training; with 0 steps there is no network. method : of phase retrieval, through
+    the model alone in the first round and through D after it. good : 1 - LPIPS (SSIM without weights) from which a
+    picture is left alone; None: GOOD_LPIPS, GOOD_SSIM. online : each picture has its own D, and its own field
     """
 
     rounds: int
@@ -69,16 +72,19 @@ class Settings:
 class Cycle:
     """Where a cycle stands.
 
-    network : shared D; own : D of each picture, online. patterns : the latest of each picture, uint8 [C, H, W]
-    history : of each showing, how near each picture came. done : pictures that are left alone
+    network : shared D; own : D of each picture, online. models : model with its own field of each picture, online
+    patterns : the latest of each picture, uint8 [C, H, W]. history : of each showing, how near each picture came
+    done : pictures that are left alone. seen, taken : what D and the fields are learned from
     """
 
     network: Approximator | None = None
     own: dict[str, Approximator] = field(default_factory=dict)
+    models: dict[str, Model] = field(default_factory=dict)
     patterns: dict[str, np.ndarray] = field(default_factory=dict)
     history: list[dict[str, Likeness]] = field(default_factory=list)
     done: set[str] = field(default_factory=set)
     seen: dict[str, list[Pairs]] = field(default_factory=dict)
+    taken: list[CaptureSet] = field(default_factory=list)
 
     def network_of(self, name: str) -> Approximator | None:
         """What a picture is looked at through; None is the identity."""
@@ -145,7 +151,9 @@ def _retrieve_all(
         say(0.3 * k / len(wanted), f"phase retrieval of {one.name}")
         network = cycle.network_of(one.name)
         method = settings.method if network is None else "hardware_in_the_loop"
-        cycle.patterns[one.name] = retrieve(model, one, method, network, settings.iterations)
+        through = cycle.models.get(one.name, model)
+        start = cycle.patterns.get(one.name) if settings.online else None
+        cycle.patterns[one.name] = retrieve(through, one, method, network, settings.iterations, start=start)
 
 
 def _write_patterns(cycle: Cycle, model: Model, folder: Path) -> None:
@@ -198,20 +206,37 @@ def _learn(
             joined(pairs), settings.recipe, settings.steps, start=start, seed=settings.seed, judges=settings.judges,
             progress=lambda step, loss: say(begin + part * step / settings.steps, f"training, loss {loss:.3g}"),
         )  # fmt: skip
-        about = {"channels": [c.name for c in model.bench.channels], "effects": list(model.names)}
+        about = {"channels": [c.name for c in model.bench.channels], "effects": list(model.parts)}
         write_approximator(folder / file, network, about)
         return network
 
     folder.mkdir(parents=True, exist_ok=True)
     if settings.online and by_picture:
+        cycle.taken.append(captures)
         active = [name for name in latest if name not in cycle.done]
         for k, name in enumerate(active):
             share = 0.5 / len(active)
+            if model.panel_field is not None:
+                say(0.5 + share * k, f"refining the field at the panel for {name}")
+                _refine_field(cycle, model, name)
+                write_model(folder / f"{name}.toml", cycle.models[name])
+            if not settings.steps:
+                continue
             start = cycle.network_of(name)
             cycle.own[name] = taught(cycle.seen[name], start, f"{name}.safetensors", 0.5 + share * k, share)
-    else:
+    elif settings.steps:
         every = [pairs for several in cycle.seen.values() for pairs in several]
         cycle.network = taught(every, cycle.network, "network.safetensors", 0.5, 0.5)
+
+
+def _refine_field(cycle: Cycle, model: Model, name: str) -> None:
+    """A picture's own field, from all that was captured of it; its D sees what the model with that field says."""
+    sets = [(captures, rows) for captures in cycle.taken if (rows := rows_of(captures, name))]
+    own = with_refined_field(model, sets)
+    cycle.models[name] = own
+    cycle.seen[name] = [
+        pairs_of(captures, rows, with_gains(captures, replace(own, gain={}), rows)) for captures, rows in sets
+    ]
 
 
 def joined(several: Sequence[Pairs]) -> Pairs:

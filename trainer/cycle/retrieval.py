@@ -19,14 +19,14 @@ import torch
 from torch import Tensor
 
 from firmware_iface.errors import InputError, nearest
-from runtime.lightpath import LightPath, irradiance, pixel_irradiance
+from runtime.lightpath import LightPath, irradiance, panel_phase, pixel_irradiance
 from runtime.solver import DriveRange, solve
 from trainer.effects.registry import BUILT_IN
 from trainer.export import baked_path, told_to_display
 from trainer.model import Model, absent
 from trainer.networks.approximator import Approximator, amplitude
 from trainer.prediction import light_path
-from trainer.scene import scene_for, stages_for
+from trainer.scene import scene_for, stages_of
 
 SOLVERS = {
     "double_phase": "double_phase",
@@ -82,10 +82,12 @@ def retrieve(
     network: Approximator | None = None,
     iterations: int = ITERATIONS,
     progress: Progress | None = None,
+    start: np.ndarray | None = None,
 ) -> np.ndarray:
     """Gray levels of each colour, uint8 [C, H, W].
 
-    network : what `hardware_in_the_loop` looks through; None is the identity, with which it is plain Wirtinger descent.
+    start : gray levels to begin from, where the method descends. network : what `hardware_in_the_loop` looks through;
+    None is the identity, with which it is plain Wirtinger descent.
     Raises InputError for a method that is not there, and a method of one plane for a volume of several.
     """
     if method not in METHODS:
@@ -95,22 +97,30 @@ def retrieve(
         model = beside_zero_order(model)
     if method != "hardware_in_the_loop":
         network = None
+    if SOLVERS[method] != "default":
+        start = None
     if network is not None or (len(wanted.planes_mm) > 1 and SOLVERS[method] == "default"):
-        return _through(model, wanted, network, iterations, progress)
+        return _through(model, wanted, network, iterations, progress, start)
     if len(wanted.planes_mm) > 1:
         raise InputError(
             f"'{method}' shows one plane and {wanted.name} has {len(wanted.planes_mm)}: use wirtinger or "
             "hardware_in_the_loop"
         )
     baked = [baked_path(model, c.name, wanted.planes_mm[0]) for c in model.bench.channels]
-    return np.stack([_solved(path, wanted, c, method, iterations)[0] for c, path in enumerate(baked)])
+    return np.stack([_solved(path, wanted, c, method, iterations, start)[0] for c, path in enumerate(baked)])
 
 
 def _solved(
-    path: LightPath, wanted: Volume, colour: int, method: str, iterations: int
+    path: LightPath,
+    wanted: Volume,
+    colour: int,
+    method: str,
+    iterations: int,
+    start: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Gray levels and phase [H, W] of one colour and plane, by the headset's solver."""
-    solution = solve(path, wanted.irradiance[0, colour], iterations, method=SOLVERS[method])
+    phase = None if start is None else panel_phase(path, start[colour].astype(np.int64))
+    solution = solve(path, wanted.irradiance[0, colour], iterations, method=SOLVERS[method], start=phase)
     return solution.gray.copy(), solution.phase.copy()
 
 
@@ -120,17 +130,22 @@ def _through(
     network: Approximator | None,
     iterations: int,
     progress: Progress | None,
+    start: np.ndarray | None,
 ) -> np.ndarray:
     """Adam on the penalty of what the network makes of the light, all colours and planes at once.
 
-    Begins with what the solver finds without the network for the plane that counts most; the best pattern met is kept.
+    Begins with `start`, or what the solver finds without the network for the plane that counts most; the best pattern
+    met is kept.
     """
     first = int(np.argmax(wanted.weight.sum((1, 2))))
     plane = wanted.planes_mm[first]
     flat = Volume.flat(wanted.name, plane, np.sum(wanted.weight[:, None] * wanted.irradiance, 0))
     baked = [baked_path(model, c.name, plane) for c in model.bench.channels]
-    start = [_solved(path, flat, c, "wirtinger", iterations)[1] for c, path in enumerate(baked)]
-    phase = torch.tensor(np.stack(start), dtype=torch.float32).requires_grad_(True)
+    if start is None:
+        begin = [_solved(path, flat, c, "wirtinger", iterations)[1] for c, path in enumerate(baked)]
+    else:
+        begin = [panel_phase(path, gray.astype(np.int64)) for path, gray in zip(baked, start, strict=True)]
+    phase = torch.tensor(np.stack(begin), dtype=torch.float32).requires_grad_(True)
     paths = [[torch_path(model, c.name, z) for c in model.bench.channels] for z in wanted.planes_mm]
     target = torch.as_tensor(wanted.irradiance, dtype=torch.float32)
     weight = torch.as_tensor(wanted.weight, dtype=torch.float32)[:, None]
@@ -182,7 +197,7 @@ def torch_path(model: Model, channel: str, plane_mm: float, dtype: torch.dtype =
     """A model's light path for one colour and plane, on tensors."""
     with torch.no_grad():
         scene = scene_for(model, channel, plane_mm, dtype)
-        return light_path(scene, stages_for(scene, model.present))
+        return light_path(scene, stages_of(scene, model))
 
 
 def _light(path: LightPath, phase: Tensor) -> Tensor:

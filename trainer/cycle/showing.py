@@ -14,7 +14,7 @@ from torch import Tensor
 from firmware_iface.errors import InputError
 from trainer.bench_file import Bench
 from trainer.capture import capture_set
-from trainer.captures import CaptureSet, read_captures
+from trainer.captures import Capture, CaptureSet, read_captures
 from trainer.cycle.retrieval import CARRIER, OPENING, Volume
 from trainer.model import Model
 from trainer.networks.perceptual import Lpips
@@ -69,10 +69,15 @@ def with_iris_beside(headset: Any) -> Any:
 
 
 def seen_pairs(captures: CaptureSet, model: Model) -> dict[str, Pairs]:
-    """What the camera saw of each pattern of `Stage.show`, by its name; the repeat that shows the noise is left out."""
+    """What the camera saw of each pattern of `Stage.show`, by its name."""
+    names = dict.fromkeys(c.extra["kind"] for c in captures.captures)
+    return {name: pairs_of(captures, rows_of(captures, name), model) for name in names}
+
+
+def rows_of(captures: CaptureSet, name: str) -> list[Capture]:
+    """Captures of one pattern of `Stage.show`; the repeat that shows the noise is left out."""
     unique = {(c.channel, c.plane_mm, c.pattern): c for c in captures.captures}
-    kinds = dict.fromkeys(c.extra["kind"] for c in unique.values())
-    return {k: pairs_of(captures, [c for c in unique.values() if c.extra["kind"] == k], model) for k in kinds}
+    return [c for c in unique.values() if c.extra["kind"] == name]
 
 
 def display_likeness(seen: Pairs, wanted: Volume, lpips: Lpips | None = None) -> Likeness:

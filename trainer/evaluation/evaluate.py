@@ -1,7 +1,8 @@
 """What each method predicts, and what the camera sees of each method's patterns, on pictures held out.
 
 Networks learn from captures of photographs that are shown with patterns for the ideal model, the physical model
-from the usual patterns. Two other photographs are held out; all numbers are means over them.
+from the usual patterns, the field at the panel (beyond the physical model) from the networks' captures. Two other
+photographs are held out; all numbers are means over them.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from trainer.cycle.pictures import HELD_OUT, LEARNED, in_depth, photographs
 from trainer.cycle.retrieval import Volume, retrieve
 from trainer.cycle.showing import Stage, display_likeness, seen_pairs, with_iris_beside
 from trainer.headset import nominal_bench
+from trainer.learn_field import with_learned_field
 from trainer.model import Model
 from trainer.networks.approximator import Approximator, read_approximator
 from trainer.training.metrics import Likeness, evaluate, mean_likeness, noise_floor
@@ -33,15 +35,18 @@ from trainer.training.pairs import Pairs, pairs_of
 from trainer.training.recipe import RECIPES, STEPS, Recipe
 from trainer.training.train import NETWORK, Judges, train
 
-PREDICTION = ("ideal", *(name for name in RECIPES if name != "compact"), "physics", "physics_compact")
+PREDICTION = (
+    "ideal", *(name for name in RECIPES if name != "compact"), "physics", "physics_compact", "field", "field_compact",
+)  # fmt: skip
 DISPLAY = (
     "gerchberg_saxton", "double_phase", "wirtinger", "wirtinger_no_zero_order", "network_1", "network_2", "physics",
-    "physics_network", "online",
+    "physics_network", "online", "field", "field_network", "field_online",
 )  # fmt: skip
-STACK = ("wirtinger", "network_1", "physics", "physics_network")
+STACK = ("wirtinger", "network_1", "physics", "physics_network", "field")
 METHODS = tuple(dict.fromkeys((*PREDICTION, *DISPLAY)))
 DEPTHS = (0.9, 1.0, 1.1)  # planes of the stack, in units of the bench's distance
-ORACLE_ITERATIONS = 60
+ONLINE = 2  # rounds of refinement online
+ORACLE_ITERATIONS = 300  # beyond the best pattern of the methods: from there on it gains little
 
 Progress = Callable[[float, str], None]
 
@@ -132,6 +137,20 @@ class _Comparison:
         with open_pool(self.workers) as pool:
             return explain(captures, self.ideal, catalogue(), pool).model
 
+    @cached_property
+    def field(self) -> Model:
+        """The physical model with a field learned at the panel, from the captures that networks learn from."""
+        captures = self.captured("learned", self.learned)
+        rows = captures.captures[1:]
+        fitted = with_gains(captures, replace(self.physics, gain={}, panel_field=None), rows)
+        return with_learned_field(captures, rows, fitted)
+
+    def model_of(self, method: str) -> Model:
+        """The model that a method looks through."""
+        if method.startswith("field"):
+            return self.field
+        return self.physics if method.startswith("physics") or method == "online" else self.ideal
+
     def captured(self, name: str, pictures: list[Volume] | None) -> CaptureSet:
         """Captures of pictures with patterns for the ideal model; None: of the usual patterns."""
         folder = self.folder / name
@@ -160,13 +179,12 @@ class _Comparison:
 
     def predicted(self, method: str) -> Likeness:
         """How near a method's prediction is to the captures of the held-out pictures."""
-        physical = method.startswith("physics")
-        model = self.physics if physical else self.ideal
+        model = self.model_of(method)
         unseen = self.pairs("held-out", self.held_out, model)
-        if method in ("ideal", "physics"):
+        if method in ("ideal", "physics", "field"):
             return evaluate(unseen, None, self.judges.lpips)
         seen = self.pairs("learned", self.learned, model)
-        recipe = self.recipe(method.removeprefix("physics_"))
+        recipe = self.recipe(method.removeprefix("physics_").removeprefix("field_"))
         network = train(seen, recipe, self.sizes.steps, judges=self.judges, seed=self.seed)
         return evaluate(unseen, network, self.judges.lpips)
 
@@ -194,27 +212,28 @@ class _Comparison:
 
     def through(self, method: str) -> tuple[Model, Approximator]:
         """Model and network of a method that looks through one."""
-        if method == "physics_network":
-            model, folder = self.physics, self.cycle(self.physics, 1, "cycle-physics") / "round-0"
+        model = self.model_of(method)
+        if method in ("physics_network", "field_network"):
+            folder = self.cycle(model, 1, f"cycle-{method}") / "round-0"
         else:
             number = {"network_1": 0, "network_2": 1}[method]
-            model, folder = self.ideal, self.cycle(self.ideal, 2, "cycle-ideal") / f"round-{number}"
+            folder = self.cycle(model, 2, "cycle-ideal") / f"round-{number}"
         return model, read_approximator(folder / NETWORK)[0]
 
     def solved(self, method: str, wanted: Volume) -> np.ndarray:
         """A method's patterns for a picture."""
         count = self.sizes.iterations
-        if method in ("network_1", "network_2", "physics_network"):
+        if method in ("network_1", "network_2", "physics_network", "field_network"):
             model, network = self.through(method)
             return retrieve(model, wanted, "hardware_in_the_loop", network, count)
-        if method == "physics":
-            return retrieve(self.physics, wanted, "wirtinger", None, count)
+        if method in ("physics", "field"):
+            return retrieve(self.model_of(method), wanted, "wirtinger", None, count)
         return retrieve(self.ideal, wanted, method, None, count)
 
     def displayed(self, method: str) -> Likeness:
         """What the camera sees of a method's patterns for the held-out pictures."""
-        if method == "online":
-            return self._online()
+        if method in ("online", "field_online"):
+            return self._online(method)
         patterns = {one.name: self.solved(method, one) for one in self.held_out}
         headset = with_iris_beside(self.headset) if method == "wirtinger_no_zero_order" else self.headset
         if headset is self.headset:
@@ -235,12 +254,17 @@ class _Comparison:
         seen = seen_pairs(captures, with_gains(captures, self.ideal, captures.captures))
         return mean_likeness([display_likeness(seen[one.name], one, self.judges.lpips) for one in wanted])
 
-    def _online(self) -> Likeness:
-        model, network = self.through("physics_network")
+    def _online(self, method: str) -> Likeness:
+        settings = self.settings(ONLINE, True)
+        network: Approximator | None = None
+        if method == "online":
+            model, network = self.through("physics_network")
+        else:  # the field alone
+            model, settings = self.field, replace(settings, steps=0)
         stage = Stage(self.headset, self.bench, self.ideal)
-        folder = self.folder / "online"
-        cycle: Cycle = run_cycle(model, self.held_out, self.settings(2, True), folder, stage, network=network)
-        self.patterns["online"] = cycle.patterns
+        folder = self.folder / method
+        cycle: Cycle = run_cycle(model, self.held_out, settings, folder, stage, network=network)
+        self.patterns[method] = cycle.patterns
         return mean_likeness(list(cycle.history[-1].values()))
 
     def oracle(self) -> Likeness:

@@ -26,7 +26,7 @@ from trainer.export import told_to_display
 from trainer.fit import Predictor
 from trainer.model import Model
 from trainer.prediction import counts, light_path
-from trainer.scene import Scene, Stages, scene_for, stages_for
+from trainer.scene import Scene, Stages, scene_for, stages_of
 
 MOST_COLOURS = 3
 WHITE = 0.999  # quantile of measured irradiance that is called white
@@ -166,7 +166,7 @@ def display_irradiance(model: Model, batch: Batch) -> Tensor:
     shown = told_to_display(model)
     scene = scene_for(shown, batch.channel, batch.plane_mm)
     with torch.no_grad():
-        path = light_path(scene, stages_for(scene, shown.present))
+        path = light_path(scene, stages_of(scene, shown))
         return pixel_irradiance(path, irradiance(path, panel_phase(path, batch.gray[:1])))[0]
 
 

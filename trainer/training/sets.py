@@ -46,7 +46,7 @@ def training_sets(
     about = {
         "captures": captures.folder.name,
         "captures_sha256": captures.content_hash(),
-        "effects": list(model.names),
+        "effects": list(model.parts),
         "channels": [c.name for c in captures.bench.channels],
     }
     return TrainingSets(fitted, held_out, model, about)
