@@ -53,6 +53,6 @@ def test_the_command_shows_it(
     report = tmp_path / "report.html"
     assert main(["compare", str(captures.folder), "--network", str(path), "--report", str(report)]) == 0
     assert "unexplained" in capsys.readouterr().out
-    assert "the network explains" in report.read_text(encoding="utf-8")
+    assert "what was learned explains" in report.read_text(encoding="utf-8")
     with pytest.raises(InputError, match="train one"):
         error_budget(captures, Model(captures.bench), disturbed("compact", (8, 8), 2, 1))

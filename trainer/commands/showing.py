@@ -50,7 +50,7 @@ def show_comparison(result: Result, args: Namespace, screen: Screen) -> None:
     if result.get("psnr_db") is not None:
         screen.say(f"Peak signal to noise: {result['psnr_db']:.1f} dB (peak: full scale; no free scale).")
     if result.get("budget"):
-        _budget(result["budget"], bool(args.network), screen)
+        _budget(result["budget"], screen)
     _numbers("channel", result.get("by_channel"), screen)
     rows = result.get("by_capture") or []
     rows = sorted(rows, key=lambda r: -(r.get("excess") or 0))
@@ -65,11 +65,11 @@ def show_comparison(result: Result, args: Namespace, screen: Screen) -> None:
     screen.next(command_line("diagnose", args.captures, args=args, model=args.model))
 
 
-def _budget(budget: Mapping[str, float], network: bool, screen: Screen) -> None:
+def _budget(budget: Mapping[str, float], screen: Screen) -> None:
     """The ideal model's error, and what becomes of each part of it."""
     words = {
         "named_physics": "named physics explains",
-        "network": "the network explains beyond that",
+        "network": "what was learned explains beyond that",
         "noise": "the camera's noise",
         "unexplained": "unexplained",
     }
@@ -77,7 +77,7 @@ def _budget(budget: Mapping[str, float], network: bool, screen: Screen) -> None:
     rows = [
         (words[name], value, f"{100 * value / total:.3g} %")
         for name, value in budget.items()
-        if name != "network" or network
+        if name != "network" or value  # nothing was learned: nothing to say
     ]
     screen.table(("the ideal model's error", "share of the signal's variance", "of the error"), rows)
 

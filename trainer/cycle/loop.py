@@ -8,7 +8,7 @@ repeat K times
 patterns = phase retrieval of the pictures through the model and D, shown and captured
 
 A picture that is good enough is left alone from then on. Online (seed section 7), each picture has a D of its own, and
-where the model has a learned field at the panel, a field of its own; its patterns begin with the ones before.
+where the model has a learned field at the panel, a field of its own, with which the patterns before are bettered.
 Captures that were recorded stand in for the camera's: one set a round, as long as there are sets.
 """
 
@@ -152,7 +152,8 @@ def _retrieve_all(
         network = cycle.network_of(one.name)
         method = settings.method if network is None else "hardware_in_the_loop"
         through = cycle.models.get(one.name, model)
-        start = cycle.patterns.get(one.name) if settings.online else None
+        # A field of one picture is true near the patterns that it was learned from: begin there.
+        start = cycle.patterns[one.name] if one.name in cycle.models else None
         cycle.patterns[one.name] = retrieve(through, one, method, network, settings.iterations, start=start)
 
 

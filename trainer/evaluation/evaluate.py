@@ -45,7 +45,7 @@ DISPLAY = (
 STACK = ("wirtinger", "network_1", "physics", "physics_network", "field")
 METHODS = tuple(dict.fromkeys((*PREDICTION, *DISPLAY)))
 DEPTHS = (0.9, 1.0, 1.1)  # planes of the stack, in units of the bench's distance
-ONLINE = 2  # rounds of refinement online
+ONLINE = {"online": 2, "field_online": 4}  # rounds of refinement; a field is quick to refine
 ORACLE_ITERATIONS = 300  # beyond the best pattern of the methods: from there on it gains little
 
 Progress = Callable[[float, str], None]
@@ -255,7 +255,7 @@ class _Comparison:
         return mean_likeness([display_likeness(seen[one.name], one, self.judges.lpips) for one in wanted])
 
     def _online(self, method: str) -> Likeness:
-        settings = self.settings(ONLINE, True)
+        settings = self.settings(ONLINE[method], True)
         network: Approximator | None = None
         if method == "online":
             model, network = self.through("physics_network")

@@ -50,7 +50,7 @@ def _budget(budget: Mapping[str, float]) -> list[tuple[str, str, str]]:
     """The parts of the ideal model's error, the network's only where there is one."""
     words = {
         "named_physics": "named physics explains",
-        "network": "the network explains",
+        "network": "what was learned explains",
         "noise": "the camera's noise is",
         "unexplained": "unexplained",
     }
