@@ -184,12 +184,15 @@ def phase_gradient(path: LightPath, phase: Array, irradiance_gradient: Array) ->
     return irradiance_and_pullback(path, phase)[1](irradiance_gradient)
 
 
-def irradiance_and_pullback(path: LightPath, phase: Array) -> tuple[Array, Callable[[Array], Array]]:
+def irradiance_and_pullback(
+    path: LightPath, phase: Array, factor: bool = False
+) -> tuple[Array, Callable[[Array], Array]]:
     """`irradiance`, and the map from a loss's gradient over it to the gradient over phase.
 
     Seed eq. 20-23, with each linear operator replaced by its adjoint: 2 z dI, back through the conjugate
     transfer, Re(-j e^{-j phi} ...). The fields of the forward pass are kept, so the way back costs no
-    second one.
+    second one. factor: instead the gradient over a factor on the field that leaves the panel, complex [..., H, W]:
+    its real part is over the factor's logarithm, its imaginary part over its phase (rad).
     """
     spectrum = panel_spectrum(path, phase)
     fields = [image_field(path, spectrum, mode) for mode in range(path.transfers.shape[0])]
@@ -201,7 +204,7 @@ def irradiance_and_pullback(path: LightPath, phase: Array) -> tuple[Array, Calla
         back = 0
         for mode, z in enumerate(fields):
             back = back + _image_field_adjoint(path, 2 * path.weights[mode] * gradient * z, mode)
-        return _panel_spectrum_adjoint(path, phase, back)
+        return _panel_spectrum_adjoint(path, phase, back, factor)
 
     return filter_irradiance(path, _summed(path, fields)), pullback
 
@@ -320,15 +323,18 @@ def _image_field_adjoint(path: LightPath, z: Array, mode: int) -> Array:
     return xp.conj(path.transfers[mode, ...]) * spectrum * (FINE**2 / (height * width))
 
 
-def _panel_spectrum_adjoint(path: LightPath, phase: Array, spectrum: Array) -> Array:
+def _panel_spectrum_adjoint(path: LightPath, phase: Array, spectrum: Array, factor: bool = False) -> Array:
+    """Adjoint of `panel_spectrum` over phase, or over a factor on the field that leaves the panel."""
     xp = array_namespace(phase)
 
-    def to_phase(field_gradient: Array, driven: Array) -> Array:
+    def here(field_gradient: Array, driven: Array) -> Array:
+        if factor:
+            return xp.conj(_panel_field(path, driven)) * field_gradient
         turned = xp.conj(path.source) * field_gradient
         return xp.cos(driven) * xp.imag(turned) - xp.sin(driven) * xp.real(turned)
 
     if path.crosstalk is None:
-        return to_phase(_band_spectrum_adjoint(path.grid, _aperture(path, phase, (1, 1)) * spectrum), phase)
+        return here(_band_spectrum_adjoint(path.grid, _aperture(path, phase, (1, 1)) * spectrum), phase)
     ky, kx = path.crosstalk
     sub = (ky.shape[0], kx.shape[0])
     spectrum = _aperture(path, phase, sub) * spectrum / (sub[0] * sub[1])
@@ -340,8 +346,9 @@ def _panel_spectrum_adjoint(path: LightPath, phase: Array, spectrum: Array) -> A
         for j in range(sub[1]):
             driven = mix_neighbours(mixed_rows, kx[j, :], -1)
             back = _row_spectrum_adjoint(path.grid, xp.conj(_offset(path, phase, sub, j, 1)) * rows_back)
-            row_gradient = row_gradient + mix_neighbours_adjoint(to_phase(back, driven), kx[j, :], -1)
-        total = total + mix_neighbours_adjoint(row_gradient, ky[i, :], -2)
+            own = here(back, driven)
+            row_gradient = row_gradient + (own if factor else mix_neighbours_adjoint(own, kx[j, :], -1))
+        total = total + (row_gradient if factor else mix_neighbours_adjoint(row_gradient, ky[i, :], -2))
     return total
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -59,6 +60,10 @@ def numbers(found: Calibration) -> dict[str, Any]:
             "error_rms_nm": _rms_error(found.errors.wavefront_nm, shape, LOWEST_WAVEFRONT),
             "rms_waves": float(wavefront.std()) / shortest,
             "terms_nm": [float(v) for v in drift.wavefront_nm],
+            "free_form": {
+                "nodes": list(drift.wavefront_nodes_nm.shape) if drift.wavefront_nodes_nm.size else None,
+                "rms_nm": float(replace(drift, wavefront_nm=np.zeros(0)).wavefront(shape).std()),
+            },
         },
         "distance_mm": {"value": drift.distance_mm, "error": found.errors.distance_mm},
         "registration": view.as_json(),

@@ -9,6 +9,7 @@ import base64
 import html
 import io
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,7 @@ def write_report(path: Path, found: Calibration, replaced: bool) -> None:
                     "nm",
                     f"Change of the panel's wavefront, {values['wavefront']['rms_nm']:.2f} nm rms",
                 ),
+                *_free_form(found, values),
                 *(
                     _signed(
                         100 * (found.estimate.drift.amplitude(c, shape) - 1),
@@ -126,6 +128,15 @@ def _registration(values: dict[str, Any]) -> str:
         f"is {view['blur_y_px2']:.3f} and {view['blur_x_px2']:.3f} square pixels, its stray light "
         f"{100 * view['stray']:.2f} % of the mean.</p>"
     )
+
+
+def _free_form(found: Calibration, values: dict[str, Any]) -> list[str]:
+    """The part of the wavefront that no polynomial holds, where one was fitted."""
+    if values["wavefront"]["free_form"]["nodes"] is None:
+        return []
+    shape = next(iter(found.bases.values())).path.grid.shape
+    fine = replace(found.estimate.drift, wavefront_nm=np.zeros(0)).wavefront(shape)
+    return [_signed(fine, "nm", f"of it the free-form part, {fine.std():.2f} nm rms")]
 
 
 def _row(figures: Sequence[str]) -> str:

@@ -17,9 +17,10 @@ import numpy as np
 from firmware_iface.errors import InputError
 from runtime.bundle import Bundle
 from runtime.calibrated import bundle_channels, bundle_paths, load_light_path, plane_of
-from runtime.calibration.check import Heldout, complete, heldout_errors, verdict
+from runtime.calibration.check import SURE, Heldout, complete, heldout_errors, removed, verdict
 from runtime.calibration.drift import Drift, drifted
 from runtime.calibration.fit import Base, Estimate, Fitted, Shot, chi_squared, fit, gain_of, predicted
+from runtime.calibration.freeform import fit_freeform
 from runtime.calibration.patterns import GRAINS, HELD_OUT, grains, grating, proof_picture
 from runtime.calibration.response import SWEEP, Sweep, best_period, fitted_response, measured_sweep
 from runtime.calibration.taking import Noise, Taker
@@ -29,6 +30,7 @@ from runtime.registration import dot_pattern, dots_of, find_homography, panel_po
 from runtime.solver import quality, solve
 
 ORDERS = ((4, 2), (8, 4), (12, 6))  # of wavefront and beam, one fit after the other
+TURNS = 4  # of free-form maps, and all else around them
 SCAN_MM = (
     0.0,
     *(s * d for d in (0.1, 0.2, 0.35, 0.6, 1.0, 1.6, 2.5) for s in (-1, 1)),
@@ -260,23 +262,45 @@ def _refit(
         mm: chi_squared(bases, coarse, replace(estimate, drift=Drift(distance_mm=mm)), 1) for mm in SCAN_MM
     }
     estimate = replace(estimate, drift=Drift(distance_mm=min(costs, key=lambda mm: costs[mm])))
+    parts = len(ORDERS) + TURNS
     for number, orders in enumerate(ORDERS):
-        begin, part = number / len(ORDERS), 1 / len(ORDERS)
-        say(begin, "phase response")
+        say(number / parts, "phase response")
         estimate, sweeps = _with_response(bases, taken, estimate)
-        found = fit(
-            bases,
-            shots,
-            estimate,
-            orders,
-            new_view=new,
-            progress=lambda d, b=begin, p=part, o=orders: say(
-                b + p * d, f"wavefront and beam to order {o[0]}"
-            ),  # type: ignore[misc]
-        )
+        what = f"wavefront and beam to order {orders[0]}"
+        told = _part(say, number, parts, what)
+        found = fit(bases, shots, estimate, orders, new_view=new, progress=told)
         estimate = found.estimate
     estimate, sweeps = _with_response(bases, taken, estimate)
-    return replace(found, estimate=estimate), sweeps
+    found = replace(found, estimate=estimate)
+    return _with_maps(bases, taken, found, sweeps, new, say)
+
+
+def _with_maps(
+    bases: Mapping[str, Base],
+    taken: Mapping[str, Taken],
+    found: Fitted,
+    sweeps: dict[str, Sweep],
+    new: bool,
+    say: Progress,
+) -> tuple[Fitted, dict[str, Sweep]]:
+    """A fit with free-form maps and all else in turn, where held-out patterns surely say that maps pay."""
+    shots = [shot for t in taken.values() for shot in t.fitted]
+    heldout = [shot for t in taken.values() for shot in t.heldout]
+    before = heldout_errors(bases, heldout, found.estimate)
+    for turn in range(TURNS):
+        told = _part(say, len(ORDERS) + turn, len(ORDERS) + TURNS, "wavefront and beam, free-form")
+        estimate = fit_freeform(bases, shots, found.estimate, told)
+        gone, error = removed(before, heldout_errors(bases, heldout, estimate))
+        if turn == 0 and gone - SURE * error <= 0:
+            break
+        found = fit(bases, shots, estimate, ORDERS[-1], iterations=2, new_view=new)
+        estimate, sweeps = _with_response(bases, taken, found.estimate)
+        found = replace(found, estimate=estimate)
+    return found, sweeps
+
+
+def _part(say: Progress, number: int, parts: int, what: str) -> Callable[[float], None]:
+    return lambda done: say((number + done) / parts, what)
 
 
 def _with_response(

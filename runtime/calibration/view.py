@@ -118,6 +118,11 @@ def sampler(view: View, grid: Grid, finer: int = 2) -> Sampler:
     cubic splines on a grid `finer` times as fine again: 2 to predict; 1 is enough for a direction to go in.
     Pixels that look beyond the grid read 0.
     """
+    return sampler_and_adjoint(view, grid, finer)[0]
+
+
+def sampler_and_adjoint(view: View, grid: Grid, finer: int = 2) -> tuple[Sampler, Sampler]:
+    """`sampler`, and its adjoint."""
     y, x = view.positions(grid.shape)
     like = np.zeros((), np.float64)
     fy, fx = image_frequencies(grid, like)
@@ -131,6 +136,7 @@ def sampler(view: View, grid: Grid, finer: int = 2) -> Sampler:
     # a cubic B-spline's own transfer, divided out, so that the spline runs through the samples
     for f in (fy, fx):
         transfer = transfer * (3 / (2 + np.cos(2 * np.pi * f / samples)))
+    transfer[grid.image_shape[0] // 2], transfer[:, -1] = 0, 0  # the highest frequency has no sign of its own
     transfer = transfer.astype(np.float32)
     height, width = (finer * n for n in grid.image_shape)
     weights = _spline(samples * (y + grid.margin), samples * (x + grid.margin), (height, width))
@@ -144,7 +150,12 @@ def sampler(view: View, grid: Grid, finer: int = 2) -> Sampler:
         seen = np.stack([weights @ one for one in flat])
         return seen.reshape(*image.shape[:-2], *view.shape)
 
-    return sampled
+    def back(light: np.ndarray) -> np.ndarray:
+        flat = light.reshape(-1, weights.shape[0])
+        fine = np.stack([weights.T @ one for one in flat]).reshape(*light.shape[:-2], height, width)
+        return irfft2(_narrowed(rfft2(fine), grid.image_shape) * transfer, grid.image_shape)
+
+    return sampled, back
 
 
 def _widened(spectrum: np.ndarray, rows: int, shape: tuple[int, int]) -> np.ndarray:
@@ -154,6 +165,13 @@ def _widened(spectrum: np.ndarray, rows: int, shape: tuple[int, int]) -> np.ndar
     wide[..., :half, : spectrum.shape[-1]] = spectrum[..., :half, :]
     wide[..., half - rows :, : spectrum.shape[-1]] = spectrum[..., half:, :]
     return wide
+
+
+def _narrowed(spectrum: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """The frequencies that a coarser grid has, of a spectrum as from `rfft2`: adjoint of `_widened`."""
+    rows, columns = shape[0], shape[1] // 2 + 1
+    half = rows // 2
+    return np.concatenate([spectrum[..., :half, :columns], spectrum[..., half - rows :, :columns]], axis=-2)
 
 
 def _spline(y: np.ndarray, x: np.ndarray, shape: tuple[int, int]) -> csr_matrix:

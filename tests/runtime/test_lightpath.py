@@ -214,6 +214,25 @@ def test_numpy_and_torch_agree_to_rounding(name: str) -> None:
         assert close(pixel_irradiance(path, image), pixel_irradiance(in_torch, theirs).numpy()) < most
 
 
+@pytest.mark.parametrize("name", PATHS)
+def test_the_gradient_over_a_factor_is_what_differences_say(name: str) -> None:
+    """A small complex change of source and leak alike, in a random direction."""
+    path, rng = PATHS[name], np.random.default_rng(4)
+    phase = phases(path, 1)[0]
+    image, pullback = irradiance_and_pullback(path, phase, factor=True)
+    slope = rng.normal(size=image.shape)
+    over = pullback(slope)
+    log, turn = rng.normal(size=(2, *path.grid.shape))
+
+    def moved(step: float) -> float:
+        factor = np.exp(step * (log + 1j * turn))
+        leak = None if path.leak is None else path.leak * factor
+        return float(np.sum(irradiance(replace(path, source=path.source * factor, leak=leak), phase) * slope))
+
+    wanted = (moved(1e-5) - moved(-1e-5)) / 2e-5
+    assert np.sum(over.real * log + over.imag * turn) == pytest.approx(wanted, rel=1e-6)
+
+
 @pytest.mark.parametrize("name", ["everything", "no_crosstalk"])
 def test_a_batch_is_its_members(name: str) -> None:
     path = PATHS[name]

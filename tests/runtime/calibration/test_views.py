@@ -122,10 +122,10 @@ def test_three_colours_share_one_wavefront(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("share", [0.25, 0.5])
-def test_a_real_panels_shape_is_found(shared: Path, share: float) -> None:
+def test_a_real_panels_shape_is_found_to_a_170th_of_a_wave(shared: Path, share: float) -> None:
     """The wavefront and the beam of a Santec panel as its owner measured them; a share of the former is the drift.
 
-    What a dozen Legendre orders do not hold is left, and so it is an 80th and a 50th of a wave here and not a 170th.
+    A dozen Legendre orders alone leave an 80th and a 50th of a wave; the free-form maps hold the rest.
     """
     file = shared / "real" / "bench_field" / "santec_wavefront_calibration.npz"
     if not file.is_file():
@@ -150,7 +150,8 @@ def test_a_real_panels_shape_is_found(shared: Path, share: float) -> None:
     found = calibrate(opened(headset), bundle)
     hidden = without_tilt(resized(phase, 1)) * wavelength / (2 * np.pi)
     error = without_tilt(found.estimate.drift.wavefront(shape) - hidden)
-    assert found.verdict == "recalibrated" and found.after.excess < 0.05 * found.before.excess
-    assert error.std() < wavelength / 45 and hidden.std() > 5 * error.std()
+    assert found.verdict == "recalibrated" and found.after.excess < 0.005 * found.before.excess
+    assert error.std() < wavelength / 170 < hidden.std() / 20
+    assert found.estimate.drift.wavefront_nodes_nm.size
     before, after = (found.pictures["green"][name][1] for name in ("before", "after"))
     assert after > before + 8
