@@ -122,6 +122,12 @@ def _power(colour: dict[str, Any]) -> str:
 def sentence_of(found: dict[str, Any], replaced: bool) -> str:
     """The verdict in plain words."""
     before, after = found["heldout"]["before"]["excess"], found["heldout"]["after"]["excess"]
+    if found["verdict"] == "unchanged" and found["camera_scale"] is not None:
+        return (
+            f"Nothing has drifted for certain (excess {before:.2g} on held-out patterns): the camera's scale is off by "
+            f"{found['camera_scale']:+.5f}, or defocus and distance have drifted as below, which at one plane looks "
+            "the same; nothing was replaced. To know, register the camera again."
+        )
     if found["verdict"] == "unchanged":
         return (
             f"Nothing has drifted that the camera can see: the excess on held-out patterns is {before:.2g}."

@@ -35,6 +35,7 @@ VIEW = (
     ("shift_y_px", 0.02),
     ("shift_x_px", 0.02),
     ("rotation_mrad", 0.05),
+    ("distortion", 1e-3),
     ("blur_y_px2", 0.02),
     ("blur_x_px2", 0.02),
 )  # fields of a View and the steps of their secants

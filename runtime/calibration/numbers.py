@@ -67,6 +67,7 @@ def numbers(found: Calibration) -> dict[str, Any]:
         },
         "distance_mm": {"value": drift.distance_mm, "error": found.errors.distance_mm},
         "registration": view.as_json(),
+        "camera_scale": found.camera_scale,
         "channels": colours,
         "plane_mm": found.plane_mm,
         "patterns": {"fitted": len(GRAINS), "gratings": len(SWEEP), "held_out": len(HELD_OUT) + 1, "dots": 1},

@@ -17,7 +17,7 @@ import numpy as np
 from firmware_iface.errors import InputError
 from runtime.bundle import Bundle
 from runtime.calibrated import bundle_channels, bundle_paths, load_light_path, plane_of
-from runtime.calibration.check import SURE, Heldout, complete, heldout_errors, removed, verdict
+from runtime.calibration.check import LEAST, SURE, Heldout, complete, heldout_errors, removed, verdict
 from runtime.calibration.drift import Drift, drifted
 from runtime.calibration.fit import Base, Estimate, Fitted, Shot, chi_squared, fit, gain_of, predicted
 from runtime.calibration.freeform import fit_freeform
@@ -61,7 +61,8 @@ class Calibration:
     responses. shots: captures a colour. before, after: errors on held-out captures. pictures: for each colour the
     picture as the camera saw it before and after, on the panel's pixels, float32 [H, W], with amplitude PSNR in dB.
     counts_per_ms: of each colour, and the relative spread over captures; known_counts_per_ms: what it was at the last
-    calibration.
+    calibration. camera_scale: where nothing is replaced and only a camera whose scale is off by this much, relative,
+    makes the light path right: that, or defocus and distance.
     """
 
     verdict: str
@@ -79,6 +80,7 @@ class Calibration:
     captures: int
     seconds: Mapping[str, float]
     known_counts_per_ms: Mapping[str, float]
+    camera_scale: float | None
 
 
 def calibrate(
@@ -119,8 +121,8 @@ def calibrate(
     found, sweeps = _refit(bases, taken, view, new, lambda d, w: say(0.25 + 0.6 * d, f"fitting: {w}"))
     say(0.86, "checking against held-out patterns")
     heldout = [shot for t in taken.values() for shot in t.heldout]
-    as_it_was = fit(bases, heldout, Estimate(Drift(), found.estimate.view), (0, 0), new_view=new).estimate
-    before, after = (heldout_errors(bases, heldout, e) for e in (as_it_was, found.estimate))
+    before, scale = _as_it_was(bases, heldout, found.estimate.view)
+    after = heldout_errors(bases, heldout, found.estimate)
     say(0.92, "solving the picture again")
     better = {c: _solved(bases[c], c, found.estimate.drift) for c in channels}
     with open_devices() as devices, _dark_after(devices):
@@ -128,8 +130,9 @@ def calibrate(
         taker = Taker(devices, lambda what: say(0.96, f"showing: {what}"), taker.taken)
         pictures = {c: _pictures(taker, c, better[c], taken[c], found.estimate.view) for c in channels}
     done = time.perf_counter()
+    said = verdict(before, after, _excess_before(bundle))
     return Calibration(
-        verdict(before, after, _excess_before(bundle)),
+        said,
         complete(before, after),
         found.estimate,
         found.errors,
@@ -144,7 +147,23 @@ def calibrate(
         taker.taken,
         {"capturing": captured - started, "fitting": done - captured},
         (bundle.description.get("camera") or {}).get("counts_per_ms") or {},
+        scale if said == "unchanged" else None,
     )
+
+
+def _as_it_was(bases: Mapping[str, Base], heldout: list[Shot], view: View) -> tuple[Heldout, float | None]:
+    """How well the light path predicts as it was, and the camera's scale if that matters to it.
+
+    At one plane defocus and distance together do what a camera of another scale does: not one pattern tells them
+    apart (the rays' matrices are the same). So the camera's scale is the old light path's to choose, and a refit must
+    be better than that before it replaces anything.
+    """
+    start = Estimate(Drift(), view)
+    rigid, scaled = (fit(bases, heldout, start, (0, 0), new_view=new).estimate for new in (False, True))
+    errors = heldout_errors(bases, heldout, scaled)
+    gone, error = removed(heldout_errors(bases, heldout, rigid), errors)
+    matters = gone - SURE * error > 0 and gone > LEAST
+    return errors, scaled.view.magnification if matters else None
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 from scipy.sparse import csr_matrix
 
 from firmware_iface.errors import InputError
@@ -17,7 +18,7 @@ from runtime.bundle import Bundle
 from runtime.fft import irfft2, rfft2
 from runtime.legendre import edge_to_edge, legendre_maps
 from runtime.lightpath import FINE, Grid, image_frequencies
-from runtime.registration import panel_points, resample
+from runtime.registration import panel_points
 
 SENSITIVITY_ORDER = 4  # of the camera's own fall-off, so that none of it is taken for the beam's
 TERMS = 14  # of that order
@@ -32,7 +33,7 @@ class View:
     shape: (h, w), pixels. homography: 9 numbers, row-major, from camera pixels (x, y, 1) to panel pixels.
     shift_y_px, shift_x_px, rotation_mrad: a rigid motion on the panel after it, about the panel's centre.
     magnification, aspect, shear, keystone_y, keystone_x: what a homography from dots is still wrong by, relative,
-    at the panel's border.
+    at the panel's border. distortion: radial, of the lens: relative, at the panel's corners.
     blur_y_px2, blur_x_px2: variance of the lens's blur, panel pixels squared. sensitivity: Legendre terms of
     its logarithm, from order 1 on. stray: light that is added, share of a picture's mean.
     """
@@ -47,6 +48,7 @@ class View:
     shear: float = 0.0
     keystone_y: float = 0.0
     keystone_x: float = 0.0
+    distortion: float = 0.0
     blur_y_px2: float = 0.0
     blur_x_px2: float = 0.0
     sensitivity: tuple[float, ...] = (0.0,) * TERMS
@@ -84,7 +86,7 @@ class View:
         """Where each camera pixel's centre looks on a panel of that shape: (y, x), each float64 [h, w]."""
         y, x = np.mgrid[: self.shape[0], : self.shape[1]]
         there = panel_points(self.matrix(panel), np.stack([x.ravel(), y.ravel()], 1))
-        return there[:, 1].reshape(self.shape), there[:, 0].reshape(self.shape)
+        return _bent(there[:, 1].reshape(self.shape), there[:, 0].reshape(self.shape), panel, self.distortion)
 
 
 def view_of(bundle: Bundle) -> View | None:
@@ -105,10 +107,23 @@ def sensitivity_maps(shape: tuple[int, int]) -> np.ndarray:
     return legendre_maps(*edge_to_edge(shape), SENSITIVITY_ORDER)
 
 
+def _bent(
+    y: np.ndarray, x: np.ndarray, panel: tuple[int, int], distortion: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions on a panel after a radial distortion; the opposite distortion takes them back, to first order."""
+    v, u = y - (panel[0] - 1) / 2, x - (panel[1] - 1) / 2
+    by = distortion * (v**2 + u**2) / ((panel[0] / 2) ** 2 + (panel[1] / 2) ** 2)
+    return y + by * v, x + by * u
+
+
 def on_panel(signal: np.ndarray, view: View, shape: tuple[int, int]) -> np.ndarray:
     """A capture [h, w] on the panel's pixels, float32 [H, W], without stray light and the camera's unevenness."""
     stray = view.stray / (1 + view.stray) * float(signal.mean())
-    return resample((signal - stray) / view.evenness(), view.matrix(shape), shape)
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    y, x = _bent(rows, columns, shape, -view.distortion)
+    there = panel_points(np.linalg.inv(view.matrix(shape)), np.stack([x.ravel(), y.ravel()], 1))
+    light = ((signal - stray) / view.evenness()).astype(np.float32)
+    return np.asarray(ndimage.map_coordinates(light, (there[:, 1], there[:, 0]), order=3)).reshape(shape)
 
 
 def sampler(view: View, grid: Grid, finer: int = 2) -> Sampler:

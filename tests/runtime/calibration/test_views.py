@@ -15,9 +15,12 @@ from firmware_iface.virtual.description import ChannelDescription
 from firmware_iface.virtual.panel import panel_path_nm
 from runtime.bundle import Bundle, read_bundle, write_bundle
 from runtime.calibrated import load_light_path, pack_light_paths
+from runtime.calibration.command import sentence_of
+from runtime.calibration.numbers import numbers
 from runtime.calibration.replacing import replace_bundle
 from runtime.calibration.run import calibrate
-from runtime.calibration.view import View, view_of
+from runtime.calibration.view import View, on_panel, sampler, view_of
+from runtime.legendre import edge_to_edge
 from runtime.lightpath import LightPath
 from runtime.registration import panel_points
 from tests.runtime.benches import ideal_path
@@ -78,6 +81,33 @@ def test_a_mirrored_turned_and_finer_camera_is_found_by_its_dots_and_remembered(
 
     replace_bundle(folder, bundle, found)
     assert view_of(read_bundle(folder)) == found.estimate.view
+
+
+def test_a_cameras_scale_and_distortion_are_not_put_into_the_light_path() -> None:
+    """A scale that is off looks like defocus and distance, exactly; a distortion does not, and is found."""
+    shape = (80, 96)
+    bench = drifted_bench("misregistration", shape=shape, scale=1.001, distortion_px=0.3)
+    bundle = read_bundle_of(ideal_path(shape, DISTANCE_MM * 1e-3, dtype=np.float32))
+    found = calibrate(opened(VirtualHeadset(bench, 1)), bundle)
+    assert found.verdict == "unchanged" and found.camera_scale == pytest.approx(0.001, rel=0.1)
+    assert found.estimate.view.distortion == pytest.approx(0.3 / np.hypot(*shape) * 2, rel=0.1)
+    said = sentence_of(numbers(found), False)
+    assert "camera's scale is off by +0.0010" in said and "defocus and distance" in said
+    # but for that defocus the wavefront is none
+    left = without_tilt(found.estimate.drift.wavefront(shape))
+    y, x = (n * v for n, v in zip(shape, edge_to_edge(shape), strict=True))
+    bowl = without_tilt(y**2 + x**2)
+    assert (left - bowl * float((bowl * left).sum() / (bowl**2).sum())).std() < 520 / 170
+
+
+def test_a_capture_is_brought_onto_the_panel_through_a_bent_view() -> None:
+    path = ideal_path(SHAPE, 8e-3)
+    image = gaussian_filter(np.random.default_rng(0).random(path.grid.image_shape), 5)
+    bent = View(SHAPE, shift_x_px=0.3, rotation_mrad=3.0, distortion=0.01)
+    wanted = sampler(View(SHAPE), path.grid)(image)
+    seen = on_panel(sampler(bent, path.grid)(image), bent, SHAPE)
+    inside = (slice(4, -4), slice(4, -4))
+    assert np.abs(seen - wanted)[inside].max() < 0.02 * np.ptp(wanted)
 
 
 def test_what_the_camera_alone_does_never_reaches_the_headset() -> None:
