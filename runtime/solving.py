@@ -173,7 +173,7 @@ def run(args: Namespace) -> dict[str, Any]:
         None if iterations is None else (iterations + 1) * len(args.targets) * len(groups)
     ) as tick:
         for target in args.targets:
-            pictures = _planes(target, shape, channels, args.fit, len(every) > 1)
+            pictures = target_planes(target, shape, channels, args.fit, len(every) > 1)
             for solver, group in zip(solvers, groups, strict=True):
                 names = [out[target, c] for c in group]
                 solution = solver.solve(
@@ -243,7 +243,7 @@ def jobs(targets: Sequence[Path], channels: Sequence[str], out: Path) -> list[Jo
     return planned
 
 
-def _planes(
+def target_planes(
     path: Path, shape: tuple[int, int], channels: Sequence[str], fit: bool, colour: bool
 ) -> dict[str, Any]:
     """A picture's irradiance for each channel, [H, W].

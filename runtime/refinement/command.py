@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,9 @@ ABOUT = """Show a picture, look at it with the headset's camera, and make it bet
 
 Each capture moves the pattern, and draws the bundle's approximator towards what the camera saw. Every third one is held
 out; where those are predicted worse than before, the refinement stops and goes back to the best. The bundle is not
-changed. The laser is switched on before and off after, and is not touched in between. For bundles of one colour that
-were exported with a network, and whose camera a calibration has seen.
+changed. The laser is switched on before and off after, and is not touched in between; several take turns, one lit at a
+time and each at its own power throughout. For bundles that were exported with a network, and whose camera a
+calibration has seen.
 
 examples:
   hololoop-runtime refine bundle/ picture.png --headset headset.toml --out pattern.png --log drift.jsonl"""
@@ -29,12 +31,19 @@ def arguments(parser: ArgumentParser) -> None:
         help="a service's configuration, virtual:NAME, or a virtual bench's TOML file",
     )  # fmt: skip
     parser.add_argument("--captures", metavar="N", type=int, default=24, help="at most so many (default 24)")
-    parser.add_argument("--out", metavar="PHASE.png", type=Path, help="write the best pattern")
+    parser.add_argument(
+        "--out",
+        metavar="PHASE.png",
+        type=Path,
+        help="write the best pattern; with several colours NAME-red.png and so on",
+    )
     parser.add_argument("--log", metavar="FILE.jsonl", type=Path, help="add a line for each capture")
 
 
 def run(args: Namespace) -> dict[str, Any]:
     """Show, capture and refine; returns what `--json` prints."""
+    import numpy as np
+
     from runtime.approximator import approximator_of
     from runtime.bundle import read_bundle
     from runtime.calibrated import bundle_channels, load_light_path
@@ -44,25 +53,21 @@ def run(args: Namespace) -> dict[str, Any]:
     from runtime.refinement.eye import Eye
     from runtime.refinement.refine import Refinement, refine
     from runtime.solver import solve
-    from runtime.solving import write_gray
-    from runtime.targets import read_target
+    from runtime.solving import jobs, target_planes, write_gray
 
     if args.captures < 1:
         raise InputError(f"--captures {args.captures}: give 1 or more, and better 6")
     bundle = read_bundle(args.bundle)
     channels = bundle_channels(bundle)
-    if len(channels) > 1:
-        raise InputError(
-            f"the bundle has {len(channels)} colours and their lasers would have to take turns, which a refinement "
-            "does not do: export one colour"
-        )
-    path = load_light_path(bundle, channels[0])
-    shape = path.grid.shape
-    approximator = approximator_of(bundle, (1, *shape))
+    outs = [job.out for job in jobs([args.target], channels, args.out)] if args.out else []
+    paths = [load_light_path(bundle, c) for c in channels]
+    shape = paths[0].grid.shape
+    approximator = approximator_of(bundle, (len(paths), *shape))
     if approximator is None:
         raise InputError("the bundle has no approximator to refine: train one and export it with the bundle")
-    target = read_target(args.target, shape, fit=True)
-    first = solve(path, target).phase
+    planes = target_planes(args.target, shape, channels, fit=True, colour=len(channels) > 1)
+    target = np.stack([planes[c] for c in channels])
+    first = np.stack([solve(path, t).phase for path, t in zip(paths, target, strict=True)])
     opened = open(args.log, "a", encoding="utf-8") if args.log else nullcontext()  # noqa: SIM115 - closed below
     with opened as log, open_devices(args.headset) as devices:
         view = view_of(bundle)
@@ -72,24 +77,32 @@ def run(args: Namespace) -> dict[str, Any]:
             raise InputError(
                 f"{args.bundle} does not know where this camera looks: run hololoop-runtime calibrate first"
             )
-        state = Refinement([path], approximator, target[None], first.reshape(1, *shape), log)
+        state = Refinement(paths, approximator, target, first, log)
         taker = Taker(devices, lambda what: None)
         black, _ = taker.darkness()
+        exposures: dict[str, float] = {}
+
+        def turn(channel: str) -> None:
+            taker.light(channel)
+            devices.camera.exposure_ms = exposures[channel]
+
         try:
-            taker.light(channels[0])
-            taker.expose(state.gray[0], black)
-            steps = refine(state, Eye(devices.panel, devices.camera, view, black), args.captures)
+            for channel, gray in zip(channels, state.gray, strict=True):
+                taker.light(channel)
+                exposures[channel] = taker.expose(gray, black)
+            turns = [partial(turn, c) for c in channels] if len(channels) > 1 else None
+            steps = refine(state, Eye(devices.panel, devices.camera, view, black, turns), args.captures)
         finally:
             devices.lasers.off()
-    if args.out:
-        write_gray(args.out, state.gray[0])
+    for out, gray in zip(outs, state.gray if outs else [], strict=True):
+        write_gray(out, gray)
     return {
         "captures": len(steps),
-        "psnr_db": {"first": steps[0].psnr_db, "best": max(s.psnr_db for s in steps)},
+        "psnr_db": {"first": steps[0].psnr_db, "best": state.best_psnr_db},
         "heldout": {"first": steps[0].heldout, "last": steps[-1].heldout},
         "drift": steps[-1].drift,
         "stopped": state.stopped,
-        "phase": str(args.out) if args.out else None,
+        "patterns": {channel: str(out) for channel, out in zip(channels if outs else [], outs, strict=True)},
         "log": str(args.log) if args.log else None,
     }
 
@@ -101,5 +114,5 @@ def show(result: dict[str, Any]) -> None:
         f"{psnr['first']:.1f} -> {psnr['best']:.1f} dB amplitude PSNR, seen by the camera, after {result['captures']} "
         f"captures ({result['stopped']})."
     )
-    if result["phase"]:
-        print(f"The best pattern is {result['phase']}.")
+    for out in result["patterns"].values():
+        print(f"The best pattern is {out}.")

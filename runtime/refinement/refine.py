@@ -5,8 +5,8 @@ pattern: the residual is the camera's, the derivatives are the model's (seed eq.
 drawn towards y through the exported gradients over its adapters, by Adam (Kingma and Ba 2015) in NumPy.
 
 Every third capture is held out: the adapters never learn from it. When they predict the last of these worse than they
-did before, they are put back to where they predicted best, and the refinement stops. The pattern that the camera liked
-best is the one that stays. The inputs are patterns and pictures; lasers are out of reach.
+did before, they are put back to where they predicted best, and the refinement stops. Of each colour the pattern that
+the camera liked best is the one that stays. The inputs are patterns and pictures; lasers are out of reach.
 """
 
 from __future__ import annotations
@@ -110,7 +110,8 @@ class Refinement:
         self._heldout = math.inf
         self._rises = 0
         self.phase = self._first_phase.copy()
-        self.best_phase, self._best_psnr, self._step = self.phase, -math.inf, STEP
+        self.best_phase = self.phase.copy()
+        self._best_psnr, self._step = np.full(len(self.paths), -np.inf), np.full(len(self.paths), STEP)
         self.stopped = None
 
     @property
@@ -118,6 +119,11 @@ class Refinement:
         """The pattern to show: the next one to be tried, or after the end the best; uint8 [C, H, W]."""
         phase = self.best_phase if self.stopped else self.phase
         return np.stack([d.gray(p) for d, p in zip(self.drives, phase, strict=True)])
+
+    @property
+    def best_psnr_db(self) -> float:
+        """What the camera saw of the best pattern of each colour, mean over colours."""
+        return float(self._best_psnr.mean())
 
     def take(self, captured: np.ndarray) -> Step:
         """Learn from what the camera saw of `gray`, irradiance [C, H, W] of any scale, and choose the next pattern.
@@ -139,18 +145,15 @@ class Refinement:
             self._heldout = self._watch()
         else:
             self._learn(simulated, seen)
-        psnr = float(
-            np.mean(
-                [quality(np.maximum(y, 0), t).psnr_db for y, t in zip(captured, self.target, strict=True)]
-            )
+        psnr = np.array(
+            [quality(np.maximum(y, 0), t).psnr_db for y, t in zip(captured, self.target, strict=True)]
         )
-        if psnr > self._best_psnr:
-            self._best_psnr, self.best_phase = psnr, self.phase
-        if psnr > self._best_psnr - WORSE_DB:
-            self._advance(simulated, seen, pullbacks)
-        else:
-            self.phase, self._step = self.best_phase, self._step / 2
-        step = Step(number, held, psnr, predicted, self._heldout, self._drift(), self.stopped)
+        better, worse = psnr > self._best_psnr, psnr < self._best_psnr - WORSE_DB
+        self.best_phase[better], self._best_psnr[better] = self.phase[better], psnr[better]
+        self._step[worse] /= 2
+        moved = self._moved(simulated, seen, pullbacks)
+        self.phase = np.where(worse[:, None, None], self.best_phase, moved).astype(np.float32)
+        step = Step(number, held, float(psnr.mean()), predicted, self._heldout, self._drift(), self.stopped)
         self.steps.append(step)
         if self.log:
             self.log.write(json.dumps(asdict(step)) + "\n")
@@ -204,7 +207,7 @@ class Refinement:
     def _held_error(self) -> float:
         return float(np.mean([self._error(simulated, seen) for simulated, seen in self._held]))
 
-    def _advance(self, simulated: np.ndarray, seen: np.ndarray, pullbacks: list[Pullback]) -> None:
+    def _moved(self, simulated: np.ndarray, seen: np.ndarray, pullbacks: list[Pullback]) -> np.ndarray:
         """The next pattern: one step down the gradient with the captured picture in place of the simulated one."""
         self._look(simulated, seen)
         made = _amplitude(self.approximator.corrected)
@@ -213,12 +216,12 @@ class Refinement:
         instead = np.maximum(made - _amplitude(seen) + _amplitude(wanted), 0) ** 2 - EPSILON
         self._look(simulated, np.maximum(instead, 0))
         moved = [
-            drive.held(p - np.float32(self._step) * back(slope.copy()))
-            for drive, p, back, slope in zip(
-                self.drives, self.phase, pullbacks, self.approximator.slope, strict=True
+            drive.held(p - np.float32(length) * back(slope.copy()))
+            for drive, p, length, back, slope in zip(
+                self.drives, self.phase, self._step, pullbacks, self.approximator.slope, strict=True
             )
         ]
-        self.phase = np.stack(moved).astype(np.float32)
+        return np.stack(moved)
 
     def _put(self, weights: Weights) -> None:
         for name, weight in weights.items():

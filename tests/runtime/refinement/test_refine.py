@@ -24,7 +24,7 @@ from runtime.lightpath import LightPath
 from runtime.refinement.eye import Eye
 from runtime.refinement.refine import HOLD_OUT, Refinement, _to_step, refine
 from runtime.solver import solve
-from tests.runtime.benches import ideal_path, scene
+from tests.runtime.benches import converted, ideal_path, scene
 
 SHAPE, DISTANCE_MM = (64, 80), 8.0
 
@@ -245,3 +245,73 @@ def test_the_command_refines_a_picture_and_leaves_the_bundle_and_the_dark(
     write_bundle(bundle, arrays, {"paths": records, "distance_mm": DISTANCE_MM}, {}, replace=True)
     assert main(["refine", *map(str, words)]) == 2
     assert "no approximator" in capsys.readouterr().err
+
+
+def test_three_colours_take_turns_and_each_is_refined(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A bench of three colours whose drive is not what the bundle believes; one laser is lit at a time."""
+    torch = pytest.importorskip("torch")
+    from firmware_iface import virtual
+    from firmware_iface.virtual.description import ChannelDescription
+    from runtime import ideal
+    from runtime.solver import quality
+    from trainer.networks.approximator import Approximator as Network
+    from trainer.networks.approximator import Architecture
+    from trainer.networks.onnx_files import onnx_files
+
+    colours = {"red": 638.0, "green": 520.0, "blue": 450.0}
+    shape = (48, 64)
+    bench = BenchDescription(
+        defects=(make_defect("phase_response"),),
+        channels=tuple(ChannelDescription(name, nm) for name, nm in colours.items()),
+    ).resized(*shape, DISTANCE_MM)
+    headset = VirtualHeadset(bench, seed=2)
+    headset.lasers.off()
+    paths = [
+        (
+            name,
+            DISTANCE_MM,
+            nm,
+            converted(ideal.ideal_path(shape, 8e-6, nm * 1e-9, DISTANCE_MM * 1e-3, 1.0), np.float32),
+        )
+        for name, nm in colours.items()
+    ]
+    records, arrays = pack_light_paths(paths)
+    torch.manual_seed(0)
+    networks = onnx_files(Network(Architecture("compact", 8, shape, 3)))
+    bundle = tmp_path / "bundle"
+    write_bundle(bundle, arrays, {"paths": records, "distance_mm": DISTANCE_MM}, {}, networks=networks)
+    picture = tmp_path / "picture.npy"
+    target = np.stack([scene(shape), scene(shape)[:, ::-1], scene(shape)[::-1]])
+    np.save(picture, target)
+
+    levels: dict[str, set[float]] = {name: set() for name in colours}
+    whole = headset.camera.capture
+
+    def capture() -> np.ndarray:
+        powers = {name: headset.lasers.power(name) for name in colours}
+        assert sum(power > 0 for power in powers.values()) <= 1
+        for name, power in powers.items():
+            levels[name].add(power)
+        return np.asarray(whole())
+
+    monkeypatch.setattr(headset.camera, "capture", capture)
+    monkeypatch.setattr(virtual, "open_headset", lambda spec, seed: headset)
+    out = tmp_path / "pattern.png"
+    words = [bundle, picture, "--headset", "virtual:demo", "--captures", 9, "--out", out, "--json"]
+    assert main(["refine", *map(str, words)]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["psnr_db"]["best"] > result["psnr_db"]["first"] + 3
+    assert all(seen == {0.0, 1.0} for seen in levels.values())  # off, or at its one power
+    assert all(headset.lasers.power(name) == 0 for name in colours)
+    monkeypatch.undo()
+    for (name, _, _, path), wanted in zip(paths, target, strict=True):
+        with Image.open(result["patterns"][name]) as image:
+            shown = np.asarray(image)
+        before, after = (
+            quality(headset.true_irradiance(gray, name), wanted).psnr_db
+            for gray in (solve(path, wanted).gray, shown)
+        )
+        print(name, before, after)
+        assert after > before + 3, name
