@@ -42,6 +42,8 @@ from runtime.service.protocol import (
     End,
     Error,
     Hello,
+    Refine,
+    Refined,
     Shown,
     State,
     Status,
@@ -74,7 +76,8 @@ class Lost(NamedTuple):
 class Client:
     """A connection to the service. Not for several threads at once.
 
-    shape : (C, H, W) of a picture. Attributes: welcome (what the service said of itself), slots (number).
+    shape : (C, H, W) of a picture. Attributes: welcome (what the service said of itself), slots (number), refined (what
+    became of the last refinement; None while it goes on).
     """
 
     def __init__(self, link: Link, welcome: Welcome, slots: int, timeout_s: float) -> None:
@@ -85,6 +88,7 @@ class Client:
         self._taken: dict[int, int] = {}  # slot by frame
         self._drawing: int | None = None
         self._outcomes: deque[Shown | Lost] = deque()
+        self.refined: Refined | None = None
 
     def __enter__(self) -> Client:
         return self
@@ -122,6 +126,15 @@ class Client:
         """A picture of the camera that began after this call: counts, uint16 [h, w]."""
         picture, fd = self._ask(Capture(), None)
         return read_sealed(fd, (picture.height, picture.width), np.uint16)
+
+    def refine(self, captures: int = 24) -> None:
+        """Have the next frame's picture refined while frames with it are shown, for at most so many captures.
+
+        What became of it is in `refined`, when it has ended and outcomes were asked for. 0 captures end it and go back
+        to the solver's own pattern.
+        """
+        self._ask(Refine(captures), Done)
+        self.refined = None
 
     def wait(self) -> Timing:
         """The next frame, when it may begin."""
@@ -219,6 +232,8 @@ class Client:
             if isinstance(message, Shown):
                 self._taken.pop(message.frame, None)
                 self._outcomes.append(message)
+            elif isinstance(message, Refined):
+                self.refined = message
             elif isinstance(message, Error):
                 if message.frame == 0:
                     raise RefusedError(message)

@@ -38,7 +38,10 @@ class Clock:
 
 @dataclass(frozen=True)
 class Ready:
-    """A pattern for the panel: gray levels of each colour, uint8 [C, H, W]; dark: not to be lit."""
+    """A pattern for the panel: gray levels of each colour, uint8 [C, H, W].
+
+    dark: not to be lit. refined: one of a refinement's, which the camera is to see.
+    """
 
     job: int
     display_ns: int
@@ -47,6 +50,7 @@ class Ready:
     psnr_db: float
     final: bool
     dark: bool = False
+    refined: bool = False
 
 
 class Events(Protocol):

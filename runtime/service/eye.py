@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable
 from itertools import count
 
 from runtime.service import inside, protocol
@@ -15,6 +16,8 @@ from runtime.service.messages import ProtocolError
 from runtime.service.metrics import Metrics
 from runtime.service.protocol import Code, Error
 from runtime.service.sessions import RequestError, Session
+
+Taken = Callable[[inside.Seen | None, int | None, str], None]  # a picture and its memfd, or None and why not
 
 
 class Eye:
@@ -31,7 +34,7 @@ class Eye:
         )
         self._stale_ns = int(configuration.timing.stale_limit_ms * 1e6)
         self._loop, self._faults, self._metrics = loop, faults, metrics
-        self._asked: dict[int, tuple[Session, int]] = {}
+        self._asked: dict[int, Taken] = {}
         self._serials = count(1)
 
     def turn(self, now_s: float) -> None:
@@ -42,6 +45,17 @@ class Eye:
 
     def capture(self, session: Session, serial: int) -> None:
         """Have the next picture sent to a program. Raises RequestError where there is no camera."""
+
+        def answer(seen: inside.Seen | None, fd: int | None, why: str) -> None:
+            if seen is None or fd is None:
+                session.send(Error(Code.CAMERA, 0, f"there is no picture: {why}"), serial)
+            else:
+                session.send(protocol.Picture(*seen), serial, fd)
+
+        self.look(answer)
+
+    def look(self, taken: Taken) -> None:
+        """Call `taken` with the next picture. Raises RequestError where there is no camera."""
         if not self.there:
             raise RequestError(Code.CAMERA, "the headset has no camera: add [camera] to its configuration")
         if self._child.link is None:
@@ -51,11 +65,7 @@ class Eye:
             self._child.link.send(inside.Take(), number)
         except OSError as error:
             raise RequestError(Code.CAMERA, f"the camera's process does not read ({error})") from None
-        self._asked[number] = (session, serial)
-
-    def forget(self, session: Session) -> None:
-        """A program has gone."""
-        self._asked = {n: asked for n, asked in self._asked.items() if asked[0] is not session}
+        self._asked[number] = taken
 
     def close(self) -> None:
         """End the process."""
@@ -78,9 +88,9 @@ class Eye:
                 self._missing(text)
             case inside.Seen(exposure_us=exposure_us):
                 self.fresh_until_ns = time.monotonic_ns() + self._stale_ns + exposure_us * 1000
-                session, asked = self._asked.pop(serial, (None, 0))
-                if session is not None and fd is not None:
-                    session.send(protocol.Picture(*message), asked, fd)
+                taken = self._asked.pop(serial, None)
+                if taken is not None:
+                    taken(message, fd, "it came without one")
         if fd is not None:
             os.close(fd)
 
@@ -88,5 +98,5 @@ class Eye:
         self.fresh_until_ns = 0
         self._faults.note("camera", why)
         asked, self._asked = self._asked, {}
-        for session, serial in asked.values():
-            session.send(Error(Code.CAMERA, 0, f"there is no picture: {why}"), serial)
+        for taken in asked.values():
+            taken(None, None, why)

@@ -11,6 +11,7 @@
  *   CLEAR, ARM, DARK -> DONE        lasers
  *   STATUS           -> STATE
  *   CAPTURE          -> PICTURE + memfd
+ *   REFINE           -> DONE        later, with serial 0: REFINED
  *
  * Any request may be answered by ERROR. Times are CLOCK_MONOTONIC in ns. A slot of the ring holds linear irradiance,
  * uint16_t [channels][height][width], 65535 for the brightest; `crc` is zlib's crc32 of its bytes.
@@ -41,7 +42,9 @@ enum hololoop_message {
     HOLOLOOP_ARM = 14,
     HOLOLOOP_DARK = 15,
     HOLOLOOP_CAPTURE = 16,
-    HOLOLOOP_PICTURE = 17
+    HOLOLOOP_PICTURE = 17,
+    HOLOLOOP_REFINE = 18,
+    HOLOLOOP_REFINED = 19
 };
 
 enum hololoop_part { HOLOLOOP_ABSENT = 0, HOLOLOOP_FRESH = 1, HOLOLOOP_STALE = 2, HOLOLOOP_LOST = 3 };
@@ -170,6 +173,20 @@ struct hololoop_picture {
     uint32_t width;
     uint32_t bit_depth;
     uint32_t exposure_us;
+};
+
+struct hololoop_refine {
+    struct hololoop_header header;
+    uint32_t captures; /* at most; 0: end a refinement, and back to the solver's own pattern */
+    uint32_t reserved;
+};
+
+struct hololoop_refined {
+    struct hololoop_header header;
+    uint32_t captures;
+    float first_psnr_db; /* of amplitude, of the captured picture */
+    float best_psnr_db;
+    char text[240]; /* why it has ended; UTF-8, ends with a zero */
 };
 
 #endif

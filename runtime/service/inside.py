@@ -1,6 +1,7 @@
 """What the supervisor and its two child processes say to each other.
 
 supervisor  Targets, Job, Free, Ping      ->  solver    Patterns, Solved, Unsolved, Pong
+supervisor  Refine, Look                  ->  solver    Refined
 supervisor  Take                          ->  camera    Seen (answers Take with the picture), Missing
 """
 
@@ -44,7 +45,8 @@ class Job(NamedTuple):
     reserved: U32 = 0
 
 
-FINAL, DARK = 1, 2  # flags of Solved: no better pattern is to come; the picture is black
+# Flags of Solved: no better pattern is to come; the picture is black; the pattern is one of a refinement's.
+FINAL, DARK, REFINED = 1, 2, 4
 
 
 class Solved(NamedTuple):
@@ -73,6 +75,30 @@ class Free(NamedTuple):
     slot: U32
 
 
+class Refine(NamedTuple):
+    """Refine the picture of the next job, and show its patterns for all jobs that have it; 0 captures: no more."""
+
+    captures: U32
+    black: F32  # counts of the camera without light
+
+
+class Look(NamedTuple):
+    """What the camera saw while the pattern with this CRC-32 was displayed; comes with a memfd, as Picture."""
+
+    crc: U32
+    height: U32
+    width: U32
+
+
+class Refined(NamedTuple):
+    """A refinement has ended, and why; amplitude PSNR of the captured picture, dB, at first and at best."""
+
+    captures: U32
+    first_psnr_db: F32
+    best_psnr_db: F32
+    text: Text
+
+
 class Seen(NamedTuple):
     """The camera took a picture."""
 
@@ -94,6 +120,18 @@ class Take(NamedTuple):
 
 
 SOLVER = Vocabulary(
-    {1: Ping, 2: Pong, 3: Patterns, 4: Targets, 5: Job, 6: Solved, 7: Unsolved, 8: Free},
+    {
+        1: Ping,
+        2: Pong,
+        3: Patterns,
+        4: Targets,
+        5: Job,
+        6: Solved,
+        7: Unsolved,
+        8: Free,
+        9: Refine,
+        10: Look,
+        11: Refined,
+    }
 )
 CAMERA = Vocabulary({1: Seen, 2: Missing, 3: Take})

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from itertools import count
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from runtime.service.metrics import Metrics
 from runtime.service.protocol import Code
 from runtime.service.ring import Ring, crc32, open_ring
 from runtime.service.sessions import FrameJob, RequestError, Session
+from runtime.service.watching import Tell, Watching
 
 PING_NS = 30_000_000
 HAND_OVER_NS = 1_000_000  # from the solver's deadline to the display's having its pattern
@@ -40,13 +41,20 @@ class Pipeline:
     """Frames on their way.
 
     expect : told what light a pattern is predicted to make, and what to do when the lasers are ready for it
+    watching : makes what follows refinements, from a way to tell the solver something
 
     Attributes: shape ((C, H, W), or None until the solver is ready), showing (the session that has the display),
     display, clock, shown, late and failed (numbers of frames), fresh_until_ns (of the solver)
     """
 
     def __init__(
-        self, configuration: Configuration, loop: Loop, faults: Faults, metrics: Metrics, expect: Expect
+        self,
+        configuration: Configuration,
+        loop: Loop,
+        faults: Faults,
+        metrics: Metrics,
+        expect: Expect,
+        watching: Callable[[Tell], Watching],
     ) -> None:
         timing = configuration.timing
         self._configuration, self._loop, self._expect = configuration, loop, expect
@@ -58,6 +66,7 @@ class Pipeline:
         self.solver = Child(
             "solver", "runtime.service.solver_process", str(configuration.file), inside.SOLVER
         )
+        self.watching = watching(self._tell_solver)
         self.shape: tuple[int, int, int] | None = None
         self.showing: Session | None = None
         self.shown_frames = self.late = self.failed = 0
@@ -97,6 +106,7 @@ class Pipeline:
 
     def forget(self, session: Session) -> None:
         """A program has gone: what it wanted is not shown."""
+        self.watching.forget(session)
         if self.showing is session:
             self.showing = None
             self.display.forget()
@@ -173,6 +183,8 @@ class Pipeline:
                 self._next_job()
             case inside.Solved():
                 self._solved(message)
+            case inside.Refined():
+                self.watching.ended(message)
         self._expect_life()
 
     def _expect_life(self) -> None:
@@ -195,6 +207,16 @@ class Pipeline:
                 self._fail(job, Code.SOLVER, f"the solver had this frame: {why}")
         self._running = None
         self._waiting.clear()
+        self.watching.ended(inside.Refined(0, 0.0, 0.0, f"the solver had it: {why}"))
+
+    def _tell_solver(self, message: NamedTuple, fd: int | None) -> bool:
+        if self.solver.link is None or self._patterns is None:
+            return False
+        try:
+            self.solver.link.send(message, fds=[] if fd is None else [fd])
+        except OSError:  # which reading from it will find
+            return False
+        return True
 
     def _send_targets(self) -> None:
         session = self.showing
@@ -235,6 +257,7 @@ class Pipeline:
                 message.psnr_db,
                 bool(message.flags & inside.FINAL),
                 bool(message.flags & inside.DARK),
+                bool(message.flags & inside.REFINED),
             )
             self._expect(message.shares, partial(self.display.put, pattern))
         if message.flags & inside.FINAL:
@@ -267,6 +290,7 @@ class Pipeline:
 
     def _shown(self, pattern: Ready, at_ns: int, transfer_s: float) -> None:
         self._metrics.stage_seconds.labels("transfer").observe(transfer_s)
+        self.watching.displayed(pattern)
         job = self._jobs.pop(pattern.job, None)
         if job is None:
             return

@@ -22,6 +22,11 @@ CLOCK_MONOTONIC, ns. The ring is made by memfd_create(MFD_ALLOW_SEALING) and sea
 F_SEAL_GROW before it is sent, else it is refused. One program at a time has a ring and so the display; any
 number may ask for Status, Capture and Dark.
 
+Refine asks that the picture of the next frame be refined with the camera while it is displayed: as long as frames with
+the same picture follow, they show the refinement's patterns. It ends by itself, with Refined; the best pattern stays
+while that picture does. Another picture ends it. Refine with 0 captures ends it and goes back to the solver's own
+pattern. The lasers are as they were: what is not lit is not learned from.
+
 Lasers: Clear (forget a latched fault), then Arm. Both are needed, in this order, after every fault and every
 start; nothing else makes light. Dark always works.
 """
@@ -164,6 +169,22 @@ class Picture(NamedTuple):
     exposure_us: U32
 
 
+class Refine(NamedTuple):
+    """Asks that the next frame's picture be refined for at most so many captures; 0: no more."""
+
+    captures: U32
+    reserved: U32 = 0
+
+
+class Refined(NamedTuple):
+    """A refinement has ended, and why; amplitude PSNR of the captured picture, dB, at first and at best."""
+
+    captures: U32
+    first_psnr_db: F32
+    best_psnr_db: F32
+    text: Text
+
+
 class Part(IntEnum):
     """How a device or a process is."""
 
@@ -227,6 +248,8 @@ PROTOCOL = Vocabulary(
         15: Dark,
         16: Capture,
         17: Picture,
+        18: Refine,
+        19: Refined,
     }
 )
 

@@ -18,23 +18,27 @@ import numpy as np
 
 from firmware_iface.errors import InputError
 from runtime.service.children import child_link
-from runtime.service.configuration import read_configuration
+from runtime.service.configuration import Configuration, read_configuration
 from runtime.service.inside import (
     DARK,
     FINAL,
+    REFINED,
     SOLVER,
     Free,
     Job,
+    Look,
     Patterns,
     Ping,
     Pong,
+    Refine,
     Solved,
     Targets,
     Unsolved,
 )
 from runtime.service.link import Link
 from runtime.service.protocol import Code
-from runtime.service.ring import Ring, crc32, make_ring, open_ring
+from runtime.service.refining import Refiner
+from runtime.service.ring import Ring, crc32, make_ring, open_ring, read_sealed
 from runtime.service.solving import Pattern, open_solver
 
 SLOTS = 4
@@ -46,8 +50,10 @@ Solve = Callable[[np.ndarray, int], Iterator[Pattern]]
 class Worker:
     """The solver's loop: what came over the link, and what is being done about it."""
 
-    def __init__(self, link: Link, shape: tuple[int, int, int]) -> None:
-        self.link, self.shape = link, shape
+    def __init__(self, link: Link, shape: tuple[int, int, int], configuration: Configuration) -> None:
+        self.link, self.shape, self.configuration = link, shape, configuration
+        self.asked: Refine | None = None  # of a refinement that begins with the next job
+        self.refiner: Refiner | None = None
         self.ring = make_ring(SLOTS, shape, np.uint8)
         self.free = set(range(SLOTS))
         self.targets: Ring | None = None
@@ -70,6 +76,13 @@ class Worker:
                 self.jobs.clear()
             case Job():
                 self.jobs.append(message)
+            case Refine(captures):
+                self.asked = message if captures else None
+                self.refine_no_more()
+            case Look(crc, height, width) if fd is not None:
+                counts = read_sealed(fd, (height, width), np.uint16)
+                if self.refiner is not None:
+                    self.refiner.look(crc, counts)
 
     def target(self, job: Job) -> np.ndarray:
         """The picture of a job, float32 [C, H, W], 0 to 1. Raises InputError where its bytes changed."""
@@ -80,14 +93,30 @@ class Worker:
             raise InputError("the picture in the slot is not the one that was announced: its CRC-32 differs")
         return counts.astype(np.float32) / FULL_SCALE
 
-    def publish(self, job: Job, pattern: Pattern, began_ns: int) -> None:
+    def refine_no_more(self) -> None:
+        """The solver's own pattern again."""
+        if self.refiner is not None:
+            self.refiner.stop()
+            self.refiner = None
+
+    def refined(self, job: Job, target: np.ndarray) -> Pattern | None:
+        """What a refinement has for a job; none where the job is to be solved."""
+        if self.asked is not None:
+            self.refiner = Refiner(self.configuration, target, job.crc, self.asked, self.link.send)
+            self.asked = None
+            self.refiner.start()
+        elif self.refiner is not None and self.refiner.crc != job.crc:
+            self.refine_no_more()
+        return self.refiner.pattern if self.refiner is not None else None
+
+    def publish(self, job: Job, pattern: Pattern, began_ns: int, refined: bool = False) -> None:
         """Hand a pattern over; waits for a free slot."""
         while not self.free:
             self.receive(wait=True)
         slot = self.free.pop()
         self.ring.slots[slot] = pattern.gray
         microseconds = (time.monotonic_ns() - began_ns) // 1000
-        flags = FINAL * pattern.final | DARK * pattern.dark
+        flags = FINAL * pattern.final | DARK * pattern.dark | REFINED * refined
         shares = struct.pack("<13f", *pattern.shares) if pattern.shares else bytes(52)
         took_us = min(microseconds, 2**32 - 1)
         self.link.send(Solved(job.job, slot, crc32(pattern.gray), flags, pattern.psnr_db, took_us, shares))
@@ -103,6 +132,9 @@ class Worker:
                 target = self.target(job)
             except InputError as error:
                 self.link.send(Unsolved(job.job, Code.TORN, str(error)))
+                continue
+            if (refined := self.refined(job, target)) is not None:
+                self.publish(job, refined, began, refined=True)
                 continue
             try:
                 for pattern in solve(target, job.deadline_ns):
@@ -123,7 +155,7 @@ def main(fd: str, configuration: str) -> None:
         return
     for _ in solver.patterns(np.ones(solver.shape, np.float32), time.monotonic_ns()):
         pass  # what is made at the first use is made before the first frame
-    Worker(link, solver.shape).run(solver.patterns)
+    Worker(link, solver.shape, asked).run(solver.patterns)
 
 
 if __name__ == "__main__":

@@ -30,6 +30,7 @@ from runtime.service.pipeline import Pipeline
 from runtime.service.protocol import Code, Done, Error, Lasers, Part
 from runtime.service.sessions import RequestError, Session
 from runtime.service.systemd import Notifier, passed_socket
+from runtime.service.watching import Tell, Watching
 
 MOST_SESSIONS = 32
 TURN_S, TURN_WAITED_S = 0.010, 0.001  # of the loop; the shorter while a program waits for a frame
@@ -52,7 +53,9 @@ class Supervisor:
             lambda: self.pipeline.display.lit_until_ns,
             lambda kind, text: self.loop.later(partial(self.faults.note, kind, text)),
         )
-        self.pipeline = Pipeline(configuration, self.loop, self.faults, self.metrics, self.lighting.expect)
+        self.pipeline = Pipeline(
+            configuration, self.loop, self.faults, self.metrics, self.lighting.expect, self._watching
+        )
         self.sessions: set[Session] = set()
         self.turned_ns = time.monotonic_ns()
         self.fed_ns = 0
@@ -90,6 +93,7 @@ class Supervisor:
         now = self.turned_ns = time.monotonic_ns()
         self.pipeline.turn(now)
         self.eye.turn(now * 1e-9)
+        self.pipeline.watching.turn()
         waited = [session for session in self.sessions if session.waiting is not None]
         for session in waited:
             self.pipeline.give_frame(session, now)
@@ -131,6 +135,9 @@ class Supervisor:
         listener.close()
         self.loop.close()
 
+    def _watching(self, tell: Tell) -> Watching:
+        return Watching(self.eye, tell, lambda: self.lighting.state)
+
     def _fresh_until(self) -> dict[str, int]:
         """Until when each loop that light depends on counts as fresh; called in the lighting thread."""
         stale_ns = self.pipeline.stale_ns
@@ -166,7 +173,6 @@ class Supervisor:
         self.sessions.discard(session)
         self.loop.forget(session.link)
         self.pipeline.forget(session)
-        self.eye.forget(session)
         session.close()
 
     def _read(self, session: Session) -> None:
@@ -221,6 +227,9 @@ class Supervisor:
                 )
             case protocol.Capture():
                 self.eye.capture(session, serial)
+            case protocol.Refine(captures):
+                self.pipeline.watching.begin(session, captures)
+                session.send(Done(), serial)
             case _:
                 raise RequestError(Code.MALFORMED, f"{type(message).__name__} is for programs to receive")
 

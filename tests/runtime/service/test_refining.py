@@ -1,0 +1,148 @@
+"""A picture is refined while the service displays it: real processes, emulated hardware, a hidden defect."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from firmware_iface.virtual.served import Remote
+from runtime.bundle import read_bundle, write_bundle
+from runtime.service.client import Client, RefusedError
+from runtime.service.protocol import Code, Lasers, Part, Shown
+from tests.campaigns.headset import SHAPE, connected, hardware, picture, served, write_configuration
+
+DEFECT = """
+[[defect]]
+kind = "phase_response"
+"""
+
+
+class Headset(NamedTuple):
+    file: Path
+    remote: Remote
+
+
+@pytest.fixture(scope="module")
+def headset(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Headset]:
+    """A service whose bundle has a network that was never trained, with a registered camera."""
+    torch = pytest.importorskip("torch")
+    from trainer.networks.approximator import Approximator, Architecture
+    from trainer.networks.onnx_files import onnx_files
+
+    torch.manual_seed(0)
+    networks = onnx_files(Approximator(Architecture("compact", 4, SHAPE, 1)))
+    file = write_configuration(tmp_path_factory.mktemp("refined"))
+    bundle = read_bundle(file.parent / "bundle")
+    write_bundle(
+        file.parent / "bundle", bundle.arrays, bundle.description, {}, networks=networks, replace=True
+    )
+    bench = file.parent / "bench.toml"
+    bench.write_text(bench.read_text() + DEFECT)
+    with hardware(file.parent) as remote, served(file):
+        yield Headset(file, remote)
+
+
+@pytest.fixture
+def client(headset: Headset) -> Iterator[Client]:
+    with connected(headset.file) as client:
+        end = time.monotonic() + 15
+        while {client.status().panel, client.status().camera} != {Part.FRESH}:
+            assert time.monotonic() < end
+        while client.status().lasers != Lasers.EMITTING:
+            assert time.monotonic() < end + 15
+            if client.status().lasers in (Lasers.OFF, Lasers.FAULT):
+                with suppress(RefusedError):
+                    client.clear()
+                    client.arm()
+            display(client, 3)
+        yield client
+        client.dark()
+
+
+def display(client: Client, frames: int, seed: int = 0) -> list[Shown]:
+    """Show one picture so many times."""
+    shown: list[Shown] = []
+    for _ in range(frames):
+        client.show(picture(client, seed))
+        shown += [o for o in client.outcomes() if isinstance(o, Shown)]
+    while client.in_flight:
+        shown += [o for o in client.outcomes(5) if isinstance(o, Shown)]
+    return shown
+
+
+def test_the_picture_on_display_gets_better_and_the_lasers_stay_as_they_are(
+    headset: Headset, client: Client
+) -> None:
+    before = {s.pattern_crc for s in display(client, 3)}
+    began = time.monotonic()
+    client.refine(12)
+    end = time.monotonic() + 60
+    tried: set[int] = set()
+    while client.refined is None:
+        assert time.monotonic() < end
+        tried |= {s.pattern_crc for s in display(client, 5)}
+    told = client.refined
+    assert told.captures == 12 and told.text == "all captures are taken"
+    assert told.best_psnr_db > told.first_psnr_db + 1
+    assert len(tried - before) >= 6
+    # never brighter than what was set; dark where this program paused
+    assert all(power == pytest.approx(50, rel=0.02) or power < 50 for _, power in headset.remote.light(began))
+    # the best stays while the picture does; then the solver has its own again
+    (best,) = {s.pattern_crc for s in display(client, 4)}
+    assert best in tried
+    display(client, 2, seed=1)
+    assert best not in {s.pattern_crc for s in display(client, 3)}
+
+
+def test_it_can_be_ended_and_another_program_or_picture_ends_it(headset: Headset, client: Client) -> None:
+    client.refine(1000)
+    with pytest.raises(RefusedError) as refused:
+        client.refine(3)
+    assert refused.value.code == Code.BUSY
+    display(client, 20)
+    display(client, 2, seed=1)
+    wait_for_the_end(client)
+    assert client.refined is not None and client.refined.text == "its picture is no longer displayed"
+    client.refine(1000)
+    display(client, 20)
+    client.refine(0)
+    wait_for_the_end(client)
+    with connected(headset.file) as other, pytest.raises(RefusedError) as refused:
+        other.refine(3)
+    assert refused.value.code == Code.ORDER
+
+
+def test_what_cannot_be_refined_is_said(tmp_path: Path) -> None:
+    file = write_configuration(tmp_path)
+    with hardware(tmp_path), served(file), connected(file) as client:
+        client.show(picture(client))
+        began_to_refine(client)
+        display(client, 3)
+        wait_for_the_end(client)
+        assert client.refined is not None and client.refined.captures == 0
+        assert "no approximator" in client.refined.text
+
+
+def began_to_refine(client: Client) -> None:
+    """Once the camera has seen darkness."""
+    end = time.monotonic() + 20
+    while True:
+        try:
+            return client.refine(3)
+        except RefusedError as error:
+            assert error.code == Code.CAMERA and "darkness" in str(error) and time.monotonic() < end
+            time.sleep(0.05)
+
+
+def wait_for_the_end(client: Client) -> None:
+    end = time.monotonic() + 20
+    while client.refined is None:
+        assert time.monotonic() < end
+        list(client.outcomes(0.05))
+    assert np.isfinite(client.refined.best_psnr_db)
