@@ -78,6 +78,7 @@ class Free(NamedTuple):
 class Refine(NamedTuple):
     """Refine the picture of the next job, and show its patterns for all jobs that have it; 0 captures: no more."""
 
+    number: U32  # comes back in Refined
     captures: U32
     black: F32  # counts of the camera without light
 
@@ -93,6 +94,7 @@ class Look(NamedTuple):
 class Refined(NamedTuple):
     """A refinement has ended, and why; amplitude PSNR of the captured picture, dB, at first and at best."""
 
+    number: U32
     captures: U32
     first_psnr_db: F32
     best_psnr_db: F32

@@ -207,7 +207,7 @@ class Pipeline:
                 self._fail(job, Code.SOLVER, f"the solver had this frame: {why}")
         self._running = None
         self._waiting.clear()
-        self.watching.ended(inside.Refined(0, 0.0, 0.0, f"the solver had it: {why}"))
+        self.watching.lost(f"the solver had it: {why}")
 
     def _tell_solver(self, message: NamedTuple, fd: int | None) -> bool:
         if self.solver.link is None or self._patterns is None:

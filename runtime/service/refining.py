@@ -73,9 +73,11 @@ class Refiner(threading.Thread):
         try:
             self._ended(self._refined())
         except InputError as error:
-            self._ended(Refined(0, 0.0, 0.0, str(error)))
+            self._ended(Refined(self._asked.number, 0, 0.0, 0.0, str(error)))
         except OSError:
             pass  # the supervisor has gone, and this process goes too
+        except Exception as error:  # whatever it was, frames go on and the program is told
+            self._ended(Refined(self._asked.number, 0, 0.0, 0.0, f"it failed: {error}"))
 
     def _refined(self) -> Refined:
         learned = _ready(self._configuration, self._target)
@@ -96,9 +98,9 @@ class Refiner(threading.Thread):
             light = counts.astype(np.float32) - np.float32(self._asked.black)
             state.take(on_panel(light, learned.view, self._target.shape[1:])[None])
         if not steps:
-            return Refined(0, 0.0, 0.0, state.stopped)
+            return Refined(self._asked.number, 0, 0.0, 0.0, state.stopped)
         self._display(learned)
-        return Refined(len(steps), steps[0].psnr_db, state.best_psnr_db, state.stopped)
+        return Refined(self._asked.number, len(steps), steps[0].psnr_db, state.best_psnr_db, state.stopped)
 
     def _display(self, learned: _Ready) -> None:
         gray, path = learned.state.gray, learned.state.paths[0]

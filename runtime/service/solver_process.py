@@ -76,8 +76,8 @@ class Worker:
                 self.jobs.clear()
             case Job():
                 self.jobs.append(message)
-            case Refine(captures):
-                self.asked = message if captures else None
+            case Refine():
+                self.asked = message if message.captures else None
                 self.refine_no_more()
             case Look(crc, height, width) if fd is not None:
                 counts = read_sealed(fd, (height, width), np.uint16)

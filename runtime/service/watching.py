@@ -28,6 +28,7 @@ class Watching:
         self._eye, self._tell, self._lasers = eye, tell, lasers
         self._black: float | None = None  # counts without light, from a picture before there was any
         self._session: Session | None = None  # whose refinement goes on
+        self._number = 0  # of it: the end of an earlier one may come late
         self._displayed = 0  # CRC-32 of the pattern that was put on the panel last
         self._looking = False
 
@@ -42,10 +43,11 @@ class Watching:
         if captures and self._black is None:
             text = "the camera has not seen darkness yet: ask for Dark, then arm and ask again"
             raise RequestError(Code.CAMERA, text)
-        if not self._tell(inside.Refine(captures, self._black or 0.0), None):
+        number = self._number + bool(captures)
+        if not self._tell(inside.Refine(number, captures, self._black or 0.0), None):
             raise RequestError(Code.SOLVER, "the solver is being started again: ask again")
         if captures:
-            self._session = session
+            self._session, self._number = session, number
 
     def turn(self) -> None:
         """Have one picture taken in the dark."""
@@ -63,16 +65,20 @@ class Watching:
                 self._looking = True
 
     def ended(self, message: inside.Refined) -> None:
-        """The refinement has ended."""
-        session, self._session = self._session, None
-        if session is not None:
-            session.send(protocol.Refined(*message))
+        """A refinement has ended."""
+        if message.number == self._number and self._session is not None:
+            self._session.send(protocol.Refined(*message[1:]))
+            self._session = None
+
+    def lost(self, why: str) -> None:
+        """The solver has gone, and what it refined with it."""
+        self.ended(inside.Refined(self._number, 0, 0.0, 0.0, why))
 
     def forget(self, session: Session) -> None:
         """A program has gone."""
         if self._session is session:
             self._session = None
-            self._tell(inside.Refine(0, 0.0), None)
+            self._tell(inside.Refine(self._number, 0, 0.0), None)
 
     @property
     def _lit(self) -> bool:
