@@ -204,6 +204,8 @@ def _over_weight(
     """Correlation of the side of the convolution before its stride with the one after it, [out, in / groups, k, k]."""
     rows, columns = weight.shape[2:]
     height, width = narrow.shape[2:]
+    if tuple(stride) == (rows, columns) and not any(padding):
+        return _over_patches(wide, narrow, weight, groups)
     padded = functional.pad(wide, (padding[1], padding[1] + stride[1], padding[0], padding[0] + stride[0]))
     taps = []
     for i in range(rows):
@@ -220,6 +222,23 @@ def _over_weight(
             ]
             taps.append(torch.cat(blocks) if groups > 1 else blocks[0])
     return torch.stack(taps, -1).reshape(*taps[0].shape, rows, columns)
+
+
+def _over_patches(wide: Tensor, narrow: Tensor, weight: Tensor, groups: int) -> Tensor:
+    """`_over_weight` where the kernel's taps do not overlap: one matrix product for all of them.
+
+    A convolution that picks out each tap is several times faster in onnxruntime than slicing or transposing.
+    """
+    channels, (rows, columns), size = wide.shape[1], weight.shape[2:], weight.shape[2] * weight.shape[3]
+    picks = torch.eye(size, dtype=wide.dtype).reshape(size, 1, rows, columns).repeat(channels, 1, 1, 1)
+    taps = _aten.convolution.default(
+        wide, picks, None, [rows, columns], [0, 0], [1, 1], False, [0, 0], channels
+    )
+    blocks = [
+        torch.mm(_flat(a), _flat(b).t())
+        for a, b in zip(narrow.chunk(groups, 1), taps.chunk(groups, 1), strict=True)
+    ]
+    return torch.cat(blocks).reshape(narrow.shape[1], channels // groups, rows, columns)
 
 
 def _flat(x: Tensor) -> Tensor:
