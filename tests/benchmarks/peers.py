@@ -6,7 +6,7 @@
 1080 x 1920, 8 um, 520 nm, 200 mm, an iris of half the panel's band, 256 gray levels, scikit-image's astronaut.
 
     hololoop         this solver, 20 iterations
-    hololoop_longer  this solver, 60 iterations
+    hololoop_longer  this solver, 80 iterations
     adam_published   torch, autograd, Adam as neural-holography publishes it (rate 8e-3, learned scale of rate 2e-3),
                      zero-padded to twice the size, from the same double phase
     adam_tuned       the same loop with the best rate and betas found (0.1; 0.9, 0.999), scale in closed form
@@ -70,7 +70,7 @@ def hololoop(target: np.ndarray, distance: float, iterations: int, most: int = 2
 
 
 def hololoop_longer(target: np.ndarray, distance: float, iterations: int) -> Solved:
-    return hololoop(target, distance, iterations, 60)
+    return hololoop(target, distance, iterations, 80)
 
 
 def _torch_adam(
