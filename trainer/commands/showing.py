@@ -115,7 +115,7 @@ def show_diagnosis(result: Result, args: Namespace, screen: Screen) -> None:
     elif result["verdict"] == "complete":
         _export(args.model, args, screen)
     else:
-        _write_your_own(result.get("stage"), screen)
+        _write_your_own_or_learn(result.get("stage"), args.model, args, screen)
 
 
 def show_addition(result: Result, args: Namespace, screen: Screen) -> None:
@@ -162,7 +162,7 @@ def show_explanation(result: Result, args: Namespace, screen: Screen) -> None:
     if result["verdict"] == "complete":
         _export(args.out, args, screen)
     elif result["verdict"] == "outside_catalogue":
-        _write_your_own(result.get("stage"), screen)
+        _write_your_own_or_learn(result.get("stage"), args.out, args, screen)
     else:
         screen.next(command_line("diagnose", args.captures, args=args, model=args.out))
 
@@ -214,12 +214,18 @@ def _export(model: Path | None, args: Namespace, screen: Screen) -> None:
         )
 
 
-def _write_your_own(stage: Any, screen: Screen) -> None:
+def _write_your_own_or_learn(stage: Any, model: Path | None, args: Namespace, screen: Screen) -> None:
     stage = stage if stage in ("drive", "panel", "pupil", "sensor") else "panel"
     screen.next(
         command_line("new-effect", "my_effect", "--stage", stage),
         f"Look at the picture of the {stage}'s probe (--report), and write the effect that it shows",
     )
+    if stage in ("drive", "panel"):
+        line = command_line("field", args.captures, "--out", "learned.toml", args=args, model=model)
+        screen.next(line, "Or let the wave at the panel be learned, without a name")
+    else:
+        line = command_line("train", args.captures, "--out", "run", args=args, model=model)
+        screen.next(line, "Or let a network learn it, without a name")
 
 
 def _numbers(label: str, table: Any, screen: Screen) -> None:
