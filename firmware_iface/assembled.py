@@ -116,7 +116,7 @@ def open_lasers(table: Table) -> Any:
     from .lasers import open_lasers as open_board
     from .virtual.served import i2c_bus
 
-    asked = read_table(LasersTable, table, "[lasers]", ignore=("power", "channel"))
+    asked = _lasers_table(table)
     bus = i2c_bus(asked.bus) if asked.bus.startswith("virtual:") else asked.bus
     return open_board(bus, laser_channels(table))
 
@@ -125,9 +125,7 @@ def open_camera(table: Table) -> Any:
     """The camera of a configuration's [camera]. Raises InputError or DeviceError."""
     asked = _camera_table(table)
     if asked.kind not in KINDS["camera"]:
-        camera = open_own(asked.kind, "camera")
-        camera.exposure_ms = asked.exposure_ms
-        return camera
+        return open_own(asked.kind, "camera", exposure_ms=asked.exposure_ms)
     if asked.kind == "oak":
         from .camera import open_oak
 
@@ -151,7 +149,7 @@ def check_tables(tables: Mapping[str, Table]) -> None:
         _panel_table(tables["panel"])
     if "camera" in tables:
         _camera_table(tables["camera"])
-    read_table(LasersTable, tables["lasers"], "[lasers]", ignore=("power", "channel"))
+    _lasers_table(tables["lasers"])
     _check_budget(tables["lasers"])
 
 
@@ -159,6 +157,10 @@ def _panel_table(table: Table) -> PanelTable:
     asked = read_table(PanelTable, table, "[panel]")
     check_kind(asked.kind, "panel", KINDS["panel"])
     return asked
+
+
+def _lasers_table(table: Table) -> LasersTable:
+    return read_table(LasersTable, table, "[lasers]", ignore=("power", "channel"))
 
 
 def _camera_table(table: Table) -> CameraTable:
@@ -185,7 +187,7 @@ def _check_budget(table: Table) -> None:
 
 def mrad_per_pixel(table: Table) -> float:
     """The angle of a pixel at the eye, for the prediction of bright spots; 0: none is to be made."""
-    return read_table(LasersTable, table, "[lasers]", ignore=("power", "channel")).mrad_per_pixel
+    return _lasers_table(table).mrad_per_pixel
 
 
 def laser_channels(table: Table) -> Sequence[LaserChannel]:

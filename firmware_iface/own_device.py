@@ -22,7 +22,10 @@ from typing import Any
 
 from .errors import DeviceError, InputError, nearest
 
-NEEDED = {"panel": ("shape", "show", "status", "close"), "camera": ("shape", "bit_depth", "capture", "close")}
+NEEDED = {
+    "panel": ("shape", "show", "status", "close"),
+    "camera": ("shape", "bit_depth", "exposure_ms", "capture", "close"),
+}
 
 
 def check_kind(kind: str, part: str, known: Collection[str]) -> None:
@@ -37,26 +40,28 @@ def check_kind(kind: str, part: str, known: Collection[str]) -> None:
         )
 
 
-def open_own(kind: str, part: str) -> Any:
+def open_own(kind: str, part: str, **settings: Any) -> Any:
     """What the function of kind = "MODULE:FUNCTION" returns; modules of the current folder are found, too.
 
-    part : "panel" or "camera", which say what it has to have (see NEEDED). Raises InputError where it cannot be called
-    or returns something else, DeviceError where it fails.
+    part : "panel" or "camera", which say what it has to have (see NEEDED). settings : attributes that are set then.
+    Raises InputError where it cannot be called or returns something else, DeviceError where it fails.
     """
     function = _imported(kind, part)
     try:
         device = function()
+        if missing := [name for name in NEEDED[part] if not hasattr(device, name)]:
+            raise InputError(
+                f"{kind} returned {type(device).__name__}, which has no '{missing[0]}': a {part} needs "
+                f"{', '.join(NEEDED[part])}."
+            )
+        for name, value in settings.items():
+            setattr(device, name, value)
     except (InputError, DeviceError):
         raise
     except Exception as error:  # vendors' libraries raise what they like
         raise DeviceError(
-            f"the {part} of {kind} cannot be opened: {error or type(error).__name__}."
+            f"the {part} of {kind} cannot be opened: {str(error) or type(error).__name__}."
         ) from error
-    if missing := [name for name in NEEDED[part] if not hasattr(device, name)]:
-        raise InputError(
-            f"{kind} returned {type(device).__name__}, which has no '{missing[0]}': a {part} needs "
-            f"{', '.join(NEEDED[part])}."
-        )
     return device
 
 

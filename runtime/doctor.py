@@ -205,8 +205,14 @@ def _opened(found: Finding, opening: Callable[[], Any], look: Callable[[Any], No
     return found
 
 
+def _place(table: dict[str, Any], usual: str, where: str) -> str:
+    """What a device is and where; one of the lab's own (MODULE:FUNCTION) knows its place by itself."""
+    kind = str(table.get("kind", usual))
+    return kind if ":" in kind else f"{kind} at {where}"
+
+
 def _panel(table: dict[str, Any], shape: tuple[int, ...] | None) -> Finding:
-    found = Finding("panel", f"{table.get('kind', 'board')} at {table.get('bus', 'usb')}")
+    found = Finding("panel", _place(table, "board", table.get("bus", "usb")))
 
     def look(panel: Any) -> None:
         found.problems += [
@@ -236,7 +242,7 @@ def _lasers(table: dict[str, Any]) -> Finding:
 
 
 def _camera(table: dict[str, Any]) -> Finding:
-    found = Finding("camera", f"{table.get('kind', 'oak')} at {table.get('address') or table.get('bus', '')}")
+    found = Finding("camera", _place(table, "oak", table.get("address") or table.get("bus", "")))
 
     def look(camera: Any) -> None:
         counts = camera.capture()

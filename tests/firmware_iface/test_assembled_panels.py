@@ -42,6 +42,10 @@ class Eye:
     def capture(self): return None
     def close(self): pass
 
+class Stuck(Eye):
+    def __setattr__(self, name, value): raise OSError("the port is busy")
+
+def stuck(): return Stuck()
 def screen(): return Screen()
 def eye(): return Eye()
 def number(): return 3
@@ -58,6 +62,10 @@ def test_a_function_of_the_labs_own_opens_its_panel_and_camera(
     monkeypatch.chdir(tmp_path)
     assert open_panel({"kind": "a_lab:screen"}).shape == (3, 5)
     assert open_camera({"kind": "a_lab:eye", "exposure_ms": 4.0}).exposure_ms == 4.0
+    with pytest.raises(DeviceError, match="a_lab:stuck cannot be opened: the port is busy"):
+        open_camera({"kind": "a_lab:stuck"})
+    with pytest.raises(InputError, match="Screen, which has no 'bit_depth'"):
+        open_camera({"kind": "a_lab:screen"})
     check_tables({"panel": {"kind": "a_lab:screen"}, "lasers": {"bus": "virtual:x", "power": {"green": 0.1}}})
     for kind, error, message in (
         ("a_lab:number", InputError, "returned int, which has no 'shape'"),
