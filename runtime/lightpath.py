@@ -52,6 +52,11 @@ class Grid:
         """Samples of the fine irradiance grid: the panel and its margin, FINE samples a pixel."""
         return (FINE * (self.shape[0] + 2 * self.margin), FINE * (self.shape[1] + 2 * self.margin))
 
+    @property
+    def band_share(self) -> float:
+        """Share of the panel's band 1 / (2 pitch) that is kept, along the axis that keeps more."""
+        return max(2 * edge / n for edge, n in zip(self.band, self.padded, strict=True))
+
     def frequency_index(self, axis: int) -> list[int]:
         """Frequency indices of the band along an axis, lowest first."""
         return list(range(-self.band[axis], self.band[axis] + 1))

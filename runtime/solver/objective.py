@@ -176,8 +176,7 @@ class Objective:
 
 def needs_fine_grid(stacks: Sequence[Sequence[LightPath]]) -> bool:
     """Whether once a pixel hides too much of the light of any of these paths: see `OPEN`."""
-    grids = [path.grid for stack in stacks for path in stack]
-    return any(2 * edge > OPEN * n for grid in grids for edge, n in zip(grid.band, grid.padded, strict=True))
+    return any(path.grid.band_share > OPEN for stack in stacks for path in stack)
 
 
 def _root_scale(light: Array, target: Array) -> float:

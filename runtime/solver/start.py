@@ -19,7 +19,7 @@ CUT = 0.7  # of the contrast: a frame that differs by more from the one before, 
 PATCH = 512  # side of the part that motion is found in
 FAINTEST = 0.7  # of the amplitude in the middle: fainter edges of the image are not made up for any further
 EDGES = 3  # times as far in as the panel's end darkens an even image, edges of a frame begin anew
-OPEN = 0.9  # of the panel's band: with a wider iris double phase errs by more than its edges
+WIDE = 0.9  # of the panel's band: with a wider iris double phase errs by more than its edges
 
 
 class Start:
@@ -28,7 +28,7 @@ class Start:
     ramp: tilt (cycles a pixel; rows, columns) of the light in the image, for a pupil whose opening is off the
     axis: the middle of what it passes. lift [H, W]: what an amplitude is multiplied by, since the panel ends and
     the edges of an image get only part of their light. edges: how far in that goes, pixels (rows, columns). Both only
-    where `doubled`, the start being double phase, and where the iris is not open: `OPEN`.
+    where `doubled`, the start being double phase, and where the iris is not open: `WIDE`.
     """
 
     def __init__(self, objective: Objective, path: LightPath, colour: int, doubled: bool) -> None:
@@ -51,7 +51,7 @@ class Start:
         ]
         self.lift: Array = None
         self.edges = 0, 0
-        if doubled and all(2 * b < OPEN * n for b, n in zip(path.grid.band, path.grid.padded, strict=True)):
+        if doubled and path.grid.band_share < WIDE:
             self._see_edges()
 
     def double_phase(self, amplitude: np.ndarray, phase: Array) -> None:
