@@ -220,12 +220,12 @@ def _write_your_own_or_learn(stage: Any, model: Path | None, args: Namespace, sc
         command_line("new-effect", "my_effect", "--stage", stage),
         f"Look at the picture of the {stage}'s probe (--report), and write the effect that it shows",
     )
-    if stage in ("drive", "panel"):
+    if stage == "panel":
         line = command_line("field", args.captures, "--out", "learned.toml", args=args, model=model)
         screen.next(line, "Or let the wave at the panel be learned, without a name")
     else:
         line = command_line("train", args.captures, "--out", "run", args=args, model=model)
-        screen.next(line, "Or let a network learn it, without a name")
+        screen.next(line, "Or let a network learn what it can of it, without a name")
 
 
 def _numbers(label: str, table: Any, screen: Screen) -> None:
