@@ -3,6 +3,6 @@
 At most numpy is imported here; vendor libraries are imported when a device is opened.
 """
 
-from .errors import DeviceError, DeviceGoneError, InputError
+from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
 
 __all__ = ["DeviceError", "DeviceGoneError", "InputError"]

@@ -37,11 +37,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from .errors import InputError, nearest
-from .lasers import VIRTUAL_CHANNELS, LaserChannel
-from .lasers.eye_safety import exposure
-from .own_device import check_kind, open_own
-from .virtual.tables import parameter, read_table
+from firmware_iface.errors import InputError, nearest
+from firmware_iface.lasers import VIRTUAL_CHANNELS, LaserChannel
+from firmware_iface.lasers.eye_safety import exposure
+from firmware_iface.own_device import check_kind, open_own
+from firmware_iface.virtual.tables import parameter, read_table
 
 Table = Mapping[str, Any]
 
@@ -86,8 +86,8 @@ class CameraTable:
 
 def open_panel(table: Table) -> Any:
     """The panel of a configuration's [panel]. Raises InputError or DeviceError."""
-    from .panel import open_board, open_dlpc900, open_mirrored, plm
-    from .panel.board import Timing
+    from firmware_iface.panel import open_board, open_dlpc900, open_mirrored, plm
+    from firmware_iface.panel.board import Timing
 
     asked = _panel_table(table)
     if asked.kind not in KINDS["panel"]:
@@ -105,7 +105,7 @@ def open_panel(table: Table) -> Any:
     timing = Timing(period_us, light_delay_us=period_us // 4, light_width_us=period_us // 2)
     backend = None
     if asked.bus.startswith("virtual:"):
-        from .virtual.served import usb_backend
+        from firmware_iface.virtual.served import usb_backend
 
         backend = usb_backend(asked.bus)
     return open_board(asked.serial or None, backend=backend, timing=timing, timeout_s=asked.timeout_ms / 1000)
@@ -113,8 +113,8 @@ def open_panel(table: Table) -> Any:
 
 def open_lasers(table: Table) -> Any:
     """The lasers of a configuration's [lasers], dark. Raises InputError or DeviceError."""
-    from .lasers import open_lasers as open_board
-    from .virtual.served import i2c_bus
+    from firmware_iface.lasers import open_lasers as open_board
+    from firmware_iface.virtual.served import i2c_bus
 
     asked = _lasers_table(table)
     bus = i2c_bus(asked.bus) if asked.bus.startswith("virtual:") else asked.bus
@@ -127,7 +127,7 @@ def open_camera(table: Table) -> Any:
     if asked.kind not in KINDS["camera"]:
         return open_own(asked.kind, "camera", exposure_ms=asked.exposure_ms)
     if asked.kind == "oak":
-        from .camera import open_oak
+        from firmware_iface.camera import open_oak
 
         return open_oak(
             asked.address,
@@ -136,7 +136,7 @@ def open_camera(table: Table) -> Any:
             timeout_s=1.0,
             starved_s=0.5,
         )
-    from .virtual.served import RemoteCamera, reach
+    from firmware_iface.virtual.served import RemoteCamera, reach
 
     camera = RemoteCamera(reach(asked.bus))
     camera.exposure_ms = asked.exposure_ms

@@ -17,8 +17,8 @@ from __future__ import annotations
 import struct
 from typing import Any
 
-from .errors import DeviceError
-from .usb_link import UsbLink
+from firmware_iface.errors import DeviceError
+from firmware_iface.usb_link import UsbLink
 
 VENDOR, PRODUCT = 0x1209, 0x0002
 READ_TEMPERATURE = 1

@@ -20,7 +20,7 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
-from .errors import DeviceError, InputError, nearest
+from firmware_iface.errors import DeviceError, InputError, nearest
 
 NEEDED = {
     "panel": ("shape", "show", "status", "close"),

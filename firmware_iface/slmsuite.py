@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import DeviceError, InputError
-from .panel.panel import checked_gray
+from firmware_iface.errors import DeviceError, InputError
+from firmware_iface.panel.panel import checked_gray
 
 
 class SlmsuitePanel:

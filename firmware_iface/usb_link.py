@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from .errors import DeviceError, DeviceGoneError
+from firmware_iface.errors import DeviceError, DeviceGoneError
 
 _GONE = {errno.ENODEV, errno.ENXIO, errno.ESHUTDOWN, errno.EIO, errno.EPROTO}
 _TIMEOUT = errno.ETIMEDOUT

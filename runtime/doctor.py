@@ -179,7 +179,7 @@ def _service(configuration: Configuration) -> Finding | None:
 
 
 def _bundle(configuration: Configuration) -> tuple[Finding, tuple[int, ...] | None]:
-    from runtime.service.solving import open_solver
+    from runtime.service.frame_solver import open_solver
 
     found = Finding("bundle", str(configuration.bundle))
     try:

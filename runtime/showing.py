@@ -12,8 +12,8 @@ import numpy as np
 from PIL import Image
 
 from firmware_iface.errors import InputError
-from runtime.devices import emulated, open_devices
-from runtime.files import whole_file
+from runtime.bundle.whole_files import whole_file
+from runtime.headset.open_devices import emulated, open_devices
 
 ABOUT = """Show patterns on a headset, one after the other, and save what its camera sees of each.
 

@@ -137,9 +137,9 @@ def _millimetres(text: str) -> float:
 
 def run(args: Namespace) -> dict[str, Any]:
     """Compute and write the patterns, picture by picture; returns what `--json` prints."""
-    from runtime.approximator import approximator_of
-    from runtime.bundle import INITIALISER, read_bundle
-    from runtime.calibrated import bundle_channels, load_light_path, plane_of
+    from runtime.bundle.bundle_folder import INITIALISER, read_bundle
+    from runtime.bundle.light_path_arrays import bundle_channels, load_light_path, plane_of
+    from runtime.networks.onnx_approximator import approximator_of
     from runtime.solver import Solver, beside_zero_order
 
     bundle = read_bundle(args.bundle)
@@ -250,7 +250,7 @@ def target_planes(
 
     colour: the bundle has several channels, and each shows its own part; else luminance is shown.
     """
-    from runtime.targets import CHANNELS, read_target
+    from runtime.solver.targets import CHANNELS, read_target
 
     if colour and all(c in CHANNELS for c in channels):
         return dict(zip(channels, read_target(path, shape, channels, fit=fit), strict=True))
@@ -262,7 +262,7 @@ def write_gray(path: Path, gray: Any) -> None:
     """Gray levels, uint8 [H, W], as an 8-bit PNG that appears whole or not at all."""
     from PIL import Image
 
-    from runtime.files import whole_file
+    from runtime.bundle.whole_files import whole_file
 
     with whole_file(path) as file:
         Image.fromarray(gray).save(file, format="PNG")

@@ -24,10 +24,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import DeviceError, DeviceGoneError, InputError
-from .depthai_process import FAILED, LOST, STARVED
-from .pipe import Frame, Messages
-from .pixels import BIT_DEPTHS, unpack
+from firmware_iface.camera.depthai_process import FAILED, LOST, STARVED
+from firmware_iface.camera.pipe import Frame, Messages
+from firmware_iface.camera.pixels import BIT_DEPTHS, unpack
+from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
 
 _WHY = {LOST: "the link was lost", STARVED: "frames stayed out", FAILED: "the library refused"}
 

@@ -4,7 +4,7 @@ Software does not make a product Class 1: see eye_safety.py for what is budgeted
 hardware must do, and have a test house classify the product.
 """
 
-from .channels import VIRTUAL_CHANNELS, LaserChannel
-from .lasers import Lasers, open_lasers
+from firmware_iface.lasers.channels import VIRTUAL_CHANNELS, LaserChannel
+from firmware_iface.lasers.lasers import Lasers, open_lasers
 
 __all__ = ["VIRTUAL_CHANNELS", "LaserChannel", "Lasers", "open_lasers"]

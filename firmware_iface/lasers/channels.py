@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..errors import InputError
-from ..virtual.tables import check_instance, parameter
-from .mcp4728 import VOLTS_PER_CODE
+from firmware_iface.errors import InputError
+from firmware_iface.lasers.mcp4728 import VOLTS_PER_CODE
+from firmware_iface.virtual.tables import check_instance, parameter
 
 MA_PER_V = 50.0  # of the laser-diode controllers' modulation inputs
 PHOTODIODE_FULL_V = 1.0

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from firmware_iface.errors import InputError
 
 POINT_MRAD, LARGEST_MRAD = 1.5, 100.0
 SIZES_MRAD = tuple(np.geomspace(POINT_MRAD, LARGEST_MRAD, 13).tolist())

@@ -26,9 +26,9 @@ from contextlib import contextmanager
 from types import TracebackType
 from typing import Any
 
-from ..errors import DeviceError, DeviceGoneError, InputError
-from .channels import LaserChannel
-from .lasers import RAMP_S, RAMP_STEPS, Lasers, open_lasers
+from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
+from firmware_iface.lasers.channels import LaserChannel
+from firmware_iface.lasers.lasers import RAMP_S, RAMP_STEPS, Lasers, open_lasers
 
 LEASE_S, TICK_S = 0.100, 0.020
 STEP_S = RAMP_S / RAMP_STEPS

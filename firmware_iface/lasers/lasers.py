@@ -24,13 +24,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import DeviceError, InputError
-from .channels import LaserChannel
-from .eye_safety import ALL_IN_ONE_SPOT, exposure
-from .mcp4728 import VOLTS_PER_CODE
-from .parts import Parts
-from .safety_controller import Command, Input, State
-from .wire import open_bus
+from firmware_iface.errors import DeviceError, InputError
+from firmware_iface.lasers.channels import LaserChannel
+from firmware_iface.lasers.eye_safety import ALL_IN_ONE_SPOT, exposure
+from firmware_iface.lasers.mcp4728 import VOLTS_PER_CODE
+from firmware_iface.lasers.parts import Parts
+from firmware_iface.lasers.safety_controller import Command, Input, State
+from firmware_iface.lasers.wire import open_bus
 
 if TYPE_CHECKING:
     from smbus2 import SMBus

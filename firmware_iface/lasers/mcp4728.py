@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ..errors import DeviceError
-from .wire import read, write
+from firmware_iface.errors import DeviceError
+from firmware_iface.lasers.wire import read, write
 
 if TYPE_CHECKING:
     from smbus2 import SMBus

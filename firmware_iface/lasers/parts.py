@@ -7,13 +7,13 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from ..errors import DeviceError, InputError
-from .ads1115 import Ads1115
-from .channels import LaserChannel
-from .mcp4728 import Mcp4728
-from .mcp23008 import Mcp23008
-from .safety_controller import VOLTS_PER_STEP, Command, Input, SafetyController
-from .tmp117 import Tmp117
+from firmware_iface.errors import DeviceError, InputError
+from firmware_iface.lasers.ads1115 import Ads1115
+from firmware_iface.lasers.channels import LaserChannel
+from firmware_iface.lasers.mcp4728 import Mcp4728
+from firmware_iface.lasers.mcp23008 import Mcp23008
+from firmware_iface.lasers.safety_controller import VOLTS_PER_STEP, Command, Input, SafetyController
+from firmware_iface.lasers.tmp117 import Tmp117
 
 if TYPE_CHECKING:
     from smbus2 import SMBus

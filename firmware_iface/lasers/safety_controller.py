@@ -5,8 +5,8 @@ from __future__ import annotations
 from enum import IntEnum, IntFlag
 from typing import TYPE_CHECKING
 
-from ..errors import DeviceError
-from .wire import write, write_read
+from firmware_iface.errors import DeviceError
+from firmware_iface.lasers.wire import write, write_read
 
 if TYPE_CHECKING:
     from smbus2 import SMBus

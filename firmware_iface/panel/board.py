@@ -9,9 +9,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from ..errors import DeviceError, DeviceGoneError, InputError
-from ..usb_link import UsbLink
-from .panel import Gray, Panel
+from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
+from firmware_iface.panel.panel import Gray, Panel
+from firmware_iface.usb_link import UsbLink
 
 VENDOR, PRODUCT = 0x1209, 0x0001
 IDENTITY, MODE, TIMING, STATUS, COMMIT, CLEAR = 1, 2, 3, 4, 5, 6

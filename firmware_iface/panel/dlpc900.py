@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import DeviceError, InputError
-from ..usb_link import UsbLink
-from . import erle
-from .mirrored import MirroredDisplay
-from .panel import Gray, Panel
-from .plm import P47, Modulator, bit_plane
+from firmware_iface.errors import DeviceError, InputError
+from firmware_iface.panel import erle
+from firmware_iface.panel.mirrored import MirroredDisplay
+from firmware_iface.panel.panel import Gray, Panel
+from firmware_iface.panel.plm import P47, Modulator, bit_plane
+from firmware_iface.usb_link import UsbLink
 
 VENDOR, PRODUCT = 0x0451, 0xC900
 OUT, IN, PACKET = 0x01, 0x81, 64

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import DeviceError, DeviceGoneError, InputError
-from .panel import Gray, Panel
+from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
+from firmware_iface.panel.panel import Gray, Panel
 
 
 class MirroredDisplay:

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from firmware_iface.errors import InputError
 
 Gray = NDArray[np.uint8]
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .panel import Gray
+from firmware_iface.panel.panel import Gray
 
 # displacement of state 0..15 over that of state 15; state 15 is 15/16 of a wave
 _LOWER = (0, 0.0126, 0.0259, 0.0495, 0.071, 0.0878, 0.1382, 0.2153)

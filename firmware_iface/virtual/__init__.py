@@ -1,9 +1,15 @@
 """A virtual headset: devices with a simulated bench behind them, whose defects are hidden."""
 
-from .defects import CATALOGUE_KINDS, DEFECT_KINDS, Defect, make_defect
-from .description import BenchDescription, load_bench, read_bench
-from .headset import VirtualCamera, VirtualHeadset, VirtualLasers, VirtualPanel, open_headset
-from .named import named_benches
+from firmware_iface.virtual.defects import CATALOGUE_KINDS, DEFECT_KINDS, Defect, make_defect
+from firmware_iface.virtual.description import BenchDescription, load_bench, read_bench
+from firmware_iface.virtual.headset import (
+    VirtualCamera,
+    VirtualHeadset,
+    VirtualLasers,
+    VirtualPanel,
+    open_headset,
+)
+from firmware_iface.virtual.named import named_benches
 
 __all__ = [
     "CATALOGUE_KINDS",

@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from ..errors import InputError, nearest
-from .tables import parameter, read_table
+from firmware_iface.errors import InputError, nearest
+from firmware_iface.virtual.tables import parameter, read_table
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ..errors import InputError, nearest
-from .defects import Defect, read_defect
-from .tables import check_instance, parameter, read_table
+from firmware_iface.errors import InputError, nearest
+from firmware_iface.virtual.defects import Defect, read_defect
+from firmware_iface.virtual.tables import check_instance, parameter, read_table
 
 D = TypeVar("D", bound=Defect)
 
@@ -222,7 +222,7 @@ def read_bench(tables: Mapping[str, Any], where: str) -> BenchDescription:
 
 def load_bench(spec: str) -> BenchDescription:
     """A bench from `virtual:NAME` (see `named_benches`) or a TOML file's path. Raises InputError."""
-    from .named import named_bench
+    from firmware_iface.virtual.named import named_bench
 
     if spec.startswith("virtual:"):
         return named_bench(spec.removeprefix("virtual:"))

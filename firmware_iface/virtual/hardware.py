@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import DeviceError, DeviceGoneError, InputError
-from .description import load_bench
-from .faults import Faults
-from .headset import VirtualHeadset
-from .i2c import LaserBoard
-from .oak import OakModel, looking_at
-from .usb.board import BoardModel
+from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
+from firmware_iface.virtual.description import load_bench
+from firmware_iface.virtual.fault_injection import Faults
+from firmware_iface.virtual.headset import VirtualHeadset
+from firmware_iface.virtual.i2c import LaserBoard
+from firmware_iface.virtual.oak import OakModel, looking_at
+from firmware_iface.virtual.usb.panel_board import BoardModel
 
 TICK_S = 0.001
 REMEMBERED = 20000  # changes of light

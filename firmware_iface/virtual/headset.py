@@ -15,12 +15,12 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from ..panel.panel import Gray, checked_gray
-from . import defects, oracle
-from .description import BenchDescription, load_bench
-from .optics import BenchOptics
-from .sensor import Drift, Integrator, Sensor
+from firmware_iface.errors import InputError
+from firmware_iface.panel.panel import Gray, checked_gray
+from firmware_iface.virtual import defects, oracle
+from firmware_iface.virtual.bench_optics import BenchOptics
+from firmware_iface.virtual.description import BenchDescription, load_bench
+from firmware_iface.virtual.simulated_sensor import Drift, Integrator, Sensor
 
 
 class VirtualPanel:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from ..errors import InputError, nearest
-from .defects import CATALOGUE_KINDS, make_defect
-from .description import BenchDescription, ChannelDescription, SimulationDescription
+from firmware_iface.errors import InputError, nearest
+from firmware_iface.virtual.defects import CATALOGUE_KINDS, make_defect
+from firmware_iface.virtual.description import BenchDescription, ChannelDescription, SimulationDescription
 
 _RGB = (
     ChannelDescription("red", 638.0),

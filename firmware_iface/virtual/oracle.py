@@ -11,8 +11,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from .optics import BenchOptics
-from .sensor import Integrator
+from firmware_iface.virtual.bench_optics import BenchOptics
+from firmware_iface.virtual.simulated_sensor import Integrator
 
 Array = NDArray[np.float64]
 

@@ -28,11 +28,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import DeviceError, DeviceGoneError, InputError
-from .hardware import Hardware
-from .i2c.server import BoardServer
-from .usb.backend import VirtualUsb
-from .usb.device import Gone, Nak, Stall
+from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
+from firmware_iface.virtual.hardware import Hardware
+from firmware_iface.virtual.i2c.server import BoardServer
+from firmware_iface.virtual.usb.device import Gone, Nak, Stall
+from firmware_iface.virtual.usb.pyusb_backend import VirtualUsb
 
 PREFIX = "virtual:"
 STARTS_WITHIN_S = 20.0

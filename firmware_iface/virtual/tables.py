@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
-from ..errors import InputError, nearest
+from firmware_iface.errors import InputError, nearest
 
 T = TypeVar("T")
 

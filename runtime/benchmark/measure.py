@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 
 from firmware_iface.errors import InputError
-from runtime import fft
-from runtime.ideal import ideal_path, single
-from runtime.lightpath import LightPath
+from runtime.lightpath import fft
+from runtime.lightpath.ideal_path import ideal_path, single
+from runtime.lightpath.light_path import LightPath
 from runtime.solver import Solver
-from runtime.targets import decode_srgb, fit_area
+from runtime.solver.targets import decode_srgb, fit_area
 
 SHAPES = ((1080, 1920), (720, 1280), (540, 960))
 PITCH, WAVELENGTH, DISTANCE, IRIS = 8e-6, 520e-9, 0.2, 0.5

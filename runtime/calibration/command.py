@@ -45,12 +45,12 @@ def arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> dict[str, Any]:
     """Calibrate, report, and replace the bundle where that is right; returns what `--json` prints."""
-    from runtime.bundle import read_bundle
-    from runtime.calibration.numbers import numbers
+    from runtime.bundle.bundle_folder import read_bundle
+    from runtime.calibration.calibrate import calibrate
+    from runtime.calibration.calibration_report import write_report
     from runtime.calibration.replacing import previous, replace_bundle, restore_bundle
-    from runtime.calibration.report import write_report
-    from runtime.calibration.run import calibrate
-    from runtime.devices import open_devices
+    from runtime.calibration.summary import numbers
+    from runtime.headset.open_devices import open_devices
 
     if args.restore:
         restore_bundle(args.bundle)

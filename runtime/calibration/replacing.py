@@ -7,11 +7,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from firmware_iface.errors import InputError
-from runtime.bundle import Bundle, read_bundle, write_bundle
-from runtime.calibrated import bundle_paths, load_light_path, pack_light_paths
+from runtime.bundle.bundle_folder import Bundle, read_bundle, write_bundle
+from runtime.bundle.light_path_arrays import bundle_paths, load_light_path, pack_light_paths
+from runtime.calibration.calibrate import Calibration
 from runtime.calibration.drift import drifted
-from runtime.calibration.numbers import numbers
-from runtime.calibration.run import Calibration
+from runtime.calibration.summary import numbers
 
 
 def previous(folder: Path) -> Path:

@@ -18,10 +18,10 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.signal import find_peaks
 
 from firmware_iface.errors import InputError
-from runtime.calibration.fit import Base, Estimate, Shot, predicted
-from runtime.calibration.patterns import grating
-from runtime.calibration.view import Sampler
-from runtime.legendre import legendre_curve
+from runtime.calibration.drift_fit import Base, Estimate, Shot, predicted
+from runtime.calibration.shown_patterns import grating
+from runtime.camera.view import Sampler
+from runtime.lightpath.legendre import legendre_curve
 
 SWEEP = (*range(16, 256, 16), 255)  # gray levels
 PERIODS = (4, 6, 8, 12, 16, 24)  # pixels

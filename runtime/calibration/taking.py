@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware_iface.errors import InputError
-from runtime.calibration.fit import Shot
-from runtime.devices import Devices
+from runtime.calibration.drift_fit import Shot
+from runtime.headset.open_devices import Devices
 
 AIM, BRIGHTEST = 0.7, 0.999  # this share of full scale for this quantile of a picture
 SHORTEST_MS, LONGEST_MS = 0.02, 1000.0

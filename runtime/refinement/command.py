@@ -44,14 +44,14 @@ def run(args: Namespace) -> dict[str, Any]:
     """Show, capture and refine; returns what `--json` prints."""
     import numpy as np
 
-    from runtime.approximator import approximator_of
-    from runtime.bundle import read_bundle
-    from runtime.calibrated import bundle_channels, load_light_path
+    from runtime.bundle.bundle_folder import read_bundle
+    from runtime.bundle.light_path_arrays import bundle_channels, load_light_path
     from runtime.calibration.taking import Taker
-    from runtime.calibration.view import View, view_of
-    from runtime.devices import open_devices
-    from runtime.refinement.eye import Eye
+    from runtime.camera.view import View, view_of
+    from runtime.headset.open_devices import open_devices
+    from runtime.networks.onnx_approximator import approximator_of
     from runtime.refinement.refine import Refinement, refine
+    from runtime.refinement.viewer import Eye
     from runtime.solver import solve
     from runtime.solving import jobs, target_planes, write_gray
 

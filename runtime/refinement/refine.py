@@ -21,13 +21,13 @@ from typing import IO
 import numpy as np
 
 from firmware_iface.errors import InputError
-from runtime.approximator import EPSILON, Approximator
-from runtime.lightpath import (
+from runtime.lightpath.light_path import (
     LightPath,
     irradiance_and_pullback,
     pixel_irradiance,
     pixel_irradiance_adjoint,
 )
+from runtime.networks.onnx_approximator import EPSILON, Approximator
 from runtime.solver import DriveRange, quality
 
 HOLD_OUT = 3  # every third capture, the first included

@@ -21,13 +21,13 @@ from runtime.service import inside, protocol
 from runtime.service.children import Child
 from runtime.service.configuration import Configuration
 from runtime.service.display import WAKE_NS, Clock, Display, Ready
+from runtime.service.event_loop import Loop
 from runtime.service.faults import Faults
-from runtime.service.loop import Loop
 from runtime.service.messages import ProtocolError
 from runtime.service.metrics import Metrics
+from runtime.service.program_session import FrameJob, RequestError, Session
 from runtime.service.protocol import Code
 from runtime.service.ring import Ring, crc32, open_ring
-from runtime.service.sessions import FrameJob, RequestError, Session
 from runtime.service.watching import Tell, Watching
 
 PING_NS = 30_000_000

@@ -18,15 +18,15 @@ import numpy as np
 from firmware_iface.assembled import mrad_per_pixel
 from firmware_iface.errors import InputError
 from firmware_iface.lasers.eye_safety import spot_shares
-from runtime.approximator import approximator_of
-from runtime.bundle import read_bundle
-from runtime.calibrated import load_light_path
-from runtime.calibration.view import View, on_panel, view_of
+from runtime.bundle.bundle_folder import read_bundle
+from runtime.bundle.light_path_arrays import load_light_path
+from runtime.camera.view import View, on_panel, view_of
+from runtime.networks.onnx_approximator import approximator_of
 from runtime.refinement.refine import Refinement
 from runtime.service.configuration import Configuration
+from runtime.service.frame_solver import Pattern
 from runtime.service.inside import Refine, Refined
 from runtime.service.ring import crc32
-from runtime.service.solving import Pattern
 from runtime.solver import quality, shown, solve
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from firmware_iface.errors import InputError
 from runtime.service.children import child_link
 from runtime.service.configuration import Configuration, read_configuration
+from runtime.service.frame_solver import Pattern, open_solver
 from runtime.service.inside import (
     DARK,
     FINAL,
@@ -39,7 +40,6 @@ from runtime.service.link import Link
 from runtime.service.protocol import Code
 from runtime.service.refining import Refiner
 from runtime.service.ring import Ring, crc32, make_ring, open_ring, read_sealed
-from runtime.service.solving import Pattern, open_solver
 
 SLOTS = 4
 FULL_SCALE = 65535

@@ -18,17 +18,17 @@ from typing import Any
 from firmware_iface.assembled import laser_power, open_lasers
 from firmware_iface.errors import InputError
 from runtime.service import protocol
+from runtime.service.camera_client import Eye
 from runtime.service.configuration import Configuration
-from runtime.service.eye import Eye
+from runtime.service.event_loop import Loop
 from runtime.service.faults import Faults
 from runtime.service.lighting import Lighting
 from runtime.service.link import Link
-from runtime.service.loop import Loop
 from runtime.service.messages import ProtocolError
 from runtime.service.metrics import Metrics
 from runtime.service.pipeline import Pipeline
+from runtime.service.program_session import RequestError, Session
 from runtime.service.protocol import Code, Done, Error, Lasers, Part
-from runtime.service.sessions import RequestError, Session
 from runtime.service.systemd import Notifier, passed_socket
 from runtime.service.watching import Tell, Watching
 

@@ -6,7 +6,7 @@ import shutil
 import sys
 from pathlib import Path
 
-from runtime.files import whole_file
+from runtime.bundle.whole_files import whole_file
 from runtime.service.configuration import Configuration
 
 SERVICE = """[Unit]

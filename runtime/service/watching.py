@@ -11,11 +11,11 @@ from typing import NamedTuple
 import numpy as np
 
 from runtime.service import inside, protocol
+from runtime.service.camera_client import Eye
 from runtime.service.display import Ready
-from runtime.service.eye import Eye
+from runtime.service.program_session import RequestError, Session
 from runtime.service.protocol import Code, Lasers
 from runtime.service.ring import read_sealed
-from runtime.service.sessions import RequestError, Session
 
 DARK = (Lasers.OFF, Lasers.ARMED, Lasers.FAULT)  # surely without light; ARMED emits nothing yet
 Tell = Callable[[NamedTuple, int | None], bool]

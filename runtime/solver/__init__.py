@@ -1,6 +1,6 @@
 """The headset's solver: the pattern whose light is nearest to a picture, by the deadline."""
 
-from runtime.solver.drive import DriveRange
+from runtime.solver.drive_range import DriveRange
 from runtime.solver.method import METHODS
 from runtime.solver.penalty import PENALTIES
 from runtime.solver.quality import Quality, quality, quality_of, shown

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from firmware_iface.errors import InputError
-from runtime.sessions import Session
+from runtime.networks.onnx_session import Session
 
 
 class Initialiser:

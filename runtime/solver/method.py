@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, Protocol
 
-from runtime.solver.drive import DriveRange
+from runtime.solver.drive_range import DriveRange
 from runtime.solver.objective import Objective
 
 Array = Any

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from runtime.approximator import Approximator
-from runtime.backend import Backend
-from runtime.lightpath import LightPath
-from runtime.solver.optics import Optics
+from runtime.lightpath.light_path import LightPath
+from runtime.networks.onnx_approximator import Approximator
+from runtime.solver.array_backend import Backend
+from runtime.solver.in_place_path import Optics
 from runtime.solver.penalty import FLOOR, PENALTIES, Irradiance
 
 Array = Any

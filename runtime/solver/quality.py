@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from runtime.lightpath import LightPath, irradiance, panel_phase, pixel_irradiance
+from runtime.lightpath.light_path import LightPath, irradiance, panel_phase, pixel_irradiance
 
 
 @dataclass(frozen=True)

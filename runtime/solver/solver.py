@@ -21,14 +21,14 @@ from typing import Any
 import numpy as np
 
 from firmware_iface.errors import InputError, nearest
-from runtime.approximator import Approximator, predistorted
-from runtime.backend import Backend, backend
-from runtime.lightpath import LightPath
-from runtime.solver.budget import Pace
-from runtime.solver.drive import DriveRange
+from runtime.lightpath.light_path import LightPath
+from runtime.networks.onnx_approximator import Approximator, predistorted
+from runtime.solver.array_backend import Backend, backend
+from runtime.solver.drive_range import DriveRange
 from runtime.solver.initialiser import Initialiser
 from runtime.solver.method import METHODS, Method
 from runtime.solver.objective import Objective, needs_fine_grid
+from runtime.solver.pace import Pace
 from runtime.solver.penalty import PENALTIES
 from runtime.solver.quality import Quality, quality, shown
 from runtime.solver.solution import Solution

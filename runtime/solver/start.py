@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from runtime.lightpath import LightPath
+from runtime.lightpath.light_path import LightPath
+from runtime.solver.in_place_path import Optics
 from runtime.solver.objective import Objective
-from runtime.solver.optics import Optics
 
 Array = Any
 

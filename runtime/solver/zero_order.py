@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from firmware_iface.errors import InputError
-from runtime.lightpath import LightPath
+from runtime.lightpath.light_path import LightPath
 
 GUARD = 0.05  # of the panel's band, from the zero order to the opening
 

@@ -18,11 +18,11 @@ import numpy as np
 import safetensors.numpy
 import torch
 
-from runtime import fft
-from runtime.approximator import Approximator
 from runtime.benchmark.measure import DISTANCE, IRIS, PITCH, WAVELENGTH
-from runtime.bundle import ADAPTERS, APPROXIMATOR, GRADIENT
-from runtime.lightpath import grid_for
+from runtime.bundle.bundle_folder import ADAPTERS, APPROXIMATOR, GRADIENT
+from runtime.lightpath import fft
+from runtime.lightpath.light_path import grid_for
+from runtime.networks.onnx_approximator import Approximator
 from trainer.networks.approximator import Approximator as Network
 from trainer.networks.approximator import Architecture
 from trainer.networks.onnx_files import onnx_files

@@ -52,7 +52,7 @@ def distance_for(shape: tuple[int, int]) -> float:
 
 def double_phase(target: np.ndarray, distance: float) -> np.ndarray:
     """The start that all who take one begin from."""
-    from runtime.ideal import ideal_path, single
+    from runtime.lightpath.ideal_path import ideal_path, single
     from runtime.solver import solve
 
     path = single(ideal_path(target.shape, PITCH, WAVELENGTH, distance, IRIS))
@@ -60,7 +60,7 @@ def double_phase(target: np.ndarray, distance: float) -> np.ndarray:
 
 
 def hololoop(target: np.ndarray, distance: float, iterations: int, most: int = 20) -> Solved:
-    from runtime.ideal import ideal_path, single
+    from runtime.lightpath.ideal_path import ideal_path, single
     from runtime.solver import Solver
 
     solver = Solver(single(ideal_path(target.shape, PITCH, WAVELENGTH, distance, IRIS)))

@@ -20,17 +20,17 @@ import pytest
 import torch
 
 from tests.trainer.hidden import bench_file
-from trainer.candidates import evaluate_captures, screen_batches
-from trainer.capture import capture_from
-from trainer.captures import read_captures
-from trainer.diagnose import parts_of, with_gains
+from trainer.captures.acquire import capture_from
+from trainer.captures.batches import load
+from trainer.captures.capture_set import read_captures
+from trainer.diagnosis.candidates import evaluate_captures, screen_batches
+from trainer.diagnosis.diagnose import parts_of, with_gains
+from trainer.diagnosis.explain import add_from
 from trainer.effects import catalogue
-from trainer.evidence import load
-from trainer.explain import add_from
-from trainer.fit import fit
-from trainer.model import Model, absent
-from trainer.prediction import light_on_camera, trace
-from trainer.scene import scene_for, stages_for
+from trainer.fitting.gauss_newton import fit
+from trainer.model.model import Model, absent
+from trainer.prediction.predict import light_on_camera, trace
+from trainer.prediction.scene import scene_for, stages_for
 
 HOLOLOOP = Path(sys.executable).with_name("hololoop-trainer")
 ROWS: list[tuple[str, str]] = []

@@ -195,7 +195,7 @@ def service_messages() -> Target:
 def bundles() -> Target:
     """A bundle's manifest and its arrays, also where the hashes are right."""
     from firmware_iface.errors import InputError
-    from runtime import bundle
+    from runtime.bundle.bundle_folder import bundle_folder as bundle
 
     folder = Path(_SCRATCH.name)
 
@@ -223,7 +223,7 @@ def bundles() -> Target:
 def capture_sets() -> Target:
     """bench.toml and captures.csv: the bytes are one, then the other."""
     from firmware_iface.errors import InputError
-    from trainer.captures import read_captures
+    from trainer.captures.capture_set import read_captures
 
     folder = Path(_SCRATCH.name)
 

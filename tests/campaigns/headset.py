@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from firmware_iface.virtual.served import Remote, running
-from runtime.bundle import write_bundle
-from runtime.calibrated import pack_light_paths
+from runtime.bundle.bundle_folder import write_bundle
+from runtime.bundle.light_path_arrays import pack_light_paths
 from runtime.service.client import Client, connect
 from tests.runtime.benches import converted, ideal_path
 

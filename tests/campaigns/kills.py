@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from firmware_iface.errors import InputError
-from runtime.bundle import read_bundle
+from runtime.bundle.bundle_folder import read_bundle
 from tests.campaigns.faults import DARK_WITHIN_S, PATIENCE_S
 from tests.campaigns.headset import ENVIRONMENT
 from tests.campaigns.lane import Lane
@@ -30,7 +30,7 @@ VICTIMS = ("service", "solver", "camera", "calibration")
 LONGEST_S = 0.8  # from one kill to the next: starting takes about half of it
 REPLACING = """
 import ctypes, sys
-from runtime.bundle import read_bundle, write_bundle
+from runtime.bundle.bundle_folder import read_bundle, write_bundle
 ctypes.CDLL(None).prctl(1, 9)
 while True:
     bundle = read_bundle(sys.argv[1])

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from runtime.service import solver_process
 from runtime.service.configuration import read_configuration
+from runtime.service.frame_solver import Pattern
 from runtime.service.ring import crc32
-from runtime.service.solving import Pattern
 from runtime.service.supervisor import Supervisor
 
 NOTES = "patterns.crc"

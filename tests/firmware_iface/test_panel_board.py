@@ -22,7 +22,7 @@ from firmware_iface.panel.board import (
     parse_status,
     parse_timing,
 )
-from firmware_iface.virtual.faults import Faults
+from firmware_iface.virtual.fault_injection import Faults
 from firmware_iface.virtual.usb import BoardModel, VirtualUsb
 from firmware_iface.virtual.usb.device import Gone, Nak, Stall
 

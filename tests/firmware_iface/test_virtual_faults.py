@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from firmware_iface.errors import InputError
-from firmware_iface.virtual.faults import KINDS, Faults
+from firmware_iface.virtual.fault_injection import KINDS, Faults
 
 
 def strikes(faults: Faults, transfers: int, *kinds: str) -> list[str | None]:

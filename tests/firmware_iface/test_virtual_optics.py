@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from firmware_iface.virtual import BenchDescription, VirtualHeadset, load_bench, make_defect
+from firmware_iface.virtual.bench_optics import BenchOptics
 from firmware_iface.virtual.description import IrisDescription, SimulationDescription
-from firmware_iface.virtual.optics import BenchOptics
-from firmware_iface.virtual.panel import Drive, smear_weights
-from firmware_iface.virtual.propagation import Band
-from firmware_iface.virtual.sensor import Integrator, interpolate
+from firmware_iface.virtual.simulated_panel import Drive, smear_weights
+from firmware_iface.virtual.simulated_sensor import Integrator, interpolate
+from firmware_iface.virtual.subpixel_propagation import Band
 
 H, W, Z = 64, 96, 12.0
 NARROW = make_defect(

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from runtime import ideal
-from runtime.lightpath import LightPath
+from runtime.lightpath import ideal_path as ideal
+from runtime.lightpath.light_path import LightPath
 
 PITCH, WAVELENGTH = 8e-6, 520e-9
 ARRAYS = (

@@ -11,11 +11,18 @@ import pytest
 from safetensors.numpy import save
 
 from firmware_iface.errors import InputError
-from runtime.approximator import EPSILON, Approximator, approximator_of
-from runtime.bundle import ADAPTERS, APPROXIMATOR, GRADIENT, INITIALISER, read_bundle, write_bundle
-from runtime.calibrated import pack_light_paths
+from runtime.bundle.bundle_folder import (
+    ADAPTERS,
+    APPROXIMATOR,
+    GRADIENT,
+    INITIALISER,
+    read_bundle,
+    write_bundle,
+)
+from runtime.bundle.light_path_arrays import pack_light_paths
 from runtime.cli import main
-from runtime.lightpath import LightPath
+from runtime.lightpath.light_path import LightPath
+from runtime.networks.onnx_approximator import EPSILON, Approximator, approximator_of
 from runtime.solver import Solver, quality, shown, solve
 from tests.runtime.benches import ideal_path, scene
 

@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_iface.errors import InputError
-from runtime import bundle as module
-from runtime.bundle import Bundle, read_bundle, write_bundle
+from runtime.bundle import bundle_folder as module
+from runtime.bundle.bundle_folder import Bundle, read_bundle, write_bundle
 
 ARRAYS = {
     "source": (np.arange(12).reshape(3, 4) + 1j).astype(np.complex64),

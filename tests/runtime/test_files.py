@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from firmware_iface.errors import InputError
-from runtime import files
-from runtime.files import whole_file, whole_folder
+from runtime.bundle import whole_files as files
+from runtime.bundle.whole_files import whole_file, whole_folder
 
 
 def names(folder: Path) -> list[str]:
@@ -164,7 +164,7 @@ def test_a_killed_replacement_leaves_a_whole_folder(tmp_path: Path) -> None:
     """kill -9 at any moment: both files are of one generation, and the folder is never missing."""
     script = (
         "import sys\n"
-        "from runtime.files import whole_folder\n"
+        "from runtime.bundle.whole_files import whole_folder\n"
         "for n in range(100000):\n"
         "    with whole_folder(sys.argv[1], replace=True, keep=sys.argv[1] + '.previous') as folder:\n"
         "        for name in 'ab':\n"

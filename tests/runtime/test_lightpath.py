@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from runtime.lightpath import (
+from runtime.lightpath.light_path import (
     FINE,
     LightPath,
     at_pixels,
@@ -24,8 +24,8 @@ from runtime.lightpath import (
     pixel_irradiance,
     pixel_irradiance_adjoint,
 )
-from runtime.neighbours import mix_neighbours
-from runtime.windows import put, ring, take
+from runtime.lightpath.neighbours import mix_neighbours
+from runtime.lightpath.windows import put, ring, take
 from tests.runtime.benches import PITCH, converted, ideal_path, padded_irradiance, random_path, torch_path
 
 torch = pytest.importorskip("torch")

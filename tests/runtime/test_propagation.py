@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from firmware_iface.errors import InputError
-from runtime.propagation import Aperture, band_limit, check_sampling, far_field, transfer_function
+from runtime.lightpath.propagation import Aperture, band_limit, check_sampling, far_field, transfer_function
 
 PITCH, WAVELENGTH, N = 8e-6, 520e-9, 512
 WAIST = 0.16e-3

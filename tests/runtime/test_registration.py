@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from firmware_iface.errors import InputError
-from runtime.registration import (
+from runtime.camera.registration import (
     BROAD,
     SPREAD,
     Dots,

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from runtime.bundle import read_bundle, write_bundle
-from runtime.calibrated import load_light_path, pack_light_paths
+from runtime.bundle.bundle_folder import read_bundle, write_bundle
+from runtime.bundle.light_path_arrays import load_light_path, pack_light_paths
 from runtime.cli import main
 from runtime.solver import quality_of
-from runtime.targets import encode_srgb, read_target
+from runtime.solver.targets import encode_srgb, read_target
 from tests.runtime.benches import converted, ideal_path, scene
 
 SHAPE = (40, 56)

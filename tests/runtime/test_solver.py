@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from firmware_iface.errors import InputError
-from runtime.lightpath import LightPath, irradiance, panel_phase, pixel_irradiance
+from runtime.lightpath.light_path import LightPath, irradiance, panel_phase, pixel_irradiance
 from runtime.solver import DriveRange, Quality, quality, quality_of, solve
 from tests.runtime.benches import converted, ideal_path, padded_irradiance, random_path, scene
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from firmware_iface.errors import InputError
-from runtime.lightpath import LightPath
+from runtime.lightpath.light_path import LightPath
 from runtime.solver import Solver, beside_zero_order, motion_between, quality, quality_of, solve
-from runtime.solver.budget import Pace
+from runtime.solver.pace import Pace
 from tests.runtime.benches import ideal_path, padded_irradiance, scene
 
 SHAPE, DISTANCE = (96, 128), 0.015

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from firmware_iface.errors import InputError
-from runtime.backend import Backend, backend
-from runtime.lightpath import (
+from runtime.lightpath.light_path import (
     LightPath,
     at_pixels,
     irradiance,
@@ -15,7 +14,8 @@ from runtime.lightpath import (
     panel_spectrum,
     pixel_irradiance,
 )
-from runtime.solver.optics import Optics
+from runtime.solver.array_backend import Backend, backend
+from runtime.solver.in_place_path import Optics
 from tests.runtime.benches import converted, ideal_path, random_path, torch_path
 
 PATHS = {
@@ -107,7 +107,7 @@ def test_single_precision_keeps_five_digits() -> None:
 def test_scipy_does_what_ducc_does(monkeypatch: pytest.MonkeyPatch) -> None:
     import scipy.fft
 
-    from runtime import fft
+    from runtime.lightpath import fft
 
     path = PATHS["everything"]
     phase, slope, _ = drawn(path)
@@ -141,8 +141,8 @@ def test_the_gpus_way_through_the_code_gives_the_same_pattern(monkeypatch: pytes
 
     import scipy.fft
 
-    from runtime.backend import CupyBackend
     from runtime.solver import Solver
+    from runtime.solver.array_backend import CupyBackend
     from tests.runtime.benches import scene
 
     cupy = types.ModuleType("cupy")

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from firmware_iface.errors import InputError
-from runtime.targets import decode_srgb, encode_srgb, fit_area, read_target
+from runtime.solver.targets import decode_srgb, encode_srgb, fit_area, read_target
 
 RGB = np.array(
     [[[255, 0, 0], [0, 255, 0], [0, 0, 255]], [[0, 0, 0], [255, 255, 255], [188, 188, 188]]], np.uint8

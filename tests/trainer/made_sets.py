@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from trainer.capture_writer import CaptureWriter
-from trainer.captures import CaptureSet, read_captures
+from trainer.captures.capture_set import CaptureSet, read_captures
+from trainer.captures.capture_writer import CaptureWriter
 
 FINE = 4
 

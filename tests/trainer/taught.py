@@ -6,10 +6,10 @@ from pathlib import Path
 
 from firmware_iface.virtual import BenchDescription, VirtualHeadset, make_defect
 from firmware_iface.virtual.description import ChannelDescription
-from trainer.bench_file import Bench
-from trainer.capture import capture_set
-from trainer.captures import CaptureSet, read_captures
-from trainer.headset import nominal_bench
+from trainer.captures.acquire import capture_set
+from trainer.captures.bench_file import Bench
+from trainer.captures.capture_set import CaptureSet, read_captures
+from trainer.captures.open_bench import nominal_bench
 
 SHAPE = (48, 64)
 COLOURS = (ChannelDescription("red", 638.0), ChannelDescription("green", 520.0))

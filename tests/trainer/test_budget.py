@@ -11,11 +11,11 @@ import pytest
 from firmware_iface.errors import InputError
 from tests.trainer.taught import captured
 from tests.trainer.test_networks import disturbed
-from trainer.budget import error_budget
-from trainer.captures import CaptureSet
+from trainer.captures.capture_set import CaptureSet
 from trainer.cli import main
-from trainer.compare import compare
-from trainer.model import Model
+from trainer.diagnosis.compare import compare
+from trainer.diagnosis.error_budget import error_budget
+from trainer.model.model import Model
 from trainer.networks.approximator import write_approximator
 from trainer.training.recipe import RECIPES
 from trainer.training.sets import training_sets

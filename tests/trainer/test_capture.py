@@ -9,12 +9,12 @@ import pytest
 
 from firmware_iface.errors import InputError
 from firmware_iface.virtual import VirtualHeadset, load_bench
-from trainer.bench_file import Bench, read_bench
-from trainer.capture import Taken, capture_from, capture_set
-from trainer.captures import read_captures
-from trainer.check import check_captures
+from trainer.captures.acquire import Taken, capture_from, capture_set
+from trainer.captures.bench_file import Bench, read_bench
+from trainer.captures.capture_set import read_captures
+from trainer.captures.check_set import check_captures
+from trainer.captures.patterns import choose_patterns, default_count
 from trainer.effects.testing import small_bench
-from trainer.patterns import choose_patterns, default_count
 
 ROWS, COLUMNS, DISTANCE = 72, 96, 6.0
 
@@ -51,7 +51,7 @@ def test_the_same_seed_gives_the_same_patterns_and_another_does_not() -> None:
 
 def test_a_picture_is_seen_in_the_image_plane() -> None:
     headset, bench = small("ideal")
-    from trainer.patterns import _picture
+    from trainer.captures.patterns import _picture
 
     for index, number in ((0, 0), (2, 1)):
         pattern = choose_patterns(bench, "green", DISTANCE, 3)[index]

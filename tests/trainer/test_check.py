@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from tests.trainer.made_sets import bench_tables, counted, irradiance, make_set
-from trainer.bench_file import Bench
-from trainer.captures import CaptureSet, read_bench
-from trainer.check import Problem, check_captures
-from trainer.photon_transfer import black_estimate, compare_repeats
+from trainer.captures.bench_file import Bench
+from trainer.captures.camera_noise import black_estimate, compare_repeats
+from trainer.captures.capture_set import CaptureSet, read_bench
+from trainer.captures.check_set import Problem, check_captures
 
 FUZZ = settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 

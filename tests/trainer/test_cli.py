@@ -20,9 +20,9 @@ from firmware_iface.errors import InputError
 from trainer import cli
 from trainer.commands.screen import Screen
 from trainer.effects import testing
-from trainer.effects.registry import catalogue
-from trainer.model import Model
-from trainer.model_file import read_model, write_model
+from trainer.effects.catalogue import catalogue
+from trainer.model.model import Model
+from trainer.model.model_file import read_model, write_model
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 NAMES = [c.name for c in cli.commands()]
@@ -31,7 +31,7 @@ NAMES = [c.name for c in cli.commands()]
 @pytest.fixture(autouse=True)
 def _one_core(monkeypatch: pytest.MonkeyPatch) -> None:
     """Test workers that each take every core slow each other down."""
-    monkeypatch.setattr("trainer.pool.cores", lambda: 1)
+    monkeypatch.setattr("trainer.fitting.pool.cores", lambda: 1)
 
 
 @pytest.fixture(scope="session")
@@ -279,8 +279,8 @@ def stand_ins(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[Any]]:
         ) -> Any:
             return functions["explain"](model, known, save)
 
-        monkeypatch.setitem(sys.modules, "trainer.diagnose", SimpleNamespace(diagnose=diagnose))
-        monkeypatch.setitem(sys.modules, "trainer.explain", SimpleNamespace(explain=explain))
+        monkeypatch.setitem(sys.modules, "trainer.diagnosis.diagnose", SimpleNamespace(diagnose=diagnose))
+        monkeypatch.setitem(sys.modules, "trainer.diagnosis.explain", SimpleNamespace(explain=explain))
         return seen
 
     return put

@@ -1,4 +1,4 @@
-"""`trainer.compare` on small sets from a propagator of this file's own, with errors planted in them."""
+"""`trainer.diagnosis.compare` on small sets from a propagator of this file's own, with errors planted in them."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from firmware_iface.errors import InputError
-from trainer import compare as module
-from trainer.captures import CaptureSet, read_captures, write_captures
-from trainer.compare import Comparison, compare
+from trainer.captures.batches import load
+from trainer.captures.capture_set import CaptureSet, read_captures, write_captures
+from trainer.diagnosis import compare as module
+from trainer.diagnosis.compare import Comparison, compare
 from trainer.effects import catalogue
-from trainer.evidence import load
-from trainer.fit import evaluate
-from trainer.model import Model, absent
+from trainer.fitting.gauss_newton import evaluate
+from trainer.model.model import Model, absent
 
 HEIGHT, WIDTH, PITCH, DISTANCE = 96, 128, 8e-6, 10e-3
 WAVELENGTH = {"green": 520e-9, "blue": 450e-9}

@@ -11,8 +11,8 @@ from scipy.ndimage import gaussian_filter
 
 from firmware_iface.errors import InputError
 from tests.trainer.made_sets import bench_tables, counted, irradiance, make_set
-from trainer.bench_file import Bench, read_bench
-from trainer.conventions import TURNS, Sample, compare_conventions, find_convention, turned
+from trainer.captures.bench_file import Bench, read_bench
+from trainer.captures.conventions import TURNS, Sample, compare_conventions, find_convention, turned
 
 BACK = {"turn_90_left": "turn_90_right", "turn_90_right": "turn_90_left"}  # all others undo themselves
 TABLES = bench_tables((96, 96))

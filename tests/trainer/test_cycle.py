@@ -12,20 +12,20 @@ import torch
 
 from firmware_iface.errors import InputError
 from firmware_iface.virtual import BenchDescription, VirtualHeadset, make_defect
-from runtime.approximator import approximator_of
-from runtime.bundle import read_bundle
-from runtime.calibrated import load_light_path
+from runtime.bundle.bundle_folder import read_bundle
+from runtime.bundle.light_path_arrays import load_light_path
+from runtime.networks.onnx_approximator import approximator_of
 from runtime.solver import Solver, quality
 from tests.trainer.taught import SHAPE, captured, fringed, known
 from tests.trainer.test_networks import disturbed
 from trainer.cli import main
+from trainer.cycle.evaluate import DISPLAY, PREDICTION, Sizes, run_evaluation
 from trainer.cycle.loop import Cycle, Settings, run_cycle
-from trainer.cycle.pictures import in_depth, photographs
 from trainer.cycle.retrieval import METHODS, Volume, beside_zero_order, loss_of, retrieve, torch_path
-from trainer.cycle.showing import Stage, with_iris_beside
-from trainer.evaluation.evaluate import DISPLAY, PREDICTION, Sizes, run_evaluation
-from trainer.export import export_bundle
-from trainer.model import Model
+from trainer.cycle.show_on_bench import Stage, with_iris_beside
+from trainer.cycle.test_pictures import in_depth, photographs
+from trainer.model.export import export_bundle
+from trainer.model.model import Model
 from trainer.networks.approximator import Approximator, Architecture
 from trainer.training.recipe import RECIPES
 from trainer.training.sets import training_sets
@@ -93,8 +93,8 @@ def test_recorded_captures_stand_in_for_the_camera(tmp_path: Path) -> None:
 
 
 def run_shown(stage: Stage, patterns: dict[str, np.ndarray], wanted: Volume, folder: Path) -> float:
-    from trainer.compare import with_gains
-    from trainer.cycle.showing import display_likeness, seen_pairs
+    from trainer.cycle.show_on_bench import display_likeness, seen_pairs
+    from trainer.diagnosis.compare import with_gains
 
     captures = stage.show(patterns, wanted.planes_mm, folder)
     seen = seen_pairs(captures, with_gains(captures, stage.model, captures.captures))
@@ -146,7 +146,7 @@ def test_the_phase_gradient_through_the_network_is_the_slope(colours: bool) -> N
 
 
 def light(phase: torch.Tensor, paths: list, network: torch.nn.Module) -> torch.Tensor:
-    from runtime.lightpath import irradiance, pixel_irradiance
+    from runtime.lightpath.light_path import irradiance, pixel_irradiance
 
     rows = [[pixel_irradiance(p, irradiance(p, phase[c])) for c, p in enumerate(row)] for row in paths]
     return network(torch.stack([torch.stack(row) for row in rows]))

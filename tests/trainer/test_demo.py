@@ -10,10 +10,10 @@ from PIL import Image
 
 from firmware_iface.errors import InputError
 from runtime.solver import quality
-from trainer.captures import read_captures
+from trainer.captures.capture_set import read_captures
 from trainer.commands.making import first_free
-from trainer.demo import run_demo
-from trainer.shown import Shown, display_section, with_display
+from trainer.cycle.demo import run_demo
+from trainer.report.displayed import Shown, display_section, with_display
 
 
 def test_a_folder_that_holds_something_is_refused(tmp_path: Path) -> None:

@@ -12,15 +12,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from runtime.fft import irfft2
-from runtime.legendre import legendre_maps
-from runtime.lightpath import FINE
-from trainer.bases import zernike_maps
-from trainer.bench_file import Bench, read_bench
+from runtime.lightpath.fft import irfft2
+from runtime.lightpath.legendre import legendre_maps
+from runtime.lightpath.light_path import FINE
+from trainer.captures.bench_file import Bench, read_bench
 from trainer.effects import catalogue
-from trainer.model import Model, Present, absent
-from trainer.prediction import counts, light_on_camera, light_path, trace
-from trainer.scene import Scene, Stages, scene_for, stages_for
+from trainer.effects.zernike import zernike_maps
+from trainer.model.model import Model, Present, absent
+from trainer.prediction.predict import counts, light_on_camera, light_path, trace
+from trainer.prediction.scene import Scene, Stages, scene_for, stages_for
 
 TABLE = {
     "phase_response": ("drive", "display"),

@@ -13,18 +13,18 @@ import pytest
 import torch
 
 from firmware_iface.errors import InputError
-from runtime.bundle import ADAPTERS, APPROXIMATOR, GRADIENT, Bundle, read_bundle, write_bundle
-from runtime.calibrated import bundle_channels, load_light_path, plane_of
-from runtime.lightpath import irradiance, panel_phase
+from runtime.bundle.bundle_folder import ADAPTERS, APPROXIMATOR, GRADIENT, Bundle, read_bundle, write_bundle
+from runtime.bundle.light_path_arrays import bundle_channels, load_light_path, plane_of
+from runtime.lightpath.light_path import irradiance, panel_phase
 from tests.trainer.test_effects import HEIGHT, PLANE, WIDTH, bench, gray, present
 from tests.trainer.test_networks import disturbed
-from trainer.captures import read_captures, write_captures
+from trainer.captures.capture_set import read_captures, write_captures
 from trainer.effects import catalogue
-from trainer.export import export_bundle
-from trainer.model import Model, Present, absent
+from trainer.model.export import export_bundle
+from trainer.model.model import Model, Present, absent
 from trainer.networks.approximator import write_approximator
-from trainer.prediction import light_path
-from trainer.scene import scene_for, stages_for
+from trainer.prediction.predict import light_path
+from trainer.prediction.scene import scene_for, stages_for
 
 CAMERA = ("sensor_blur", "misregistration", "vignetting", "stray_light", "sensor_response", "laser_drift")
 

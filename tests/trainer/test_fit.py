@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from runtime.legendre import legendre_count
-from trainer.candidates import least_for_order
-from trainer.captures import CaptureSet
+from runtime.lightpath.legendre import legendre_count
+from trainer.captures.batches import Batch, load
+from trainer.captures.capture_set import CaptureSet
+from trainer.diagnosis.candidates import least_for_order
 from trainer.effects import catalogue
 from trainer.effects.testing import captures_with, placed
-from trainer.evidence import Batch, load
-from trainer.fit import fit, raise_order
-from trainer.model import Model, Present, absent
+from trainer.fitting.gauss_newton import fit, raise_order
+from trainer.model.model import Model, Present, absent
 
 KNOWN = catalogue()
 

@@ -13,10 +13,10 @@ from firmware_iface.virtual import open_headset
 from tests.campaigns.headset import hardware, write_configuration
 from tests.trainer.hidden import ran
 from tests.trainer.taught import SHAPE, fringed, known
-from trainer.bench_file import bench_tables
-from trainer.capture import capture_set
+from trainer.captures.acquire import capture_set
+from trainer.captures.bench_file import bench_tables
+from trainer.captures.open_bench import RealHeadset, nominal_bench, open_bench
 from trainer.cli import main
-from trainer.headset import RealHeadset, nominal_bench, open_bench
 
 
 def test_real_lasers_stay_within_the_power_that_is_set(tmp_path: Path) -> None:

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from runtime.bundle import INITIALISER, read_bundle, write_bundle
-from runtime.calibrated import load_light_path, pack_light_paths
+from runtime.bundle.bundle_folder import INITIALISER, read_bundle, write_bundle
+from runtime.bundle.light_path_arrays import load_light_path, pack_light_paths
 from runtime.solver import Solver
 from tests.runtime.benches import ideal_path, scene
 from trainer.cli import main
-from trainer.initialiser import InitialiserNetwork, _fit, onnx_file
+from trainer.training.train_initialiser import InitialiserNetwork, _fit, onnx_file
 
 SHAPE = (48, 64)
 

@@ -16,10 +16,10 @@ import pytest
 
 from firmware_iface.errors import InputError
 from tests.trainer.hidden import bench_file
-from trainer.capture import capture_from
-from trainer.effects.registry import catalogue
-from trainer.model import Model
-from trainer.model_file import read_model
+from trainer.captures.acquire import capture_from
+from trainer.effects.catalogue import catalogue
+from trainer.model.model import Model
+from trainer.model.model_file import read_model
 
 psutil = pytest.importorskip("psutil")
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trainer.capture_writer import CaptureWriter
+from trainer.captures.capture_writer import CaptureWriter
 from trainer.effects.testing import small_bench
 
 GIB = 2**30

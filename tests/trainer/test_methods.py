@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from firmware_iface.errors import InputError
-from runtime.lightpath import irradiance, phase_gradient
+from runtime.lightpath.light_path import irradiance, phase_gradient
 from tests.trainer.hidden import BENCH
-from trainer.bench_file import Bench, read_bench
-from trainer.export import export_bundle
-from trainer.model import Model
-from trainer.prediction import light_on_camera, light_path, trace
-from trainer.scene import scene_for, stages_for
+from trainer.captures.bench_file import Bench, read_bench
+from trainer.model.export import export_bundle
+from trainer.model.model import Model
+from trainer.prediction.predict import light_on_camera, light_path, trace
+from trainer.prediction.scene import scene_for, stages_for
 
 
 def bench(side: int, distance_mm: float) -> Bench:

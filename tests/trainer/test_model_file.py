@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from firmware_iface.errors import InputError
-from trainer.bench_file import Bench, Camera, Channel, Iris, Panel
+from trainer.captures.bench_file import Bench, Camera, Channel, Iris, Panel
+from trainer.effects.catalogue import catalogue
 from trainer.effects.definition import Effect, Parameter
-from trainer.effects.registry import catalogue
-from trainer.model import Model, Present, absent
-from trainer.model_file import read_model, write_model
+from trainer.model.model import Model, Present, absent
+from trainer.model.model_file import read_model, write_model
 
 
 def curve(drive: Any, gain: Any, curvature: Any) -> Any:
@@ -181,7 +181,7 @@ def test_a_failed_write_leaves_the_old_model_readable(
     old = Model(on, (filled(effect, on, np.random.default_rng(1)),))
     path = tmp_path / "m.toml"
     write_model(path, old)
-    import trainer.model_file as module
+    import trainer.model.model_file as module
 
     real, calls = module.whole_file, []
 

@@ -10,10 +10,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from firmware_iface.errors import InputError
-from trainer.bench_file import Bench, Camera, Channel, Iris, Panel
-from trainer.effects.registry import catalogue
-from trainer.model import Model, absent
-from trainer.model_file import read_model, write_model
+from trainer.captures.bench_file import Bench, Camera, Channel, Iris, Panel
+from trainer.effects.catalogue import catalogue
+from trainer.model.model import Model, absent
+from trainer.model.model_file import read_model, write_model
 
 KNOWN = catalogue()
 

@@ -10,12 +10,13 @@ from pathlib import Path
 import pytest
 
 from firmware_iface.errors import InputError
-from trainer.effects import registry, testing
+from trainer.diagnosis.explain import add
+from trainer.effects import catalogue as registry
+from trainer.effects import testing
+from trainer.effects.catalogue import catalogue, load_effects
 from trainer.effects.definition import Effect
-from trainer.effects.registry import catalogue, load_effects
-from trainer.explain import add
-from trainer.model import Model
-from trainer.new_effect import EXAMPLES, STAGES, write_new_effect
+from trainer.effects.new_effect import EXAMPLES, STAGES, write_new_effect
+from trainer.model.model import Model
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from firmware_iface.errors import InputError
-from runtime.bundle import ADAPTERS, APPROXIMATOR, GRADIENT
+from runtime.bundle.bundle_folder import ADAPTERS, APPROXIMATOR, GRADIENT
 from tests.trainer.test_networks import disturbed
 from trainer.networks.approximator import Approximator, penalty
 from trainer.networks.onnx_files import onnx_files

@@ -12,29 +12,29 @@ import torch
 
 from firmware_iface.errors import InputError
 from firmware_iface.virtual import BenchDescription, VirtualHeadset, make_defect
-from firmware_iface.virtual.panel import Surface
-from runtime.bundle import read_bundle
-from runtime.calibrated import load_light_path
-from runtime.lightpath import irradiance, panel_phase
+from firmware_iface.virtual.simulated_panel import Surface
+from runtime.bundle.bundle_folder import read_bundle
+from runtime.bundle.light_path_arrays import load_light_path
+from runtime.lightpath.light_path import irradiance, panel_phase
 from tests.trainer.hidden import ran
 from tests.trainer.taught import SHAPE
-from trainer.bench_file import Bench
-from trainer.budget import error_budget
-from trainer.capture import capture_set
-from trainer.captures import CaptureSet, read_captures
+from trainer.captures.acquire import capture_set
+from trainer.captures.bench_file import Bench
+from trainer.captures.capture_set import CaptureSet, read_captures
+from trainer.captures.open_bench import nominal_bench
 from trainer.cycle.loop import Settings, run_cycle
-from trainer.cycle.pictures import photographs
 from trainer.cycle.retrieval import retrieve
-from trainer.cycle.showing import Stage
-from trainer.effects.registry import catalogue
-from trainer.export import export_bundle
-from trainer.headset import nominal_bench
-from trainer.learn_field import learn_field
-from trainer.model import Model, absent
-from trainer.model_file import read_model, write_model
-from trainer.panel_field import UNITS, combined, with_field
-from trainer.prediction import trace
-from trainer.scene import scene_for, stages_for, stages_of
+from trainer.cycle.show_on_bench import Stage
+from trainer.cycle.test_pictures import photographs
+from trainer.diagnosis.error_budget import error_budget
+from trainer.effects.catalogue import catalogue
+from trainer.fitting.learn_field import learn_field
+from trainer.model.export import export_bundle
+from trainer.model.model import Model, absent
+from trainer.model.model_file import read_model, write_model
+from trainer.prediction.panel_field import UNITS, combined, with_field
+from trainer.prediction.predict import trace
+from trainer.prediction.scene import scene_for, stages_for, stages_of
 from trainer.training.recipe import RECIPES
 
 

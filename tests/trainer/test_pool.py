@@ -16,14 +16,14 @@ from typing import Any
 import pytest
 
 from firmware_iface.errors import InputError
-from trainer import pool
-from trainer.captures import CaptureSet, read_captures
+from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.cli import main
-from trainer.diagnose import diagnose
+from trainer.diagnosis.diagnose import diagnose
 from trainer.effects import testing
-from trainer.effects.registry import Catalogue, catalogue, load_effects
-from trainer.model import Model
-from trainer.pool import open_pool
+from trainer.effects.catalogue import Catalogue, catalogue, load_effects
+from trainer.fitting import pool
+from trainer.fitting.pool import open_pool
+from trainer.model.model import Model
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 
@@ -117,7 +117,7 @@ def test_a_process_that_is_lost_is_one_sentence() -> None:
 
 SCRIPT = """
 import sys, time
-from trainer.pool import open_pool
+from trainer.fitting.pool import open_pool
 if __name__ == "__main__":
     try:
         with open_pool(2) as pool:
@@ -192,8 +192,8 @@ Run = Callable[..., dict[str, Any]]
 @pytest.fixture
 def diagnosed(captures: CaptureSet, own: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> Run:
     """`diagnose --json` of the set with a user's effects; only a few of the others are tried, to be quick."""
-    monkeypatch.setattr("trainer.pool.cores", lambda: 1)
-    monkeypatch.setattr("trainer.effects.registry.catalogue", lambda files=(): few(catalogue(files), own))
+    monkeypatch.setattr("trainer.fitting.pool.cores", lambda: 1)
+    monkeypatch.setattr("trainer.effects.catalogue.catalogue", lambda files=(): few(catalogue(files), own))
 
     def run(*options: str) -> dict[str, Any]:
         capsys.readouterr()

@@ -15,12 +15,12 @@ import pytest
 from PIL import Image
 
 from firmware_iface.errors import InputError
-from trainer.bench_file import read_bench
+from trainer.captures.bench_file import read_bench
 from trainer.effects import catalogue
-from trainer.model import Model, absent
-from trainer.numbers import measured, number, parameters, percent
+from trainer.formatting import measured, number, parameters, percent
+from trainer.model.model import Model, absent
 from trainer.report import write_report
-from trainer.report.pictures import blocks, draw, place
+from trainer.report.array_pictures import blocks, draw, place
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 HOSTILE = '<script>alert("1")</script> & $\\frac{a}$'

@@ -19,18 +19,18 @@ from tests.conftest import ROOT
 from tests.trainer.made_sets import bench_tables, counted, irradiance
 from tests.trainer.taught import SHAPE, captured
 from tests.trainer.test_perceptual import random_weights
-from trainer.bench_file import read_bench
-from trainer.captures import CaptureSet, read_captures, write_captures
+from trainer.captures.batches import load_batch
+from trainer.captures.bench_file import read_bench
+from trainer.captures.capture_set import CaptureSet, read_captures, write_captures
 from trainer.cli import main
-from trainer.compare import with_gains
+from trainer.diagnosis.compare import with_gains
 from trainer.effects import catalogue
-from trainer.evidence import load_batch
-from trainer.model import Model, absent
+from trainer.model.model import Model, absent
 from trainer.networks.approximator import read_approximator
 from trainer.networks.weights import ALEXNET, VGG19
-from trainer.scene import scene_for, stages_for
+from trainer.prediction.scene import scene_for, stages_for
+from trainer.training.likeness import evaluate, likeness, noise_floor
 from trainer.training.losses import Critic, content_loss, matching_loss, picture, where_seen
-from trainer.training.metrics import evaluate, likeness, noise_floor
 from trainer.training.pairs import measured_on_panel, onto_camera, onto_panel, pairs_of, stacked
 from trainer.training.recipe import RECIPES, Recipe, recipe_named
 from trainer.training.sets import TrainingSets, training_sets
@@ -228,8 +228,8 @@ from pathlib import Path
 import torch
 from safetensors.torch import save_file
 torch.set_num_threads(1)
-from trainer.captures import read_captures
-from trainer.model import Model
+from trainer.captures.capture_set import read_captures
+from trainer.model.model import Model
 from trainer.training.recipe import RECIPES
 from trainer.training.sets import training_sets
 from trainer.training.train import train

@@ -11,14 +11,14 @@ import pytest
 
 from firmware_iface.errors import InputError
 from tests.trainer.hidden import bench_file
-from trainer.capture import capture_from
-from trainer.captures import CaptureSet, read_captures
-from trainer.compare import compare
-from trainer.diagnose import Diagnosis, diagnose
-from trainer.effects.registry import catalogue
-from trainer.evidence import in_view
-from trainer.model import Model
-from trainer.pool import open_pool
+from trainer.captures.acquire import capture_from
+from trainer.captures.batches import in_view
+from trainer.captures.capture_set import CaptureSet, read_captures
+from trainer.diagnosis.compare import compare
+from trainer.diagnosis.diagnose import Diagnosis, diagnose
+from trainer.effects.catalogue import catalogue
+from trainer.fitting.pool import open_pool
+from trainer.model.model import Model
 
 PIXEL_UM = 6.0  # the panel's are 8
 

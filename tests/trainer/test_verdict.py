@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from trainer.evidence import Batch
-from trainer.excess import TILE, Errors, Removed, errors_of, join, removed, tiles
-from trainer.verdict import Thresholds
+from trainer.captures.batches import Batch
+from trainer.diagnosis.verdict import Thresholds
+from trainer.fitting.excess import TILE, Errors, Removed, errors_of, join, removed, tiles
 
 CANDIDATES = 18  # as many as the catalogue has
 REAL = Thresholds(share=0, excess=0)  # asks only whether an improvement is real, not whether it matters

@@ -17,10 +17,10 @@ from runtime.solving import whole
 from trainer.commands.screen import Screen
 
 if TYPE_CHECKING:
-    from trainer.captures import CaptureSet
-    from trainer.effects.registry import Catalogue
-    from trainer.model import Model
-    from trainer.verdict import Thresholds
+    from trainer.captures.capture_set import CaptureSet
+    from trainer.diagnosis.verdict import Thresholds
+    from trainer.effects.catalogue import Catalogue
+    from trainer.model.model import Model
 
 PROGRAM = "hololoop-trainer"
 Result = dict[str, Any]
@@ -168,7 +168,7 @@ def threshold_options(parser: ArgumentParser) -> None:
 
 def thresholds_of(args: Namespace) -> Thresholds:
     """The thresholds that the options ask for."""
-    from trainer.verdict import Thresholds
+    from trainer.diagnosis.verdict import Thresholds
 
     named = {
         "level": args.level,
@@ -182,10 +182,10 @@ def thresholds_of(args: Namespace) -> Thresholds:
 
 def inputs_of(args: Namespace) -> tuple[CaptureSet, Catalogue, Model]:
     """The capture set, the effects that are known, and the model to start from. Raises InputError."""
-    from trainer.captures import read_captures
-    from trainer.effects.registry import catalogue
-    from trainer.model import Model
-    from trainer.model_file import read_model
+    from trainer.captures.capture_set import read_captures
+    from trainer.effects.catalogue import catalogue
+    from trainer.model.model import Model
+    from trainer.model.model_file import read_model
 
     captures = read_captures(args.captures)
     known = catalogue(args.effects)
@@ -197,14 +197,14 @@ def use_every_core() -> None:
     """Let torch use all of this process's processors: for work that is done in this process."""
     import torch
 
-    from trainer.pool import cores
+    from trainer.fitting.pool import cores
 
     torch.set_num_threads(cores())
 
 
 def workers_of(args: Namespace) -> int:
     """How many processes to use; with one, this process takes every core."""
-    from trainer.pool import cores
+    from trainer.fitting.pool import cores
 
     workers = int(args.workers or cores())
     if workers == 1:

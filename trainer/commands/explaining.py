@@ -36,15 +36,15 @@ from trainer.commands.showing import (
 )
 
 if TYPE_CHECKING:
-    from trainer.model import Model
+    from trainer.model.model import Model
 
 MISREAD = ("convention", "left_justified", "bit_depth")  # problems after which every number is wrong
 
 
 def run_check(args: Namespace, screen: Screen) -> Result:
     """Everything that is wrong with a capture set."""
-    from trainer.captures import read_bench, scan_rows
-    from trainer.check import check_captures
+    from trainer.captures.capture_set import read_bench, scan_rows
+    from trainer.captures.check_set import check_captures
 
     folder: Path = args.captures
     if not folder.is_dir():
@@ -65,8 +65,8 @@ def run_compare(args: Namespace, screen: Screen) -> Result:
     captures, _, model = inputs_of(args)
     from dataclasses import replace
 
-    from trainer.budget import error_budget
-    from trainer.compare import compare
+    from trainer.diagnosis.compare import compare
+    from trainer.diagnosis.error_budget import error_budget
     from trainer.networks.approximator import read_approximator
 
     network = read_approximator(args.network)[0] if args.network else None
@@ -89,13 +89,13 @@ def run_diagnose(args: Namespace, screen: Screen) -> Result:
     thresholds = thresholds_of(args)
     captures, known, model = inputs_of(args)
     refuse_misread(args.captures, screen)
-    from trainer.diagnose import diagnose
-    from trainer.pool import open_pool
+    from trainer.diagnosis.diagnose import diagnose
+    from trainer.fitting.pool import open_pool
 
     with screen.progress("diagnosing") as told, open_pool(workers_of(args), args.cluster) as pool:
         found = diagnose(captures, model, known, pool, thresholds, told)
     if args.report:
-        from trainer.compare import compare
+        from trainer.diagnosis.compare import compare
         from trainer.report import write_report
 
         write_report(
@@ -110,12 +110,12 @@ def run_diagnose(args: Namespace, screen: Screen) -> Result:
 def run_add(args: Namespace, screen: Screen) -> Result:
     """One effect more."""
     refuse_folder(args.out, "--out")
-    from trainer.effects.registry import catalogue, find_effect
+    from trainer.effects.catalogue import catalogue, find_effect
 
     effect = find_effect(catalogue(args.effects), args.effect)
     captures, known, model = inputs_of(args)
-    from trainer.explain import add
-    from trainer.model_file import write_model
+    from trainer.diagnosis.explain import add
+    from trainer.model.model_file import write_model
 
     use_every_core()
     with screen.progress(f"adding {effect.name}") as told:
@@ -131,9 +131,9 @@ def run_explain(args: Namespace, screen: Screen) -> Result:
     thresholds = thresholds_of(args)
     captures, known, model = inputs_of(args)
     refuse_misread(args.captures, screen)
-    from trainer.explain import explain
-    from trainer.model_file import write_model
-    from trainer.pool import open_pool
+    from trainer.diagnosis.explain import explain
+    from trainer.fitting.pool import open_pool
+    from trainer.model.model_file import write_model
 
     source = origin(captures)
     saved: list[tuple[str, ...]] = []
@@ -148,7 +148,7 @@ def run_explain(args: Namespace, screen: Screen) -> Result:
             found = explain(captures, model, known, pool, thresholds, save, told)
         save(found.model)
         if args.report:
-            from trainer.compare import compare
+            from trainer.diagnosis.compare import compare
             from trainer.report import write_report
 
             write_report(
@@ -166,7 +166,7 @@ def run_explain(args: Namespace, screen: Screen) -> Result:
 
 def _sizes(model: Model) -> list[Result]:
     """The effects of a model, each with its size in words and its parameters."""
-    from trainer.parameters import describe, json_values
+    from trainer.model.parameters import describe, json_values
 
     return [
         {
@@ -192,7 +192,7 @@ def refuse_misread(folder: Path, screen: Screen) -> None:
     """Raises InputError where the captures are not what bench.toml says, so that every number would be wrong; a
     line on stderr for other errors of the set, which may be what is to be explained.
     """
-    from trainer.check import check_captures
+    from trainer.captures.check_set import check_captures
 
     errors = [p for p in check_captures(folder) if p.severity == "error"]
     for problem in errors:

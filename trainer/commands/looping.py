@@ -26,7 +26,7 @@ from trainer.commands.training import judge_options, seed_option
 if TYPE_CHECKING:
     import numpy as np
 
-    from trainer.bench_file import Bench
+    from trainer.captures.bench_file import Bench
     from trainer.cycle.loop import Settings
 
 
@@ -34,16 +34,16 @@ def run_loop(args: Namespace, screen: Screen) -> Result:
     """The hardware-in-the-loop cycle on a bench, or with recorded captures."""
     from contextlib import ExitStack
 
-    from trainer.captures import read_captures
+    from trainer.captures.capture_set import read_captures
+    from trainer.captures.open_bench import open_bench
     from trainer.cycle.loop import run_cycle
-    from trainer.cycle.pictures import LEARNED, in_depth, photographs, volumes_of
     from trainer.cycle.retrieval import beside_zero_order
-    from trainer.cycle.showing import Stage, with_iris_beside
-    from trainer.effects.registry import catalogue
-    from trainer.headset import open_bench
-    from trainer.model import Model
-    from trainer.model_file import read_model
-    from trainer.training.judges import left_out
+    from trainer.cycle.show_on_bench import Stage, with_iris_beside
+    from trainer.cycle.test_pictures import LEARNED, in_depth, photographs, volumes_of
+    from trainer.effects.catalogue import catalogue
+    from trainer.model.model import Model
+    from trainer.model.model_file import read_model
+    from trainer.training.weight_files import left_out
 
     recorded = [read_captures(folder) for folder in args.recorded]
     if args.bench is None and not recorded:
@@ -83,7 +83,7 @@ def run_loop(args: Namespace, screen: Screen) -> Result:
 
 def _depths(args: Namespace, bench: Bench, count: int) -> list[np.ndarray | None]:
     """Depth of each picture, [H, W]; None where no map is given."""
-    from runtime.targets import encode_srgb, read_target
+    from runtime.solver.targets import encode_srgb, read_target
 
     if not args.depth:
         return [None] * count
@@ -100,8 +100,8 @@ def _settings(args: Namespace) -> Settings:
     from dataclasses import replace
 
     from trainer.cycle.loop import Settings
-    from trainer.training.judges import read_judges
     from trainer.training.recipe import recipe_named
+    from trainer.training.weight_files import read_judges
 
     recipe = recipe_named(args.network)
     if args.filters is not None:
@@ -153,10 +153,10 @@ def run_evaluate(args: Namespace, screen: Screen) -> Result:
     """Every method on one bench."""
     from dataclasses import replace
 
-    from trainer.effects.registry import catalogue
-    from trainer.evaluation.evaluate import METHODS, Sizes, run_evaluation
-    from trainer.model_file import read_model
-    from trainer.training.judges import read_judges
+    from trainer.cycle.evaluate import METHODS, Sizes, run_evaluation
+    from trainer.effects.catalogue import catalogue
+    from trainer.model.model_file import read_model
+    from trainer.training.weight_files import read_judges
 
     sizes = Sizes.full() if args.full else Sizes()
     given = {"filters": args.filters, "steps": args.steps, "iterations": args.iterations}

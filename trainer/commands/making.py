@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 def run_effects(args: Namespace, screen: Screen) -> Result:
     """The catalogue, or one effect of it."""
-    from trainer.effects.registry import catalogue, find_effect
+    from trainer.effects.catalogue import catalogue, find_effect
 
     known = catalogue(args.effects)
     chosen = [find_effect(known, args.name)] if args.name else list(known.values())
@@ -37,7 +37,7 @@ def run_effects(args: Namespace, screen: Screen) -> Result:
 
 
 def _described(effect: Effect) -> Result:
-    from trainer.effects.registry import BUILT_IN
+    from trainer.effects.catalogue import BUILT_IN
 
     return {
         "name": effect.name,
@@ -87,8 +87,8 @@ def show_effects(result: Result, args: Namespace, screen: Screen) -> None:
 
 def run_new_effect(args: Namespace, screen: Screen) -> Result:
     """A file with an effect to edit, and its test."""
-    from trainer.effects.registry import catalogue
-    from trainer.new_effect import write_new_effect
+    from trainer.effects.catalogue import catalogue
+    from trainer.effects.new_effect import write_new_effect
 
     paths = write_new_effect(args.name, args.stage, args.out, catalogue(args.effects))
     return {"effect": str(paths[0]), "test": str(paths[1]), "stage": args.stage}
@@ -108,7 +108,7 @@ def show_new_effect(result: Result, args: Namespace, screen: Screen) -> None:
 
 def run_capture(args: Namespace, screen: Screen) -> Result:
     """Patterns shown on a bench and captured."""
-    from trainer.capture import capture_from
+    from trainer.captures.acquire import capture_from
 
     with screen.progress("capturing") as told:
         taken = capture_from(
@@ -132,10 +132,10 @@ def run_export(args: Namespace, screen: Screen) -> Result:
     """A model as a bundle for the headset."""
     if args.out.exists() and not args.out.is_dir():
         raise InputError(f"--out {args.out} is a file: give the name of a folder")
-    from trainer.captures import read_captures
-    from trainer.effects.registry import catalogue
-    from trainer.export import export_bundle
-    from trainer.model_file import read_model
+    from trainer.captures.capture_set import read_captures
+    from trainer.effects.catalogue import catalogue
+    from trainer.model.export import export_bundle
+    from trainer.model.model_file import read_model
 
     captures = read_captures(args.captures) if args.captures else None
     model = read_model(args.model, catalogue(args.effects), captures.bench if captures else None)
@@ -155,7 +155,7 @@ def show_export(result: Result, args: Namespace, screen: Screen) -> None:
 
 def run_demo(args: Namespace, screen: Screen) -> Result:
     """The whole way on a virtual bench."""
-    from trainer.demo import run_demo as demo
+    from trainer.cycle.demo import run_demo as demo
 
     folder = args.out or first_free(Path("hololoop-demo"))
     with screen.progress("demo") as told:

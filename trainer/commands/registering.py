@@ -19,7 +19,7 @@ SAME = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
 
 def run_register(args: Namespace, screen: Screen) -> Result:
     """Writes the pattern to show, or reads its picture and writes the homography into bench.toml."""
-    from trainer.bench_file import read_bench
+    from trainer.captures.bench_file import read_bench
 
     path: Path = args.bench
     tables = _tables(path)
@@ -36,12 +36,12 @@ def run_register(args: Namespace, screen: Screen) -> Result:
                 "say where the dot pattern goes (--out DOTS.png), or give its picture as IMAGE.png"
             )
         from runtime.solving import write_gray
-        from trainer.patterns import dots_to_show
+        from trainer.captures.patterns import dots_to_show
 
         write_gray(args.out, dots_to_show(bench, channel, args.plane or bench.distance_mm, args.spacing))
         return {"pattern": str(args.out), "spacing_px": args.spacing, "channel": channel}
-    from runtime.registration import dots_of, find_homography
-    from trainer.captures import read_picture
+    from runtime.camera.registration import dots_of, find_homography
+    from trainer.captures.capture_set import read_picture
 
     depth = 16 if bench.camera.bit_depth > 8 else 8
     image = read_picture(args.image, bench.camera.shape, depth, f"the dot picture {args.image}")
@@ -63,7 +63,7 @@ def _write(path: Path, homography: np.ndarray) -> None:
     """Puts the homography into the bench file; all else, comments too, stays."""
     import tomlkit
 
-    from runtime.files import whole_file
+    from runtime.bundle.whole_files import whole_file
 
     document: Any = tomlkit.parse(path.read_text(encoding="utf-8"))
     document["camera"]["registered"] = False

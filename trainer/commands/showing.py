@@ -11,7 +11,7 @@ from typing import Any
 
 from trainer.commands.command import Result, command_line
 from trainer.commands.screen import Screen
-from trainer.numbers import listed, parameters
+from trainer.formatting import listed, parameters
 
 MOST_ROWS = 12
 

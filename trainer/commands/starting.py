@@ -13,7 +13,7 @@ from trainer.commands.training import seed_option
 
 def run_initialiser(args: Namespace, screen: Screen) -> Result:
     """A bundle with an initialiser that was taught on its own solver's results."""
-    from trainer.initialiser import with_initialiser
+    from trainer.training.train_initialiser import with_initialiser
 
     use_every_core()
     with screen.progress("solving") as told:

@@ -31,8 +31,8 @@ def run_field(args: Namespace, screen: Screen) -> Result:
     """A field learned at the panel, in a model."""
     refuse_folder(args.out, "--out")
     captures, _, model = inputs_of(args)
-    from trainer.learn_field import learn_field
-    from trainer.model_file import write_model
+    from trainer.fitting.learn_field import learn_field
+    from trainer.model.model_file import write_model
 
     use_every_core()
     with screen.progress("learning the field at the panel") as told:
@@ -64,10 +64,10 @@ def run_train(args: Namespace, screen: Screen) -> Result:
     from dataclasses import asdict
 
     from trainer.networks.approximator import read_approximator
-    from trainer.training.judges import left_out, read_judges
-    from trainer.training.metrics import evaluate, noise_floor
+    from trainer.training.likeness import evaluate, noise_floor
     from trainer.training.sets import training_sets
     from trainer.training.train import NETWORK, train
+    from trainer.training.weight_files import left_out, read_judges
 
     recipe = recipe_of(args)
     judges = read_judges(args.vgg, args.lpips)

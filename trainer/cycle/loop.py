@@ -24,15 +24,15 @@ import torch
 
 from firmware_iface.errors import InputError
 from runtime.solving import write_gray
-from trainer.captures import CaptureSet
-from trainer.compare import with_gains
+from trainer.captures.capture_set import CaptureSet
 from trainer.cycle.retrieval import ITERATIONS, Volume, retrieve
-from trainer.cycle.showing import Stage, display_likeness, rows_of, seen_pairs
-from trainer.learn_field import with_refined_field
-from trainer.model import Model
-from trainer.model_file import write_model
+from trainer.cycle.show_on_bench import Stage, display_likeness, rows_of, seen_pairs
+from trainer.diagnosis.compare import with_gains
+from trainer.fitting.learn_field import with_refined_field
+from trainer.model.model import Model
+from trainer.model.model_file import write_model
 from trainer.networks.approximator import Approximator, write_approximator
-from trainer.training.metrics import Likeness
+from trainer.training.likeness import Likeness
 from trainer.training.pairs import Pairs, pairs_of
 from trainer.training.recipe import Recipe
 from trainer.training.train import Judges, train

@@ -19,14 +19,14 @@ import torch
 from torch import Tensor
 
 from firmware_iface.errors import InputError, nearest
-from runtime.lightpath import LightPath, irradiance, panel_phase, pixel_irradiance
+from runtime.lightpath.light_path import LightPath, irradiance, panel_phase, pixel_irradiance
 from runtime.solver import DriveRange, solve
-from trainer.effects.registry import BUILT_IN
-from trainer.export import baked_path, told_to_display
-from trainer.model import Model, absent
+from trainer.effects.catalogue import BUILT_IN
+from trainer.model.export import baked_path, told_to_display
+from trainer.model.model import Model, absent
 from trainer.networks.approximator import Approximator, amplitude
-from trainer.prediction import light_path
-from trainer.scene import scene_for, stages_of
+from trainer.prediction.predict import light_path
+from trainer.prediction.scene import scene_for, stages_of
 
 SOLVERS = {
     "double_phase": "double_phase",

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from firmware_iface.errors import InputError
-from trainer.bench_file import Bench
-from trainer.numbers import UNIT_SUFFIX
+from trainer.captures.bench_file import Bench
+from trainer.formatting import UNIT_SUFFIX
 
 STAGES = ("drive", "panel", "pupil", "sensor")
 TOLD_TO = ("display", "camera")
@@ -100,7 +100,7 @@ class Effect:
 def _named(name: str, source: str) -> Effect:
     from pathlib import Path
 
-    from trainer.effects.registry import BUILT_IN, catalogue, load_effects
+    from trainer.effects.catalogue import BUILT_IN, catalogue, load_effects
 
     for one in BUILT_IN:
         if one.name == name:

@@ -8,9 +8,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from runtime.legendre import legendre_count, legendre_curve, legendre_surface
+from runtime.lightpath.legendre import legendre_count, legendre_curve, legendre_surface
 from trainer.effects.definition import Parameter, effect
-from trainer.stages import Drive
+from trainer.prediction.stages import Drive
 
 SUB_PIXELS = 4  # of a pixel an axis; 3 leave an excess of 9e-4, 5 gain nothing that a camera sees
 REACH = 2  # neighbours on either side that a pixel hears

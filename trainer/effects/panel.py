@@ -7,10 +7,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from runtime.legendre import legendre_count, legendre_surface
+from runtime.lightpath.legendre import legendre_count, legendre_surface
 from trainer.effects.definition import Parameter, effect
-from trainer.stages import Panel
-from trainer.starts import wavefront_starts
+from trainer.effects.starts import wavefront_starts
+from trainer.prediction.stages import Panel
 
 
 @effect(

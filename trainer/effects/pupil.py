@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from trainer.bases import zernike_count, zernike_maps
 from trainer.effects.definition import Parameter, effect
-from trainer.stages import Pupil
+from trainer.effects.zernike import zernike_count, zernike_maps
+from trainer.prediction.stages import Pupil
 
 LINES = 5  # nodes of the Gauss-Hermite rule that stands for a laser line
 FWHM = 2 * math.sqrt(2 * math.log(2))

@@ -8,11 +8,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from runtime.legendre import legendre_count, legendre_curve, legendre_surface
+from runtime.lightpath.legendre import legendre_count, legendre_curve, legendre_surface
 from trainer.effects.definition import Parameter, effect
 from trainer.effects.pupil import kernel_transfer
-from trainer.stages import Sensor
-from trainer.starts import gain_spread, ghost_starts, registration_starts
+from trainer.effects.starts import gain_spread, ghost_starts, registration_starts
+from trainer.prediction.stages import Sensor
 
 
 @effect(

@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from trainer.bench_file import Bench, Camera, Channel, Iris, Panel
-from trainer.capture_writer import CaptureWriter
-from trainer.captures import CaptureSet, read_captures
+from trainer.captures.bench_file import Bench, Camera, Channel, Iris, Panel
+from trainer.captures.capture_set import CaptureSet, read_captures
+from trainer.captures.capture_writer import CaptureWriter
+from trainer.captures.patterns import choose_patterns
 from trainer.effects.definition import Effect
-from trainer.model import Model, Present, absent
-from trainer.patterns import choose_patterns
-from trainer.prediction import counts, light_on_camera, trace
-from trainer.scene import scene_for, stages_for
+from trainer.model.model import Model, Present, absent
+from trainer.prediction.predict import counts, light_on_camera, trace
+from trainer.prediction.scene import scene_for, stages_for
 
 BRIGHTNESS = 0.13  # mean signal, share of full scale
 

@@ -17,7 +17,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from firmware_iface.errors import InputError, nearest
-from runtime.files import whole_file
+from runtime.bundle.whole_files import whole_file
 from trainer.networks.baselines import Pix2Pix, Pix2PixHD, UNet
 from trainer.networks.compact import Compact
 from trainer.networks.published import Generator

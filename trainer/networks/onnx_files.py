@@ -25,7 +25,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from firmware_iface.errors import InputError
-from runtime.bundle import ADAPTERS, APPROXIMATOR, GRADIENT
+from runtime.bundle.bundle_folder import ADAPTERS, APPROXIMATOR, GRADIENT
 from trainer.networks.approximator import Approximator, amplitude
 
 EXPORTED = ("published", "compact")

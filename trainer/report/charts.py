@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from trainer.numbers import number, percent, superscript
+from trainer.formatting import number, percent, superscript
 
 # Colours that stand for the page's own; each is replaced by a CSS value after drawing.
 INK, QUIET, GRID, PAPER = "#010101", "#020202", "#030303", "#070707"

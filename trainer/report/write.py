@@ -9,10 +9,11 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
-from runtime.files import whole_file
-from trainer.model import Model
-from trainer.numbers import listed, number, percent, sentence
-from trainer.report import explained, seen
+from runtime.bundle.whole_files import whole_file
+from trainer.formatting import listed, number, percent, sentence
+from trainer.model.model import Model
+from trainer.report import where_sections as seen
+from trainer.report import why_sections as explained
 
 METHOD = (
     "Every number comes from captures that no fit has seen: excess is the mean squared error beyond the "
@@ -34,7 +35,7 @@ def write_report(
 ) -> None:
     """Write a report; the file appears whole or not at all.
 
-    comparison : trainer.compare.Comparison, or anything with its `as_json()`; `pictures` if it has them
+    comparison : trainer.diagnosis.compare.Comparison, or anything with its `as_json()`; `pictures` if it has them
     diagnosis : an object with `as_json()` (what `diagnose --json` prints, with `thresholds`, `ideal_excess`
         and `sentence` if known), and `probe_pictures`: (stage, title, array of one or two dimensions, unit)
     ladder : steps {"added", "removed", "nrmse", "excess", "indistinguishable_from"}, or what

@@ -19,14 +19,14 @@ import torch
 from torch import Tensor
 
 from firmware_iface.errors import InputError
-from runtime.lightpath import irradiance, panel_phase, pixel_irradiance
-from trainer.captures import Capture, CaptureSet
-from trainer.evidence import Batch, load_batch
-from trainer.export import told_to_display
-from trainer.fit import Predictor
-from trainer.model import Model
-from trainer.prediction import counts, light_path
-from trainer.scene import Scene, Stages, scene_for, stages_of
+from runtime.lightpath.light_path import irradiance, panel_phase, pixel_irradiance
+from trainer.captures.batches import Batch, load_batch
+from trainer.captures.capture_set import Capture, CaptureSet
+from trainer.fitting.gauss_newton import Predictor
+from trainer.model.export import told_to_display
+from trainer.model.model import Model
+from trainer.prediction.predict import counts, light_path
+from trainer.prediction.scene import Scene, Stages, scene_for, stages_of
 
 MOST_COLOURS = 3
 WHITE = 0.999  # quantile of measured irradiance that is called white

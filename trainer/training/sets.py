@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from trainer.captures import CaptureSet
-from trainer.compare import with_gains
-from trainer.evidence import split
-from trainer.model import Model
+from trainer.captures.batches import split
+from trainer.captures.capture_set import CaptureSet
+from trainer.diagnosis.compare import with_gains
+from trainer.model.model import Model
 from trainer.training.pairs import Pairs, pairs_of
 
 Progress = Callable[[float], None]

@@ -19,11 +19,11 @@ import torch
 from torch import Tensor
 
 from firmware_iface.errors import InputError
-from runtime.files import whole_file
+from runtime.bundle.whole_files import whole_file
 from trainer.networks.approximator import Approximator, Architecture, write_approximator
 from trainer.networks.perceptual import Lpips, Perceptual
+from trainer.training.likeness import evaluate
 from trainer.training.losses import Critic, content_loss, matching_loss, picture, where_seen
-from trainer.training.metrics import evaluate
 from trainer.training.pairs import Pairs
 from trainer.training.recipe import Recipe
 

@@ -4,8 +4,8 @@ board = LaserBoard()
 node = attach(board.bus)        # a path to give smbus2.SMBus
 """
 
-from .board import LaserBoard
-from .bus import I2cBus, Message
-from .kernel import attach, detach
+from firmware_iface.virtual.i2c.bus import I2cBus, Message
+from firmware_iface.virtual.i2c.kernel import attach, detach
+from firmware_iface.virtual.i2c.laser_board import LaserBoard
 
 __all__ = ["I2cBus", "LaserBoard", "Message", "attach", "detach"]

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
-from ..faults import Faults
+from firmware_iface.virtual.fault_injection import Faults
 
 GENERAL_CALL = 0x00
 

@@ -12,8 +12,8 @@ import os
 import tempfile
 from typing import Any
 
-from .bus import Message, Transferring, failure
-from .pec import pec
+from firmware_iface.virtual.i2c.bus import Message, Transferring, failure
+from firmware_iface.virtual.i2c.pec import pec
 
 # I2C | SMBUS_EMUL (which has PEC), as <linux/i2c.h> numbers them
 FUNCTIONS = 0x00000001 | 0x0EFF0008

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from .bus import NackError
+from firmware_iface.virtual.i2c.bus import NackError
 
 SUPPLY_V, REFERENCE_V = 5.0, 2.048
 EEPROM_WRITE_S = 0.05

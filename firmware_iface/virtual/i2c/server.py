@@ -11,9 +11,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from .board import LaserBoard
-from .bus import Message, failure
-from .kernel import attach
+from firmware_iface.virtual.i2c.bus import Message, failure
+from firmware_iface.virtual.i2c.kernel import attach
+from firmware_iface.virtual.i2c.laser_board import LaserBoard
 
 TICK_S = 0.002
 PACKET = 65536

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from ..description import CameraDescription
-from .model import Expose
+from firmware_iface.virtual.description import CameraDescription
+from firmware_iface.virtual.oak.oak_model import Expose
 
 BITS = 10
 

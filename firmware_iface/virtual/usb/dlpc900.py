@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..faults import Faults
-from .device import (
+from firmware_iface.virtual.fault_injection import Faults
+from firmware_iface.virtual.usb.device import (
     INTERRUPT,
     Nak,
     Stall,

@@ -10,11 +10,11 @@ import numpy as np
 
 from firmware_iface.virtual import BenchDescription, VirtualHeadset
 from firmware_iface.virtual.defects import make_defect
-from runtime.bundle import INITIALISER, write_bundle
-from runtime.calibrated import pack_light_paths
-from runtime.calibration.fit import Base
-from runtime.devices import Devices
-from runtime.legendre import edge_to_edge
+from runtime.bundle.bundle_folder import INITIALISER, write_bundle
+from runtime.bundle.light_path_arrays import pack_light_paths
+from runtime.calibration.drift_fit import Base
+from runtime.headset.open_devices import Devices
+from runtime.lightpath.legendre import edge_to_edge
 from tests.runtime.benches import ideal_path
 
 SHAPE, DISTANCE_MM, WAVELENGTH_NM = (96, 128), 8.0, 520.0

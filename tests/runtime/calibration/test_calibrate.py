@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_iface.virtual.panel import Drive, beam_amplitude, panel_path_nm
-from runtime.bundle import read_bundle
-from runtime.calibrated import load_light_path
+from firmware_iface.virtual.simulated_panel import Drive, beam_amplitude, panel_path_nm
+from runtime.bundle.bundle_folder import read_bundle
+from runtime.bundle.light_path_arrays import load_light_path
 from runtime.calibration.drift import Drift
 from runtime.cli import main
 from tests.runtime.calibration.drifting import (

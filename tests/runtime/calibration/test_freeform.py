@@ -9,11 +9,11 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from runtime.calibration.drift import Drift, drifted, node_weights
-from runtime.calibration.fit import Base, Estimate, Shot, chi_squared, predicted
-from runtime.calibration.freeform import fit_freeform, nodes_of
-from runtime.calibration.patterns import grains
-from runtime.calibration.view import View, sampler, sampler_and_adjoint
-from runtime.lightpath import LightPath, irradiance, panel_phase
+from runtime.calibration.drift_fit import Base, Estimate, Shot, chi_squared, predicted
+from runtime.calibration.free_form_fit import fit_freeform, nodes_of
+from runtime.calibration.shown_patterns import grains
+from runtime.camera.view import View, sampler, sampler_and_adjoint
+from runtime.lightpath.light_path import LightPath, irradiance, panel_phase
 from tests.runtime.benches import ideal_path, random_path
 from tests.runtime.calibration.drifting import WAVELENGTH_NM, without_tilt
 

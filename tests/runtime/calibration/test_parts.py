@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from firmware_iface.errors import InputError
-from firmware_iface.virtual.panel import Drive
-from runtime.calibration.check import Heldout, complete, verdict
+from firmware_iface.virtual.simulated_panel import Drive
 from runtime.calibration.drift import Drift, drifted, wavefront_maps
-from runtime.calibration.fit import Base, Estimate, Shot, _columns, _Layout, _stepped_views, predicted
-from runtime.calibration.patterns import grains, grating
+from runtime.calibration.drift_fit import Base, Estimate, Shot, _columns, _Layout, _stepped_views, predicted
+from runtime.calibration.held_out_errors import Heldout, complete, verdict
 from runtime.calibration.response import (
     SWEEP,
     Sweep,
@@ -22,9 +21,10 @@ from runtime.calibration.response import (
     measured_sweep,
     phase_of_power,
 )
+from runtime.calibration.shown_patterns import grains, grating
 from runtime.calibration.taking import Taker
-from runtime.calibration.view import View, sampler
-from runtime.lightpath import irradiance, panel_phase, pixel_irradiance
+from runtime.camera.view import View, sampler
+from runtime.lightpath.light_path import irradiance, panel_phase, pixel_irradiance
 from tests.runtime.benches import PITCH, ideal_path, random_path
 from tests.runtime.calibration.drifting import WAVELENGTH_NM, base, devices, drifted_bench, headset
 

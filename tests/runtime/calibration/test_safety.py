@@ -10,8 +10,8 @@ import pytest
 
 from firmware_iface.errors import InputError
 from firmware_iface.virtual import VirtualHeadset
-from runtime.bundle import read_bundle
-from runtime.calibration.run import calibrate
+from runtime.bundle.bundle_folder import read_bundle
+from runtime.calibration.calibrate import calibrate
 from tests.runtime.calibration.drifting import SHAPE, drifted_bench, headset, ideal_bundle, opened
 
 

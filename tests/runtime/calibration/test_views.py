@@ -12,17 +12,17 @@ from scipy.ndimage import gaussian_filter
 
 from firmware_iface.virtual import BenchDescription, VirtualHeadset
 from firmware_iface.virtual.description import ChannelDescription
-from firmware_iface.virtual.panel import panel_path_nm
-from runtime.bundle import Bundle, read_bundle, write_bundle
-from runtime.calibrated import load_light_path, pack_light_paths
+from firmware_iface.virtual.simulated_panel import panel_path_nm
+from runtime.bundle.bundle_folder import Bundle, read_bundle, write_bundle
+from runtime.bundle.light_path_arrays import load_light_path, pack_light_paths
+from runtime.calibration.calibrate import calibrate
 from runtime.calibration.command import sentence_of
-from runtime.calibration.numbers import numbers
 from runtime.calibration.replacing import replace_bundle
-from runtime.calibration.run import calibrate
-from runtime.calibration.view import View, on_panel, sampler, view_of
-from runtime.legendre import edge_to_edge
-from runtime.lightpath import LightPath
-from runtime.registration import panel_points
+from runtime.calibration.summary import numbers
+from runtime.camera.registration import panel_points
+from runtime.camera.view import View, on_panel, sampler, view_of
+from runtime.lightpath.legendre import edge_to_edge
+from runtime.lightpath.light_path import LightPath
 from tests.runtime.benches import ideal_path
 from tests.runtime.calibration.drifting import (
     DISTANCE_MM,

@@ -15,14 +15,14 @@ from PIL import Image
 from firmware_iface.errors import InputError
 from firmware_iface.virtual import BenchDescription, VirtualHeadset
 from firmware_iface.virtual.defects import make_defect
-from runtime.approximator import Approximator
-from runtime.bundle import ADAPTERS, APPROXIMATOR, GRADIENT, write_bundle
-from runtime.calibrated import pack_light_paths
-from runtime.calibration.view import View
+from runtime.bundle.bundle_folder import ADAPTERS, APPROXIMATOR, GRADIENT, write_bundle
+from runtime.bundle.light_path_arrays import pack_light_paths
+from runtime.camera.view import View
 from runtime.cli import main
-from runtime.lightpath import LightPath
-from runtime.refinement.eye import Eye
+from runtime.lightpath.light_path import LightPath
+from runtime.networks.onnx_approximator import Approximator
 from runtime.refinement.refine import HOLD_OUT, Refinement, _to_step, refine
+from runtime.refinement.viewer import Eye
 from runtime.solver import solve
 from tests.runtime.benches import converted, ideal_path, scene
 
@@ -169,7 +169,7 @@ def test_where_camera_and_model_agree_the_gradient_is_the_models(
     approximator: Approximator, path: LightPath, start: np.ndarray
 ) -> None:
     """The captured picture takes the place of the simulated one: given the simulated one, it is plain descent."""
-    from runtime.lightpath import irradiance, irradiance_and_pullback, pixel_irradiance
+    from runtime.lightpath.light_path import irradiance, irradiance_and_pullback, pixel_irradiance
     from runtime.refinement.refine import STEP, _amplitude, _matched
 
     target = scene(SHAPE)[None]
@@ -254,7 +254,7 @@ def test_three_colours_take_turns_and_each_is_refined(
     torch = pytest.importorskip("torch")
     from firmware_iface import virtual
     from firmware_iface.virtual.description import ChannelDescription
-    from runtime import ideal
+    from runtime.lightpath import ideal_path as ideal
     from runtime.solver import quality
     from trainer.networks.approximator import Approximator as Network
     from trainer.networks.approximator import Architecture

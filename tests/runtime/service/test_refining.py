@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from firmware_iface.virtual.served import Remote
-from runtime.bundle import read_bundle, write_bundle
+from runtime.bundle.bundle_folder import read_bundle, write_bundle
 from runtime.service.client import Client, RefusedError
 from runtime.service.protocol import Code, Lasers, Part, Shown
 from tests.campaigns.headset import SHAPE, connected, hardware, picture, served, write_configuration

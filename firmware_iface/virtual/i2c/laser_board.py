@@ -1,0 +1,194 @@
+"""The laser board: the parts on their bus, wired to three laser diodes, as light comes out of them.
+
+DAC -> limiter of the safety controller -> laser-diode controller (50 mA/V, enabled by the gate and by a pin of the
+expander) -> diode -> photodiode -> converter, whose ALERT goes back to the safety controller.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from firmware_iface.virtual.fault_injection import Faults
+from firmware_iface.virtual.i2c.ads1115 import Ads1115
+from firmware_iface.virtual.i2c.bus import I2cBus
+from firmware_iface.virtual.i2c.mcp4728 import Mcp4728
+from firmware_iface.virtual.i2c.mcp23008 import Mcp23008
+from firmware_iface.virtual.i2c.safety_controller import SafetyController
+from firmware_iface.virtual.i2c.tmp117 import Tmp117
+
+CONTROLLER_MA_PER_V = 50.0
+BUILT_FOR = ((15000, 13000, 9000), (13000, 13000, 8000), (9000, 13000, 6000))
+KEY_PIN, INTERLOCK_PIN, ALERT_PIN = 4, 5, 6
+
+
+@dataclass
+class Diode:
+    """One laser: what it emits at the exit pupil, and what its photodiode makes of that.
+
+    offset_ma : what the set-point knob of its controller adds; should be 0
+    efficiency : a factor on what it emits, for ageing and faults
+    """
+
+    name: str
+    threshold_ma: float
+    slope_uw_per_ma: float
+    photodiode_v_per_uw: float
+    offset_ma: float = 0.0
+    efficiency: float = 1.0
+
+    def power_uw(self, current_ma: float) -> float:
+        """Light at a current."""
+        return self.efficiency * self.slope_uw_per_ma * max(0.0, current_ma - self.threshold_ma)
+
+
+def diodes() -> list[Diode]:
+    """The three that the board is built with: 120, 100 and 15 µW at 1.5, 1.3 and 0.9 V."""
+    return [
+        Diode("red", 45.0, 4.0, 1 / 120),
+        Diode("green", 40.0, 4.0, 1 / 100),
+        Diode("blue", 30.0, 1.0, 1 / 15),
+    ]
+
+
+class LaserBoard:
+    """The board, powered on: dark.
+
+    clock : seconds; tests give their own
+    emission : told (time s, {laser: µW}) whenever the light changes
+    faults : script of the bus
+
+    Attributes: bus, dac, expander, converter, thermometer, controller (the models), diodes, celsius.
+    """
+
+    def __init__(
+        self,
+        clock: Callable[[], float] = time.monotonic,
+        emission: Callable[[float, dict[str, float]], None] = lambda time_s, power_uw: None,
+        faults: Faults | None = None,
+    ) -> None:
+        self._clock, self._emission = clock, emission
+        self.bus = I2cBus(self.settle, faults)
+        self._key = self._interlock = False
+        self._celsius = 25.0
+        self._photodiode_broken = [False] * 3
+        self.diodes = diodes()
+        self._emitted = dict.fromkeys((d.name for d in self.diodes), 0.0)
+        self.dac = Mcp4728(clock)
+        self.expander = Mcp23008(self._pins)
+        self.converter = Ads1115(clock, lambda pin: self.photodiode_v(pin) if pin < 3 else 0.0)
+        self.thermometer = Tmp117(lambda: self._celsius)
+        self.controller = SafetyController(clock, self, BUILT_FOR)
+        self.bus.parts = {
+            0x20: self.expander,
+            0x36: self.controller,
+            0x48: self.converter,
+            0x49: self.thermometer,
+            0x60: self.dac,
+        }
+
+    def power_cycle(self) -> None:
+        """Off and on again: every part in its power-on state, the DAC as its EEPROM says."""
+        with self.bus.lock:
+            self._power_on()
+        self.settle()
+
+    def _power_on(self) -> None:
+        for part in (self.dac, self.expander, self.converter, self.thermometer, self.controller):
+            part.power_on()
+
+    def settle(self) -> None:
+        """Let every part do what is due by now, and tell of a change of light."""
+        with self.bus.lock:
+            if self.bus.faults.standing("unplug"):
+                self._power_on()
+            self.thermometer.settle()
+            self.controller.settle()
+            self.converter.settle()  # after the limiter has come this far
+            self.controller.settle()  # and ALERT with it
+            emitted = {d.name: self.power_uw(k) for k, d in enumerate(self.diodes)}
+            if emitted == self._emitted:
+                return
+            self._emitted = emitted
+        self._emission(self._clock(), dict(emitted))
+
+    @property
+    def emitted_uw(self) -> dict[str, float]:
+        """Light now, µW at the exit pupil, by laser."""
+        self.settle()
+        return dict(self._emitted)
+
+    def power_uw(self, laser: int) -> float:
+        """Light of one laser, 0 to 2."""
+        enabled = self.expander.registers[0] >> laser & 1 == 0 and self.expander.pins() >> laser & 1
+        if not (self.controller.gate and enabled):
+            return 0.0
+        diode = self.diodes[laser]
+        return diode.power_uw(CONTROLLER_MA_PER_V * self.controller.output_v(laser) + diode.offset_ma)
+
+    # --- what happens to the board
+
+    @property
+    def key(self) -> bool:
+        """The key switch."""
+        return self._key
+
+    @key.setter
+    def key(self, on: bool) -> None:
+        self.settle()
+        self._key = on
+        self.settle()
+
+    @property
+    def interlock(self) -> bool:
+        """Whether the interlock loop is closed."""
+        return self._interlock
+
+    @interlock.setter
+    def interlock(self, closed: bool) -> None:
+        self.settle()
+        self._interlock = closed
+        self.settle()
+
+    @property
+    def celsius(self) -> float:
+        """Temperature of the lasers' heat sink."""
+        return self._celsius
+
+    @celsius.setter
+    def celsius(self, value: float) -> None:
+        self.settle()
+        self._celsius = value
+        self.settle()
+
+    def break_photodiode(self, laser: int, broken: bool = True) -> None:
+        """Cut (or mend) a photodiode's wire: it then shows no light."""
+        self.settle()
+        self._photodiode_broken[laser] = broken
+        self.settle()
+
+    # --- what the safety controller's and the expander's pins see
+
+    def requested_v(self, laser: int) -> float:
+        """Voltage from the DAC."""
+        return self.dac.volts(laser)
+
+    def photodiode_v(self, laser: int) -> float:
+        """Voltage from a photodiode."""
+        if self._photodiode_broken[laser]:
+            return 0.0
+        return self.power_uw(laser) * self.diodes[laser].photodiode_v_per_uw
+
+    def hot(self) -> bool:
+        """The thermometer's ALERT."""
+        return self.thermometer.alert
+
+    def over_power(self) -> bool:
+        """The converter's ALERT."""
+        return self.converter.alert
+
+    def _pins(self) -> int:
+        return (
+            self._key << KEY_PIN | self._interlock << INTERLOCK_PIN | (not self.converter.alert) << ALERT_PIN
+        )

@@ -1,0 +1,210 @@
+"""A model of the panel board, written from firmware_iface/panel/PROTOCOL.md alone: bytes in, bytes out.
+
+It shares no code with the driver, so that a mistake in one shows against the other.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+import zlib
+from collections import deque
+from collections.abc import Callable
+from typing import NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_iface.virtual.fault_injection import Faults
+from firmware_iface.virtual.usb.device import (
+    BULK,
+    Nak,
+    Stall,
+    UsbModel,
+    configuration_descriptor,
+    device_descriptor,
+    endpoint_descriptor,
+    interface_descriptor,
+)
+
+PACKET = 512
+EMPTY, FILLING, COMPLETE, PENDING = range(4)
+DARK, SHOW, TEST = range(3)
+
+
+def _sealed(body: bytes) -> bytes:
+    return body + zlib.crc32(body).to_bytes(4, "little")
+
+
+class BoardModel(UsbModel):
+    """The board and the panel behind it.
+
+    shape : (H, W), pixels
+    serial : serial number
+    faults : see UsbModel
+    clock : seconds, rising
+
+    Attributes: gray (what the panel shows now), shown (sequence and CRC-32 of the frames displayed, the
+    newest last, up to 4096), fault_bits and temperature_c (what STATUS reports).
+    """
+
+    def __init__(
+        self,
+        shape: tuple[int, int] = (240, 320),
+        serial: str = "HL0001",
+        faults: Faults | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.shape = shape
+        self.shown: deque[tuple[int, int]] = deque(maxlen=4096)
+        self.fault_bits, self.temperature_c = 0, 31.25
+        self._clock = clock
+        self._started = clock()
+        super().__init__(
+            device_descriptor(0x1209, 0x0001),
+            configuration_descriptor(
+                interface_descriptor(1, 0xFF, 0x48, 1), endpoint_descriptor(0x01, BULK, PACKET)
+            ),
+            ("hololoop", "panel board", serial),
+            faults,
+        )
+        self.on_reset()
+
+    @property
+    def gray(self) -> NDArray[np.uint8]:
+        """Gray levels on the panel, uint8 [H, W]; gray 0 without power."""
+        with self._lock:
+            if not self.present or self._mode == DARK:
+                return np.zeros(self.shape, np.uint8)
+            if self._mode == TEST:
+                row, column = np.indices(self.shape)
+                return ((row // 8 + column // 8) % 2 * 128).astype(np.uint8)
+            self._run()
+            return np.frombuffer(self._front, np.uint8).reshape(self.shape).copy()
+
+    def on_reset(self) -> None:
+        self._mode, self._period_us, self._delay_us, self._width_us = DARK, 16667, 0, 0
+        self._front = bytes(self.shape[0] * self.shape[1])
+        self._back = bytearray()
+        self._state, self._refusal = EMPTY, 0
+        self._header: tuple[int, int, int] | None = None  # sequence, bytes, CRC of the pixels
+        self._received = self._committed = self._displayed = 0
+        self._count = self._rejected = 0
+        self._epoch = self._clock()
+        self._due = 0
+
+    def on_control(self, kind: int, request: int, value: int, index: int, data: bytes | int) -> bytes:
+        self._run()
+        match kind, request, data:
+            case 0xC0, 1, int():
+                height, width = self.shape
+                return _sealed(
+                    struct.pack("<4sHHHBBIIIHH", b"HLPB", 1, width, height, 8, 0, 8000, 1000, 100_000, 4, 1)
+                )
+            case 0x40, 2, b"":
+                if value > TEST:
+                    self._refuse(7)
+                self._mode = value
+            case 0xC0, 3, int():
+                return _sealed(struct.pack("<III", self._period_us, self._delay_us, self._width_us))
+            case 0x40, 3, bytes():
+                period, delay, width = struct.unpack("<III", self._opened(data, 12))
+                if not 1000 <= period <= 100_000 or delay + width > period:
+                    self._refuse(7)
+                self._period_us, self._delay_us, self._width_us = period, delay, width
+                self._epoch = self._clock()
+                self._due = 1 if self._state == PENDING else 0
+            case 0xC0, 4, int():
+                return self._status()
+            case 0x40, 5, bytes():
+                sequence, crc = struct.unpack("<II", self._opened(data, 8))
+                held = self._header and (self._header[0], self._header[2])
+                if self._state != COMPLETE or held != (sequence, crc):
+                    self._refuse(6)
+                self._state, self._committed, self._due = PENDING, sequence, self._periods() + 1
+            case 0x40, 6, b"":
+                if self._state != PENDING:
+                    self._state, self._header = EMPTY, None
+                self._refusal = 0
+            case _:
+                self._refuse(1)
+        return b""
+
+    def on_write(self, endpoint: int, data: bytes) -> None:
+        self._run()
+        if self._state == PENDING:
+            raise Nak
+        short = len(data) % PACKET > 0
+        if self._state != FILLING:
+            self._begin(data)
+            data = data[24:]
+        self._back += data
+        assert self._header is not None
+        _, length, crc = self._header
+        if len(self._back) > length or (short and len(self._back) < length):
+            self._reject(4)
+        if len(self._back) == length:
+            if zlib.crc32(self._back) != crc:
+                self._reject(5)
+            self._state, self._received = COMPLETE, self._header[0]
+
+    def _begin(self, data: bytes) -> None:
+        self._back.clear()
+        if len(data) < 24:
+            self._reject(3)
+        magic, sequence, width, height, length, pixels_crc, crc = struct.unpack_from("<4sIHHIII", data)
+        good = magic == b"HLPF" and crc == zlib.crc32(data[:20])
+        if not good or (height, width) != self.shape or length != height * width or not sequence:
+            self._reject(3)
+        self._state, self._header = FILLING, (sequence, length, pixels_crc)
+
+    def _run(self) -> None:
+        """Let the periods pass that the clock says have passed."""
+        if self._state == PENDING and self._periods() >= self._due:
+            assert self._header is not None
+            self._front = bytes(self._back)
+            self._displayed = self._committed
+            self._count += 1
+            self.shown.append((self._displayed, zlib.crc32(self._front)))
+            self._state, self._header = EMPTY, None
+
+    def _periods(self) -> int:
+        return int((self._clock() - self._epoch) * 1e6 / self._period_us)
+
+    def _status(self) -> bytes:
+        since = int((self._clock() - self._epoch) * 1e6) % self._period_us
+        return _sealed(
+            struct.pack(
+                "<BBBBIIIIIIIhH",
+                self._mode,
+                self._state,
+                self._refusal,
+                self.fault_bits,
+                self._received,
+                self._committed,
+                self._displayed,
+                self._count,
+                self._rejected,
+                int((self._clock() - self._started) * 1e6 / self._period_us),
+                since,
+                round(self.temperature_c * 100),
+                0,
+            )
+        )
+
+    def _opened(self, data: bytes, size: int) -> bytes:
+        if len(data) != size + 4:
+            self._refuse(1)
+        if zlib.crc32(data[:size]) != int.from_bytes(data[size:], "little"):
+            self._refuse(2)
+        return data[:size]
+
+    def _refuse(self, reason: int) -> NoReturn:
+        self._refusal = reason
+        raise Stall
+
+    def _reject(self, reason: int) -> NoReturn:
+        self._rejected += 1
+        self._state, self._header = EMPTY, None
+        self._back.clear()
+        self._refuse(reason)

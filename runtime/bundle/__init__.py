@@ -1,0 +1,1 @@
+"""The bundle: a calibrated light path as the trainer hands it to the headset."""

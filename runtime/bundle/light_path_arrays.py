@@ -1,0 +1,241 @@
+"""Light paths in a bundle: how each colour and plane's arrays are named, written and read back.
+
+`bundle.json`'s description holds, besides the panel, one record a colour and plane:
+
+    {"channel", "plane_mm", "wavelength_nm",
+     "grid": {"shape", "padded", "margin", "band", "pitch_m"},
+     "arrays": {field of LightPath: name of an array}}
+
+Fields that are None in a LightPath are not listed; `crosstalk` is two arrays, crosstalk_rows and
+crosstalk_columns. Arrays that several planes or colours share are stored once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from firmware_iface.errors import InputError, nearest
+from runtime.bundle.bundle_folder import ARRAYS, MANIFEST, Bundle
+from runtime.lightpath.light_path import FINE, Grid, LightPath
+
+COMPLEX, REAL = np.dtype(np.complex64), np.dtype(np.float32)
+NEEDED = ("response", "source", "transfers", "weights", "aperture")
+OPTIONAL = ("gain", "leak", "crosstalk_rows", "crosstalk_columns", "irradiance_filter")
+TYPES = {
+    "source": COMPLEX,
+    "leak": COMPLEX,
+    "transfers": COMPLEX,
+}  # the filter is either; all others are real
+LARGEST = 1 << 15  # samples an axis
+
+Record = dict[str, Any]
+
+
+def pack_light_paths(
+    paths: Iterable[tuple[str, float, float, LightPath]],
+) -> tuple[list[Record], dict[str, np.ndarray]]:
+    """Records and arrays of light paths, given as (channel, plane in mm, wavelength in nm, path) on NumPy
+    arrays.
+
+    Arrays become float32 and complex64; equal ones are kept once, under the name of the first that has them.
+    """
+    records: list[Record] = []
+    arrays: dict[str, np.ndarray] = {}
+    known: dict[tuple[str, bytes], str] = {}
+    for channel, plane_mm, wavelength_nm, path in paths:
+        names = {}
+        for field, array in _fields(path).items():
+            array = np.ascontiguousarray(array, COMPLEX if np.iscomplexobj(array) else REAL)
+            key = (f"{field}{array.shape}{array.dtype}", array.tobytes())
+            if key not in known:
+                known[key] = f"{field}.{channel}.{plane_mm:g}mm"
+                arrays[known[key]] = array
+            names[field] = known[key]
+        grid = path.grid
+        records.append(
+            {
+                "channel": channel,
+                "plane_mm": float(plane_mm),
+                "wavelength_nm": float(wavelength_nm),
+                "grid": {
+                    "shape": list(grid.shape),
+                    "padded": list(grid.padded),
+                    "margin": grid.margin,
+                    "band": list(grid.band),
+                    "pitch_m": grid.pitch,
+                },
+                "arrays": names,
+            }
+        )
+    return records, arrays
+
+
+def _fields(path: LightPath) -> dict[str, np.ndarray]:
+    """The arrays of a light path that are there, by field."""
+    fields = {
+        "response": path.response,
+        "source": path.source,
+        "transfers": path.transfers,
+        "weights": path.weights,
+        "aperture": np.array([float(side) for side in path.aperture]),
+        "gain": path.gain,
+        "leak": path.leak,
+        "irradiance_filter": path.irradiance_filter,
+    }
+    if path.crosstalk is not None:
+        fields["crosstalk_rows"], fields["crosstalk_columns"] = path.crosstalk
+    return {name: array for name, array in fields.items() if array is not None}
+
+
+def bundle_paths(bundle: Bundle) -> list[Record]:
+    """The records of all light paths in a bundle. Raises InputError where there are none."""
+    records = bundle.description.get("paths")
+    if not isinstance(records, list) or not records or not all(isinstance(r, dict) for r in records):
+        raise InputError(f"{MANIFEST} describes no light paths: export the bundle again")
+    for number, record in enumerate(records):
+        channel, plane = record.get("channel"), record.get("plane_mm")
+        if not isinstance(channel, str) or not _is_number(plane):
+            raise InputError(
+                f"light path {number} of {MANIFEST} has no channel or no plane_mm: export it again"
+            )
+    return records
+
+
+def bundle_channels(bundle: Bundle) -> list[str]:
+    """Names of a bundle's colours, in its own order."""
+    return list(dict.fromkeys(r["channel"] for r in bundle_paths(bundle)))
+
+
+def load_light_path(bundle: Bundle, channel: str | None = None, plane_mm: float | None = None) -> LightPath:
+    """The light path of one colour and plane of a bundle, on NumPy arrays.
+
+    channel: may be left out where the bundle has one colour. plane_mm: where it is left out, the bench's own
+    distance if the bundle has it, else the colour's first plane. Raises InputError for a colour or plane that
+    the bundle lacks, and where its arrays do not fit together.
+    """
+    record = _find(bundle, channel, plane_mm)
+    where = f"light path {record['channel']}, {record['plane_mm']:g} mm"
+    grid = _grid(record.get("grid"), where)
+    names = record.get("arrays")
+    if not isinstance(names, Mapping):
+        raise InputError(f"{MANIFEST}: {where} lists no arrays: export the bundle again")
+    for field in names:
+        if field not in NEEDED + OPTIONAL:
+            raise InputError(f"{MANIFEST}: {where} has an array '{field}' that this release does not know")
+    arrays = {field: _array(bundle, names.get(field), field, where) for field in NEEDED + OPTIONAL}
+    _check_shapes(arrays, grid, where)
+    rows, columns = arrays["crosstalk_rows"], arrays["crosstalk_columns"]
+    return LightPath(
+        grid=grid,
+        response=arrays["response"],
+        source=arrays["source"],
+        transfers=arrays["transfers"],
+        weights=arrays["weights"],
+        gain=arrays["gain"],
+        crosstalk=None if rows is None or columns is None else (rows, columns),
+        leak=arrays["leak"],
+        aperture=(arrays["aperture"][0], arrays["aperture"][1]),  # type: ignore[index]
+        irradiance_filter=arrays["irradiance_filter"],
+    )
+
+
+def plane_of(bundle: Bundle, channel: str | None = None, plane_mm: float | None = None) -> float:
+    """The plane (mm) of what `load_light_path` gives for the same arguments. Raises InputError as it does."""
+    return float(_find(bundle, channel, plane_mm)["plane_mm"])
+
+
+def _find(bundle: Bundle, channel: str | None, plane_mm: float | None) -> Record:
+    records, channels = bundle_paths(bundle), bundle_channels(bundle)
+    if channel is None:
+        if len(channels) > 1:
+            raise InputError(f"the bundle has several channels: choose one of {', '.join(channels)}")
+        channel = channels[0]
+    if channel not in channels:
+        raise InputError(f"the bundle has no channel '{channel}': {nearest(channel, channels)}")
+    here = [r for r in records if r["channel"] == channel]
+    if plane_mm is None:
+        own: Any = bundle.description.get("distance_mm")
+        return next((r for r in here if _is_number(own) and _same(r["plane_mm"], own)), here[0])
+    for record in here:
+        if _same(record["plane_mm"], plane_mm):
+            return record
+    planes = ", ".join(f"{r['plane_mm']:g}" for r in here)
+    raise InputError(
+        f"the bundle has no plane at {plane_mm:g} mm for {channel}: use one of {planes}, or export it"
+    )
+
+
+def _same(a: float, b: float) -> bool:
+    return abs(a - b) <= 1e-6 * max(1.0, abs(a))
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _grid(given: Any, where: str) -> Grid:
+    wrong = InputError(f"{MANIFEST}: the grid of {where} cannot be computed: export the bundle again")
+    if not isinstance(given, Mapping):
+        raise wrong
+
+    def pair(key: str) -> tuple[int, int]:
+        value = given.get(key)
+        if not isinstance(value, list) or len(value) != 2 or not all(type(n) is int for n in value):
+            raise wrong
+        return value[0], value[1]
+
+    shape, padded, band = pair("shape"), pair("padded"), pair("band")
+    margin: Any = given.get("margin")
+    pitch: Any = given.get("pitch_m")
+    if type(margin) is not int or margin < 0 or not _is_number(pitch) or not 0 < pitch < 1:
+        raise wrong
+    for n, room, edge in zip(shape, padded, band, strict=True):
+        if not (n >= 1 and n + 2 * margin <= room <= LARGEST and 0 <= edge < room):
+            raise wrong
+    return Grid(shape, padded, margin, band, float(pitch))
+
+
+def _array(bundle: Bundle, name: Any, field: str, where: str) -> np.ndarray | None:
+    if name is None:
+        if field in NEEDED:
+            raise InputError(f"{MANIFEST}: {where} has no {field}: export the bundle again")
+        return None
+    if name not in bundle.arrays:
+        raise InputError(f"{ARRAYS} has no array '{name}', which {where} needs: export the bundle again")
+    array = bundle.arrays[name]
+    wanted = {COMPLEX, REAL} if field == "irradiance_filter" else {TYPES.get(field, REAL)}
+    if array.dtype not in wanted:
+        kinds = " or ".join(sorted(str(d) for d in wanted))
+        raise InputError(f"{ARRAYS}: '{name}' is {array.dtype}, and {field} of {where} must be {kinds}")
+    return array
+
+
+def _check_shapes(arrays: Mapping[str, np.ndarray | None], grid: Grid, where: str) -> None:
+    height, width = grid.image_shape
+    response, weights = arrays["response"], arrays["weights"]
+    levels = 256 if response is None else max(2, min(response.size, 256))
+    modes = 1 if weights is None else weights.size
+    shapes: dict[str, tuple[int, ...]] = {
+        "response": (levels,),
+        "weights": (modes,),
+        "aperture": (2,),
+        "source": grid.shape,
+        "gain": grid.shape,
+        "leak": grid.shape,
+        "transfers": (modes, 2 * grid.band[0] + 1, 2 * grid.band[1] + 1),
+        "irradiance_filter": (height, width // 2 + 1),
+    }
+    for field, shape in shapes.items():
+        array = arrays[field]
+        if array is not None and array.shape != shape:
+            raise InputError(f"{ARRAYS}: {field} of {where} has the shape {array.shape}, expected {shape}")
+    for field in ("crosstalk_rows", "crosstalk_columns"):
+        taps = arrays[field]
+        if taps is not None and (taps.ndim != 2 or taps.shape[1] % 2 == 0 or taps.shape[0] > 4 * FINE**2):
+            raise InputError(f"{ARRAYS}: {field} of {where} is not a table [sub-pixels, odd number of taps]")
+    if (arrays["crosstalk_rows"] is None) != (arrays["crosstalk_columns"] is None):
+        raise InputError(f"{MANIFEST}: {where} has crosstalk along one axis only: export the bundle again")

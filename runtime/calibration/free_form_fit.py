@@ -1,0 +1,96 @@
+"""Free-form maps over the panel: what is left of wavefront and beam after the polynomials.
+
+A real panel and its beam have structure as fine as a few pixels. Maps of cubic B-splines with a node every few
+pixels are fitted to the same captures by L-BFGS (Liu and Nocedal 1989), with the light path's own adjoint. A pattern
+has a pixel's worth of evidence a pixel, and a map one number every NODE x NODE pixels, so ten patterns determine it
+some 160 times over; a weak prior holds what no light shows, and few iterations keep the rest from following noise.
+Time and memory grow with pixels alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import minimize
+
+from runtime.calibration.drift import drifted, node_weights
+from runtime.calibration.drift_fit import Base, Estimate, Shot, gain_of, seen_by
+from runtime.camera.view import sampler_and_adjoint
+from runtime.lightpath.light_path import irradiance_and_pullback, panel_phase
+
+NODE = 4  # panel pixels
+MOST = (270, 480)  # nodes: larger panels get coarser maps
+LIKELY_NM, LIKELY_LOG = 30.0, 0.3  # standard deviations of a node, before anything is seen
+ITERATIONS = 30
+MEMORY = 8  # steps that L-BFGS remembers
+
+Progress = Callable[[float], None]
+
+
+def fit_freeform(
+    bases: Mapping[str, Base],
+    shots: Sequence[Shot],
+    start: Estimate,
+    progress: Progress | None = None,
+) -> Estimate:
+    """The estimate with maps of wavefront (one for all colours) and of each colour's beam that explain the shots
+    best, all else held. progress: share done.
+    """
+    grid = next(iter(bases.values())).path.grid
+    rows, columns = (node_weights(n, m) for n, m in zip(grid.shape, nodes_of(grid.shape), strict=True))
+    shape = (rows.shape[1], columns.shape[1])
+    channels = tuple(bases)
+    readers = {g: sampler_and_adjoint(start.view, g) for g in {b.path.grid for b in bases.values()}}
+    even = start.view.evenness().astype(np.float32)
+    done = 0
+
+    def with_maps(vector: np.ndarray) -> Estimate:
+        nm, *logs = vector.reshape(-1, *shape)
+        beams = {c: LIKELY_LOG * v for c, v in zip(channels, logs, strict=True)}
+        return replace(
+            start, drift=replace(start.drift, wavefront_nodes_nm=LIKELY_NM * nm, amplitude_nodes=beams)
+        )
+
+    def cost(vector: np.ndarray) -> tuple[float, np.ndarray]:
+        drift = with_maps(vector).drift
+        total, gradient = float(vector @ vector), 2 * vector.reshape(-1, *shape)
+        paths = {c: drifted(b.path, c, b.wavelength_nm, drift) for c, b in bases.items()}
+        for shot in shots:
+            path, (sample, back) = paths[shot.channel], readers[bases[shot.channel].path.grid]
+            phase = panel_phase(path, shot.gray.astype(np.int64))
+            image, pullback = irradiance_and_pullback(path, phase, factor=True)
+            light = seen_by(start.view, sample, image)
+            gain = gain_of(shot, light)
+            residual = shot.signal - gain * light
+            total += float(np.vdot(shot.weight * residual, residual))
+            slope = (-2 * gain) * shot.weight * residual
+            onto = slope * even + np.float32(start.view.stray * float(slope.mean()))
+            over = pullback(back(onto.astype(np.float32)))
+            turn = 2 * math.pi / bases[shot.channel].wavelength_nm * LIKELY_NM
+            gradient[0] += turn * (rows.T @ over.imag @ columns)
+            gradient[1 + channels.index(shot.channel)] += LIKELY_LOG * (rows.T @ over.real @ columns)
+        return total, gradient.ravel()
+
+    def told(_: np.ndarray) -> None:
+        nonlocal done
+        done += 1
+        if progress:
+            progress(done / ITERATIONS)
+
+    drift, nothing = start.drift, np.zeros(shape)
+    begin = [drift.wavefront_nodes_nm / LIKELY_NM if drift.wavefront_nodes_nm.size else nothing]
+    begin += [drift.amplitude_nodes.get(c, nothing) / LIKELY_LOG for c in channels]
+    found = minimize(
+        cost, np.ravel(begin), jac=True, method="L-BFGS-B", callback=told,
+        options={"maxiter": ITERATIONS, "maxfun": 2 * ITERATIONS, "maxcor": MEMORY, "ftol": 1e-7},
+    )  # fmt: skip
+    return with_maps(found.x)
+
+
+def nodes_of(shape: tuple[int, int]) -> tuple[int, int]:
+    """Nodes of a map over a panel of that shape, (rows, columns)."""
+    rows, columns = (min(-(-n // NODE) + 3, most) for n, most in zip(shape, MOST, strict=True))
+    return rows, columns

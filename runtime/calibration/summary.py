@@ -1,0 +1,82 @@
+"""A self-calibration in numbers: what `calibrate --json` prints and a bundle remembers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from runtime.calibration.calibrate import Calibration
+from runtime.calibration.drift import LOWEST_AMPLITUDE, LOWEST_WAVEFRONT
+from runtime.calibration.held_out_errors import SURE, removed
+from runtime.calibration.response import SWEEP
+from runtime.calibration.shown_patterns import GRAINS, HELD_OUT
+from runtime.lightpath.legendre import edge_to_edge, legendre_maps, legendre_order
+
+
+def numbers(found: Calibration) -> dict[str, Any]:
+    """What was found, as numbers."""
+    drift, view = found.estimate.drift, found.estimate.view
+    shape = next(iter(found.bases.values())).path.grid.shape
+    wavefront = drift.wavefront(shape)
+    shortest = min(b.wavelength_nm for b in found.bases.values())
+    gone, error = removed(found.before, found.after)
+    colours = {}
+    for channel, base in found.bases.items():
+        sweep, was, now = found.sweeps[channel], base.path.response, drift.response[channel]
+        counts, spread = found.counts_per_ms[channel]
+        known = found.known_counts_per_ms.get(channel)
+        terms = np.asarray(drift.log_amplitude[channel])
+        beam = drift.amplitude(channel, shape)
+        colours[channel] = {
+            "wavelength_nm": base.wavelength_nm,
+            "illumination_rms": float(np.log(beam).std()),
+            "illumination_error": _rms_error(found.errors.log_amplitude[channel], shape, LOWEST_AMPLITUDE),
+            "illumination_terms": [float(v) for v in terms],
+            "response_change_rad": float(np.abs((now - now[0]) - (was - was[0])).max()),
+            "response_gain": float((now[-1] - now[0]) / (was[-1] - was[0])),
+            "response_error_rad": float(np.median(sweep.error)),
+            "grating_visibility": float(np.median(sweep.visibility)),
+            "counts_per_ms": counts,
+            "power_change": counts / known - 1 if known else None,
+            "power_spread": spread,
+            "exposure_ms": found.shots[channel].exposure_ms,
+            "picture_psnr_db": {name: psnr for name, (_, psnr) in found.pictures[channel].items()},
+        }
+    return {
+        "verdict": found.verdict,
+        "complete": found.complete,
+        "heldout": {
+            "before": found.before.as_json(),
+            "after": found.after.as_json(),
+            "excess_removed": gone,
+            "ci95": [gone - SURE * error, gone + SURE * error],
+        },
+        "wavefront": {
+            "rms_nm": float(wavefront.std()),
+            "peak_to_valley_nm": float(np.ptp(wavefront)),
+            "error_rms_nm": _rms_error(found.errors.wavefront_nm, shape, LOWEST_WAVEFRONT),
+            "rms_waves": float(wavefront.std()) / shortest,
+            "terms_nm": [float(v) for v in drift.wavefront_nm],
+            "free_form": {
+                "nodes": list(drift.wavefront_nodes_nm.shape) if drift.wavefront_nodes_nm.size else None,
+                "rms_nm": float(replace(drift, wavefront_nm=np.zeros(0)).wavefront(shape).std()),
+            },
+        },
+        "distance_mm": {"value": drift.distance_mm, "error": found.errors.distance_mm},
+        "registration": view.as_json(),
+        "camera_scale": found.camera_scale,
+        "channels": colours,
+        "plane_mm": found.plane_mm,
+        "patterns": {"fitted": len(GRAINS), "gratings": len(SWEEP), "held_out": len(HELD_OUT) + 1, "dots": 1},
+        "captures": found.captures,
+        "seconds": {name: round(value, 2) for name, value in found.seconds.items()},
+    }
+
+
+def _rms_error(errors: np.ndarray, shape: tuple[int, int], lowest: int) -> float:
+    """Root mean square over the panel of a map's standard error, its terms' errors taken as independent."""
+    maps = legendre_maps(*edge_to_edge(shape), legendre_order(len(errors), lowest), lowest)
+    return math.sqrt(float(np.sum(np.asarray(errors) ** 2 * (maps**2).mean((1, 2)))))

@@ -1,0 +1,1 @@
+"""Where the camera looks and how it sees the image plane."""

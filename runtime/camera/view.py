@@ -1,0 +1,213 @@
+"""How the headset's camera sees the image plane: where it looks, how sharply, how evenly.
+
+None of this reaches the light path: it explains the measurement. Positions are (y, x) in panel pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+from scipy.sparse import csr_matrix
+
+from firmware_iface.errors import InputError
+from runtime.bundle.bundle_folder import Bundle
+from runtime.camera.registration import panel_points
+from runtime.lightpath.fft import irfft2, rfft2
+from runtime.lightpath.legendre import edge_to_edge, legendre_maps
+from runtime.lightpath.light_path import FINE, Grid, image_frequencies
+
+SENSITIVITY_ORDER = 4  # of the camera's own fall-off, so that none of it is taken for the beam's
+TERMS = 14  # of that order
+
+Sampler = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera in front of the image plane.
+
+    shape: (h, w), pixels. homography: 9 numbers, row-major, from camera pixels (x, y, 1) to panel pixels.
+    shift_y_px, shift_x_px, rotation_mrad: a rigid motion on the panel after it, about the panel's centre.
+    magnification, aspect, shear, keystone_y, keystone_x: what a homography from dots is still wrong by, relative,
+    at the panel's border. distortion: radial, of the lens: relative, at the panel's corners.
+    blur_y_px2, blur_x_px2: variance of the lens's blur, panel pixels squared. sensitivity: Legendre terms of
+    its logarithm, from order 1 on. stray: light that is added, share of a picture's mean.
+    """
+
+    shape: tuple[int, int]
+    homography: tuple[float, ...] = (1, 0, 0, 0, 1, 0, 0, 0, 1)
+    shift_y_px: float = 0.0
+    shift_x_px: float = 0.0
+    rotation_mrad: float = 0.0
+    magnification: float = 0.0
+    aspect: float = 0.0
+    shear: float = 0.0
+    keystone_y: float = 0.0
+    keystone_x: float = 0.0
+    distortion: float = 0.0
+    blur_y_px2: float = 0.0
+    blur_x_px2: float = 0.0
+    sensitivity: tuple[float, ...] = (0.0,) * TERMS
+    stray: float = 0.0
+
+    def as_json(self) -> dict[str, Any]:
+        """For a bundle's description."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, given: Mapping[str, Any]) -> View:
+        """What `as_json` gave. Raises TypeError or ValueError where it is something else."""
+        values = {f.name: given[f.name] for f in fields(cls) if f.name in given}
+        for name in ("shape", "homography", "sensitivity"):
+            values[name] = tuple(values[name])
+        return cls(**values)
+
+    def evenness(self) -> np.ndarray:
+        """The camera's relative sensitivity, float64 [h, w]."""
+        return np.exp(np.tensordot(np.asarray(self.sensitivity), sensitivity_maps(self.shape), 1))
+
+    def matrix(self, panel: tuple[int, int]) -> np.ndarray:
+        """The homography with the motion: from camera pixels (x, y, 1) to pixels of a panel of that shape."""
+        cy, cx = (panel[0] - 1) / 2, (panel[1] - 1) / 2
+        cos, sin = np.cos(1e-3 * self.rotation_mrad), np.sin(1e-3 * self.rotation_mrad)
+        to_centre, back = np.eye(3), np.eye(3)
+        to_centre[:2, 2], back[:2, 2] = (-cx, -cy), (cx + self.shift_x_px, cy + self.shift_y_px)
+        turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+        m, a, s = self.magnification, self.aspect, self.shear
+        keystone = (2 * self.keystone_x / panel[1], 2 * self.keystone_y / panel[0], 1)
+        stretch = np.array([[1 + m + a, s, 0], [s, 1 + m - a, 0], keystone])
+        return back @ turn @ stretch @ to_centre @ np.asarray(self.homography, float).reshape(3, 3)
+
+    def positions(self, panel: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+        """Where each camera pixel's centre looks on a panel of that shape: (y, x), each float64 [h, w]."""
+        y, x = np.mgrid[: self.shape[0], : self.shape[1]]
+        there = panel_points(self.matrix(panel), np.stack([x.ravel(), y.ravel()], 1))
+        return _bent(there[:, 1].reshape(self.shape), there[:, 0].reshape(self.shape), panel, self.distortion)
+
+
+def view_of(bundle: Bundle) -> View | None:
+    """The camera's view of an earlier calibration, if the bundle holds one."""
+    given = bundle.description.get("camera")
+    if not isinstance(given, Mapping) or "view" not in given:
+        return None
+    try:
+        return View.from_json(given["view"])
+    except (TypeError, ValueError, KeyError) as error:
+        raise InputError(
+            f"the bundle's record of its camera cannot be read: {error}; export it again"
+        ) from None
+
+
+def sensitivity_maps(shape: tuple[int, int]) -> np.ndarray:
+    """The maps that `View.sensitivity` has a term for: float64 [TERMS, h, w]."""
+    return legendre_maps(*edge_to_edge(shape), SENSITIVITY_ORDER)
+
+
+def _bent(
+    y: np.ndarray, x: np.ndarray, panel: tuple[int, int], distortion: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions on a panel after a radial distortion; the opposite distortion takes them back, to first order."""
+    v, u = y - (panel[0] - 1) / 2, x - (panel[1] - 1) / 2
+    by = distortion * (v**2 + u**2) / ((panel[0] / 2) ** 2 + (panel[1] / 2) ** 2)
+    return y + by * v, x + by * u
+
+
+def on_panel(signal: np.ndarray, view: View, shape: tuple[int, int]) -> np.ndarray:
+    """A capture [h, w] on the panel's pixels, float32 [H, W], without stray light and the camera's unevenness."""
+    stray = view.stray / (1 + view.stray) * float(signal.mean())
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    y, x = _bent(rows, columns, shape, -view.distortion)
+    there = panel_points(np.linalg.inv(view.matrix(shape)), np.stack([x.ravel(), y.ravel()], 1))
+    light = ((signal - stray) / view.evenness()).astype(np.float32)
+    return np.asarray(ndimage.map_coordinates(light, (there[:, 1], there[:, 0]), order=3)).reshape(shape)
+
+
+def sampler(view: View, grid: Grid, finer: int = 2) -> Sampler:
+    """The linear map from irradiance on a fine grid [..., *grid.image_shape] to camera pixels [..., h, w].
+
+    Light is integrated over the camera pixel's area, blurred by the lens, and read where the pixel looks, by
+    cubic splines on a grid `finer` times as fine again: 2 to predict; 1 is enough for a direction to go in.
+    Pixels that look beyond the grid read 0.
+    """
+    return sampler_and_adjoint(view, grid, finer)[0]
+
+
+def sampler_and_adjoint(view: View, grid: Grid, finer: int = 2) -> tuple[Sampler, Sampler]:
+    """`sampler`, and its adjoint."""
+    y, x = view.positions(grid.shape)
+    like = np.zeros((), np.float64)
+    fy, fx = image_frequencies(grid, like)
+    fy, fx = fy[:, None] * grid.pitch, fx[None, :] * grid.pitch  # cycles a panel pixel
+    i, j = view.shape[0] // 2, view.shape[1] // 2
+    down = (y[i, j] - y[i - 1, j], x[i, j] - x[i - 1, j])
+    right = (y[i, j] - y[i, j - 1], x[i, j] - x[i, j - 1])
+    transfer = np.sinc(fy * down[0] + fx * down[1]) * np.sinc(fy * right[0] + fx * right[1])
+    transfer *= np.exp(-2 * np.pi**2 * (view.blur_y_px2 * fy**2 + view.blur_x_px2 * fx**2))
+    samples = FINE * finer
+    # a cubic B-spline's own transfer, divided out, so that the spline runs through the samples
+    for f in (fy, fx):
+        transfer = transfer * (3 / (2 + np.cos(2 * np.pi * f / samples)))
+    transfer[grid.image_shape[0] // 2], transfer[:, -1] = 0, 0  # the highest frequency has no sign of its own
+    transfer = transfer.astype(np.float32)
+    height, width = (finer * n for n in grid.image_shape)
+    weights = _spline(samples * (y + grid.margin), samples * (x + grid.margin), (height, width))
+
+    def sampled(image: np.ndarray) -> np.ndarray:
+        spectrum = rfft2(image) * transfer
+        if finer > 1:
+            spectrum = _widened(spectrum, image.shape[-2], (height, width)) * finer**2
+        fine = irfft2(spectrum, (height, width))
+        flat = fine.reshape(-1, height * width)
+        seen = np.stack([weights @ one for one in flat])
+        return seen.reshape(*image.shape[:-2], *view.shape)
+
+    def back(light: np.ndarray) -> np.ndarray:
+        flat = light.reshape(-1, weights.shape[0])
+        fine = np.stack([weights.T @ one for one in flat]).reshape(*light.shape[:-2], height, width)
+        return irfft2(_narrowed(rfft2(fine), grid.image_shape) * transfer, grid.image_shape)
+
+    return sampled, back
+
+
+def _widened(spectrum: np.ndarray, rows: int, shape: tuple[int, int]) -> np.ndarray:
+    """A spectrum as from `rfft2` with zeros for the frequencies of a finer grid."""
+    half = rows // 2
+    wide = np.zeros((*spectrum.shape[:-2], shape[0], shape[1] // 2 + 1), spectrum.dtype)
+    wide[..., :half, : spectrum.shape[-1]] = spectrum[..., :half, :]
+    wide[..., half - rows :, : spectrum.shape[-1]] = spectrum[..., half:, :]
+    return wide
+
+
+def _narrowed(spectrum: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """The frequencies that a coarser grid has, of a spectrum as from `rfft2`: adjoint of `_widened`."""
+    rows, columns = shape[0], shape[1] // 2 + 1
+    half = rows // 2
+    return np.concatenate([spectrum[..., :half, :columns], spectrum[..., half - rows :, :columns]], axis=-2)
+
+
+def _spline(y: np.ndarray, x: np.ndarray, shape: tuple[int, int]) -> csr_matrix:
+    """Cubic B-spline weights of samples [shape] at positions y, x [h, w]: sparse [h w, samples]."""
+    (rows, wy), (columns, wx) = _taps(y.ravel()), _taps(x.ravel())
+    inside = (rows[0] >= 0) & (rows[3] < shape[0]) & (columns[0] >= 0) & (columns[3] < shape[1])
+    index = np.clip(rows, 0, shape[0] - 1)[:, None] * shape[1] + np.clip(columns, 0, shape[1] - 1)[None, :]
+    weight = wy[:, None] * wx[None, :] * inside
+    count = y.size
+    starts = 16 * np.arange(count + 1)
+    flat = (
+        weight.reshape(16, count).T.ravel().astype(np.float32),
+        index.reshape(16, count).T.ravel(),
+        starts,
+    )
+    return csr_matrix(flat, shape=(count, shape[0] * shape[1]))
+
+
+def _taps(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Indices [4, n] and weights [4, n] of the cubic B-splines that reach a position."""
+    whole = np.floor(position)
+    t = position - whole
+    weights = [(1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3]
+    return whole.astype(np.int64) + np.arange(-1, 3)[:, None], np.stack(weights) / 6

@@ -1,0 +1,1 @@
+"""The devices of a headset, opened by name."""

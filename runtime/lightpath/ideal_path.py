@@ -1,0 +1,46 @@
+"""The light path of a perfect bench: a full turn of phase, a uniform beam, a square iris, free space."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from runtime.lightpath.light_path import LightPath, band_frequencies, grid_for
+from runtime.lightpath.propagation import Aperture, band_limit, check_sampling, transfer_function
+
+
+def ideal_path(
+    shape: tuple[int, int], pitch: float, wavelength: float, distance: float, half_width: float
+) -> LightPath:
+    """A perfect panel [H, W] of 256 levels, in double precision; lengths in metres.
+
+    half_width: the iris's, as a share of the panel's band. Raises InputError where the sampling does not hold.
+    """
+    grid = grid_for(shape, pitch, wavelength, distance, half_width)
+    edge = half_width / (2 * pitch) * (1 + 1e-9)
+    check_sampling("angular_spectrum", Aperture(shape, grid.padded, pitch), wavelength, distance, edge)
+    fy, fx = band_frequencies(grid, np.zeros((), np.float64))
+    limits = tuple(band_limit(wavelength, distance, n * pitch) for n in grid.padded)
+    passed = (np.abs(fy)[:, None] <= edge) & (np.abs(fx)[None, :] <= edge)
+    transfer = transfer_function(
+        fy[:, None], fx[None, :], wavelength, distance, (limits[0], limits[1]), "angular_spectrum"
+    )
+    return LightPath(
+        grid=grid,
+        response=2 * math.pi * np.arange(256) / 256,
+        source=np.ones(shape, np.complex128),
+        transfers=(passed * transfer)[None],
+        weights=np.ones(1),
+    )
+
+
+def single(path: LightPath) -> LightPath:
+    """An ideal path in single precision, as a bundle holds them."""
+    return LightPath(
+        path.grid,
+        path.response.astype(np.float32),
+        path.source.astype(np.complex64),
+        path.transfers.astype(np.complex64),
+        path.weights.astype(np.float32),
+    )

@@ -1,0 +1,152 @@
+"""The aberration approximator D: irradiance that the optics predict to irradiance that is seen (seed eq. 13).
+
+It comes in a bundle as two networks in ONNX: `approximator.onnx`, irradiance to corrected, and
+`approximator_gradient.onnx`, irradiance and target to a loss and its gradient over irradiance, with the
+weights that may be refined on the headset as further inputs. All are [1, C, H, W], float32, irradiance with a
+mean of about 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import safetensors.numpy
+from safetensors import SafetensorError
+
+from firmware_iface.errors import InputError
+from runtime.bundle.bundle_folder import ADAPTERS, APPROXIMATOR, GRADIENT, Bundle
+from runtime.networks.onnx_session import Session
+
+CORRECTIONS = 2  # of a target that is pre-distorted
+EPSILON = 1e-3  # under the square roots of the loss that is in the gradient's network
+
+
+class Approximator:
+    """D for pictures of one size, shape (C, H, W).
+
+    irradiance, target, corrected, slope: its arrays, float32 [C, H, W], which callers fill and read in place.
+    adapters: weights by the name of their input. Raises InputError for networks that do not fit.
+    """
+
+    def __init__(
+        self,
+        shape: tuple[int, int, int],
+        model: bytes,
+        gradient: bytes | None = None,
+        adapters: Mapping[str, np.ndarray] | None = None,
+    ) -> None:
+        self.shape = shape
+        whole = (1, *shape)
+        self._irradiance, self._target, self._corrected, self._slope = (
+            np.zeros(whole, np.float32) for _ in range(4)
+        )
+        self.irradiance, self.target, self.corrected, self.slope = (
+            a[0] for a in (self._irradiance, self._target, self._corrected, self._slope)
+        )
+        self._loss = np.zeros((), np.float32)
+        self._forward = Session(model, "approximator.onnx")
+        _check(self._forward, {"irradiance"}, {"corrected"}, whole)
+        self._forward.bind(irradiance=self._irradiance, corrected=self._corrected)
+        self._backward: Session | None = None
+        if gradient is not None:
+            self._backward = Session(gradient, "approximator_gradient.onnx")
+            given = dict(adapters or {})
+            _check(self._backward, {"irradiance", "target", *given}, {"loss", "gradient"}, whole)
+            room: dict[str, np.ndarray] = {
+                name: np.zeros(given[name.removeprefix("gradient.")].shape, np.float32)
+                for name in self._backward.outputs
+                if name.startswith("gradient.")
+            }
+            self._adapter_gradients = {name.removeprefix("gradient."): a for name, a in room.items()}
+            self._adapters = {n: np.array(a, np.float32) for n, a in given.items()}
+            if "corrected" in self._backward.outputs:  # with the adapters as they are now
+                room["corrected"] = self._corrected
+            self._backward.bind(
+                irradiance=self._irradiance, target=self._target, loss=self._loss, gradient=self._slope,
+                **self._adapters, **room,
+            )  # fmt: skip
+
+    @property
+    def has_gradient(self) -> bool:
+        """Whether `look` can be called."""
+        return self._backward is not None
+
+    @property
+    def adapters(self) -> dict[str, np.ndarray]:
+        """The weights that may be refined, by name, to be written in place; `look` takes them, `correct` does not."""
+        return self._adapters if self._backward is not None else {}
+
+    @property
+    def refinable(self) -> bool:
+        """Whether `look` takes adapters, gives their gradients and fills `corrected` with what they make."""
+        return bool(self.adapters) and "corrected" in getattr(self._backward, "outputs", ())
+
+    def correct(self) -> None:
+        """Fill `corrected` from `irradiance`."""
+        self._forward.run()
+
+    def look(self) -> float:
+        """The loss of `irradiance` against `target`; fills `slope`, its gradient over irradiance."""
+        if self._backward is None:
+            raise InputError(
+                "the bundle has no approximator_gradient.onnx: export it, or pre-distort targets"
+            )
+        self._backward.run()
+        return float(self._loss)
+
+    def adapter_gradients(self) -> dict[str, np.ndarray]:
+        """The loss's gradient over each adapter, of the last `look`; the arrays are written again by the next."""
+        return self._adapter_gradients if self._backward is not None else {}
+
+
+def approximator_of(bundle: Bundle, shape: tuple[int, int, int]) -> Approximator | None:
+    """The approximator in a bundle, for irradiance [C, H, W] of a shape; without one D is the identity: None."""
+    if APPROXIMATOR not in bundle.networks:
+        return None
+    adapters = {}
+    if ADAPTERS in bundle.networks:
+        try:
+            adapters = safetensors.numpy.load(bundle.networks[ADAPTERS])
+        except (SafetensorError, KeyError, ValueError, TypeError) as error:
+            raise InputError(
+                f"{ADAPTERS} cannot be read as arrays: {error}; export the bundle again"
+            ) from error
+    return Approximator(shape, bundle.networks[APPROXIMATOR], bundle.networks.get(GRADIENT), adapters)
+
+
+def predistorted(d: Approximator, targets: np.ndarray) -> np.ndarray:
+    """Targets [C, 1, H, W] that D turns into the given ones, as nearly as two corrections find.
+
+    Where D is near the identity, t - D(J) is about what J lacks.
+    """
+    for c, (target,) in enumerate(targets):
+        np.multiply(target, 1 / float(np.mean(target, dtype=np.float64)), out=d.target[c])
+    d.irradiance[...] = d.target
+    for _ in range(CORRECTIONS):
+        d.correct()
+        for c in range(len(targets)):
+            made, wanted = d.corrected[c], d.target[c]
+            scale = float(np.vdot(made, wanted)) / max(float(np.vdot(made, made)), 1e-30)
+            made *= -scale
+            made += wanted
+            d.irradiance[c] += made
+            np.maximum(d.irradiance[c], 0, out=d.irradiance[c])
+    return d.irradiance[:, None]
+
+
+def _check(session: Session, inputs: set[str], outputs: set[str], shape: tuple[int, ...]) -> None:
+    if missing := sorted(inputs - set(session.inputs)) + sorted(outputs - set(session.outputs)):
+        raise InputError(f"{session.name} has no '{missing[0]}': export the bundle again")
+    if extra := sorted(set(session.inputs) - inputs):
+        raise InputError(
+            f"{session.name} wants an input '{extra[0]}' that the bundle does not hold: export it again"
+        )
+    declared: Any = session.inputs["irradiance"]
+    sizes = list(zip(declared, shape, strict=False))
+    if len(declared) != 4 or any(isinstance(n, int) and n != wanted for n, wanted in sizes):
+        raise InputError(
+            f"{session.name} takes irradiance of {' x '.join(map(str, declared))} and the panel needs "
+            f"{' x '.join(map(str, shape))}: export it for this panel"
+        )

@@ -1,0 +1,152 @@
+"""Where the solver's arrays live and what transforms them: NumPy on the CPU's cores, or CuPy on a GPU.
+
+The namespace is chosen once, by `backend()`. Everything the inner loop does is in place: elementwise work goes
+over strips of rows that fit a core's cache, several cores at a time; transforms write where they are told.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from firmware_iface.errors import InputError, nearest
+from runtime.lightpath import fft
+
+Array = Any
+Strip = Callable[[int, slice], "tuple[float, ...] | None"]
+
+STRIP_BYTES = 1 << 19  # of one row buffer: a share of a core's second cache
+COLUMNS = 96  # of a column transform by one core
+BACKENDS = ("numpy", "cupy")
+
+
+class Backend:
+    """NumPy arrays, worked on by all of the machine's cores."""
+
+    name = "numpy"
+    xp: Any = np
+
+    def __init__(self, threads: int = fft.THREADS) -> None:
+        self.threads = threads
+        self.pool = ThreadPoolExecutor(threads - 1, "strips") if threads > 1 else None
+
+    def strip_rows(self, width: int) -> int:
+        """Rows of `width` complex samples in a strip."""
+        return max(1, STRIP_BYTES // (8 * width))
+
+    def over_rows(self, rows: int, size: int, work: Strip) -> tuple[float, ...]:
+        """Call work(worker, rows of a strip) for all rows; the sums of what it returns.
+
+        `worker` is below `threads`, and no two calls share it at a time: it says whose row buffer to use.
+        """
+
+        def share(worker: int) -> list[tuple[float, ...]]:
+            begin, end = (rows * k // self.threads for k in (worker, worker + 1))
+            done = [work(worker, slice(r, min(r + size, end))) for r in range(begin, end, size)]
+            return [d for d in done if d is not None]
+
+        others = [self.pool.submit(share, k) for k in range(1, self.threads)] if self.pool else []
+        parts = share(0)
+        for other in others:
+            parts += other.result()
+        return tuple(map(sum, zip(*parts, strict=True)))
+
+    def rows_fft(self, x: Array, out: Array, forward: bool) -> None:
+        """Unscaled DFT of each row of a strip, on the calling core alone."""
+        fft.into(x, out, 1, forward, 1)
+
+    def through_columns(self, x: Array, multiply: Callable[[slice], None]) -> None:
+        """DFT of each column, `multiply` (which is told the columns), inverse DFT; in place and not scaled.
+
+        Some columns at a time, so that they are in a core's cache all the way.
+        """
+
+        def work(worker: int, columns: slice) -> None:
+            fft.into(x[:, columns], x[:, columns], 0, True, 1)
+            multiply(columns)
+            fft.into(x[:, columns], x[:, columns], 0, False, 1)
+
+        self.over_rows(x.shape[1], COLUMNS, work)
+
+    def columns_fft(self, x: Array, forward: bool) -> None:
+        """Unscaled DFT of each column, in place, on all cores."""
+        fft.into(x, x, 0, forward, self.threads)
+
+    def filter(self, image: Array, transfer: Array, spectrum: Array) -> None:
+        """A real image through a transfer function over its half spectrum, in place; `spectrum` is room."""
+        fft.filter_into(image, transfer, spectrum, self.threads)
+
+    def to_host(self, x: Array) -> np.ndarray:
+        """As a NumPy array."""
+        return np.asarray(x)
+
+
+class CupyBackend(Backend):
+    """CuPy arrays on the GPU: a strip is the whole array, and streams do what threads do on a CPU."""
+
+    name = "cupy"
+
+    def __init__(self) -> None:
+        import cupy
+        import cupyx.scipy.fft
+
+        self.xp, self._fft = cupy, cupyx.scipy.fft
+        self.threads, self.pool = 1, None
+
+    def strip_rows(self, width: int) -> int:
+        return 1 << 30
+
+    def rows_fft(self, x: Array, out: Array, forward: bool) -> None:
+        self._transform(x, out, 1, forward)
+
+    def columns_fft(self, x: Array, forward: bool) -> None:
+        self._transform(x, x, 0, forward)
+
+    def through_columns(self, x: Array, multiply: Callable[[slice], None]) -> None:
+        self.columns_fft(x, True)
+        multiply(slice(0, x.shape[1]))
+        self.columns_fft(x, False)
+
+    def _transform(self, x: Array, out: Array, axis: int, forward: bool) -> None:
+        if forward:
+            out[...] = self._fft.fft(x, axis=axis)
+        else:
+            out[...] = self._fft.ifft(x, axis=axis, norm="forward")
+
+    def filter(self, image: Array, transfer: Array, spectrum: Array) -> None:
+        spectrum[...] = self._fft.rfft2(image)
+        spectrum *= transfer
+        image[...] = self._fft.irfft2(spectrum, s=image.shape)
+
+    def to_host(self, x: Array) -> np.ndarray:
+        return np.asarray(self.xp.asnumpy(x))
+
+
+@cache
+def backend(name: str | None = None) -> Backend:
+    """The machine's backend: CuPy where it is installed and has a GPU, else NumPy; or the one that is named.
+
+    HOLOLOOP_BACKEND in the environment names one too. Raises InputError for one that is not there.
+    """
+    name = name or os.environ.get("HOLOLOOP_BACKEND") or None
+    if name not in (None, *BACKENDS):
+        raise InputError(f"there is no backend '{name}': {nearest(name, BACKENDS)}")
+    if name == "numpy":
+        return Backend()
+    try:
+        found = CupyBackend()
+        if found.xp.cuda.runtime.getDeviceCount() > 0:
+            return found
+    except (
+        Exception
+    ) as error:  # not installed, no driver, no device: each library version says it its own way
+        if name == "cupy":
+            raise InputError(f"the CuPy backend cannot start ({error}): use numpy") from error
+    if name == "cupy":
+        raise InputError("the CuPy backend finds no GPU: use numpy")
+    return Backend()

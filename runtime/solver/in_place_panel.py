@@ -1,0 +1,168 @@
+"""From the panel's phase to the spectrum of the light that leaves it, and back, in place."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from runtime.lightpath.light_path import LightPath
+from runtime.solver.array_backend import Backend
+from runtime.solver.band import Band, Run
+from runtime.solver.in_place_crosstalk import Crosstalk
+
+Array = Any
+
+
+class Panel:
+    """The panel's side of a light path: the DFT of source exp(j phase) + leak, over the band's columns.
+
+    spectrum [rows, columns of the band]: what `forward` fills and `adjoint` uses up. runs: where the band's
+    rows are in it. Only rows that the panel has are transformed, and only columns that the iris passes go on;
+    the pixel's aperture is in the pupil's transfer functions (`Optics`). With crosstalk, the sum over
+    sub-pixels, each at its place.
+    """
+
+    def __init__(self, path: LightPath, rows: Band, columns: Band, backend: Backend) -> None:
+        xp, grid = backend.xp, path.grid
+        real, pair = path.response.dtype, path.source.dtype
+        self.backend, self.rows, self.columns = backend, rows, columns
+        self.shape = height, width = grid.shape
+        self.source = None if np.all(path.source == 1) else xp.asarray(path.source)
+        self.leak = None if path.leak is None else xp.asarray(path.leak)
+        self.strip = min(backend.strip_rows(grid.padded[1]), height)
+        room = (self.strip, grid.padded[1])
+        self.lit = xp.zeros((height, grid.padded[1]), pair)  # source exp(j phase); dark beyond the panel
+        self.row = [xp.zeros(room, pair) for _ in range(backend.threads)]
+        self.part = [xp.empty((self.strip, width), real) for _ in range(backend.threads)]
+        self.crosstalk = None if path.crosstalk is None else Crosstalk(path, rows, columns, backend)
+        count = len(rows.frequencies) if self.crosstalk else grid.padded[0]
+        self.spectrum = xp.zeros((count, len(columns.frequencies)), pair)
+        self.runs = rows.runs
+        if self.crosstalk:  # in the band's own order, whose frequencies are each there once
+            self.runs = tuple(Run(run.band, run.band, run.image, False) for run in rows.runs)
+
+    def forward(self, phase: Array, columns: bool = True) -> None:
+        """Fill `spectrum` from phase (rad) [H, W]; columns: transformed too, which a caller may do by itself."""
+        mixing = self.crosstalk
+        if mixing is None:
+            self._rows_forward(phase, self.spectrum, None)
+            if columns:
+                self.backend.columns_fft(self.spectrum, True)
+            return
+        self.spectrum[...] = 0
+        for i, down in enumerate(mixing.down):
+            mixed = mixing.mix_down(phase, i)
+            mixing.columns[...] = 0
+            for j, across in enumerate(mixing.across):
+                self._rows_forward(mixing.mix_across(mixed, j), mixing.columns, across)
+            self.backend.columns_fft(mixing.columns, True)
+            for run in self.rows.runs:
+                self.spectrum[run.band] += mixing.columns[run.panel] * down[run.band]
+
+    def adjoint(self, phase: Array, gradient: Array, columns: bool = True) -> None:
+        """Gradient of a loss over phase [H, W], from its gradient over `spectrum`, which is used up.
+
+        `phase` is that of the last `forward`; columns: as there.
+        """
+        mixing = self.crosstalk
+        if mixing is None:
+            if columns:
+                self.backend.columns_fft(self.spectrum, False)
+            self._rows_adjoint(self.spectrum, None, gradient)
+            return
+        gradient[...] = 0
+        for i, down in enumerate(mixing.down):
+            mixed = mixing.mix_down(phase, i)
+            mixing.columns[...] = 0
+            for run in self.rows.runs:
+                mixing.columns[run.panel] += self.spectrum[run.band] * down[run.band].conj()
+            self.backend.columns_fft(mixing.columns, False)
+            mixing.back[...] = 0
+            for j, across in enumerate(mixing.across):
+                self._light_all(mixing.mix_across(mixed, j))
+                self._rows_adjoint(mixing.columns, across, mixing.one)
+                mixing.unmix_across(mixing.one, j, mixing.back)
+            mixing.unmix_down(mixing.back, i, gradient)
+
+    def field_from_spectrum(self, field: Array, columns: bool = True) -> None:
+        """Adjoint of the way from a field on the panel [H, W] (crosstalk aside) to `spectrum`, which is used up."""
+        spectrum = self.spectrum
+        if self.crosstalk:
+            spectrum = self.crosstalk.columns
+            spectrum[...] = 0
+            for run in self.rows.runs:
+                spectrum[run.panel] += self.spectrum[run.band]
+        if columns:
+            self.backend.columns_fft(spectrum, False)
+
+        def work(worker: int, rows: slice) -> None:
+            field[rows] = self._row_back(worker, rows, spectrum, None)
+
+        self.backend.over_rows(self.shape[0], self.strip, work)
+
+    def _light_all(self, phase: Array) -> None:
+        def work(worker: int, rows: slice) -> None:
+            self._light(worker, rows, phase)
+
+        self.backend.over_rows(self.shape[0], self.strip, work)
+
+    def _light(self, worker: int, rows: slice, phase: Array) -> None:
+        """source exp(j phase): cosine and sine apart cost a fraction of a complex exponential."""
+        xp = self.backend.xp
+        lit, part = self.lit[rows, : self.shape[1]], self.part[worker][: rows.stop - rows.start]
+        xp.cos(phase[rows], out=part)
+        lit.real[...] = part
+        xp.sin(phase[rows], out=part)
+        lit.imag[...] = part
+        if self.source is not None:
+            lit *= self.source[rows]
+
+    def _rows_forward(self, phase: Array, spectrum: Array, turned: Array | None) -> None:
+        """Spectra of the rows, the band's columns of them; `turned` [columns]: times this, added."""
+        height, width = self.shape
+
+        def work(worker: int, rows: slice) -> None:
+            self._light(worker, rows, phase)
+            row = self.row[worker][: rows.stop - rows.start]
+            if self.leak is None:
+                self.backend.rows_fft(self.lit[rows], row, True)
+            else:
+                row[:, width:] = 0
+                self.backend.xp.add(self.lit[rows, :width], self.leak[rows], out=row[:, :width])
+                self.backend.rows_fft(row, row, True)
+            for run in self.columns.runs:
+                if turned is None:
+                    spectrum[rows, run.band] = row[:, run.panel]
+                else:
+                    spectrum[rows, run.band] += row[:, run.panel] * turned[run.band]
+
+        spectrum[height:] = 0
+        self.backend.over_rows(height, self.strip, work)
+
+    def _row_back(self, worker: int, rows: slice, spectrum: Array, turned: Array | None) -> Array:
+        """The panel's part of rows whose spectra are given: adjoint of what `_rows_forward` does to a field."""
+        row = self.row[worker][: rows.stop - rows.start]
+        row[:, self.columns.panel_gap] = 0
+        for run in self.columns.runs:
+            part = spectrum[rows, run.band]
+            if turned is not None:
+                part = part * turned[run.band].conj()
+            if run.again:
+                row[:, run.panel] += part
+            else:
+                row[:, run.panel] = part
+        self.backend.rows_fft(row, row, False)
+        return row[:, : self.shape[1]]
+
+    def _rows_adjoint(self, spectrum: Array, turned: Array | None, gradient: Array) -> None:
+        """Seed eq. 22-23, Re(-j exp(-j phase) ...), with the field that lights the panel, `lit`, in it."""
+        xp = self.backend.xp
+
+        def work(worker: int, rows: slice) -> None:
+            row = self._row_back(worker, rows, spectrum, turned)
+            xp.conjugate(row, out=row)
+            row *= self.lit[rows, : self.shape[1]]
+            xp.negative(row.imag, out=gradient[rows])
+
+        self.backend.over_rows(self.shape[0], self.strip, work)

@@ -1,0 +1,230 @@
+"""Takes a capture set from a bench: chooses patterns, sets the exposure, shows and captures.
+
+The exposure of each colour is set once, from a look at all of its patterns, and then stays, so that the
+laser's power is the only thing that changes the gain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_iface.errors import InputError, nearest
+from trainer.captures.bench_file import Bench, Camera, read_bench
+from trainer.captures.capture_writer import CaptureWriter
+from trainer.captures.open_bench import open_bench
+from trainer.captures.patterns import Pattern, choose_patterns, default_count
+
+Progress = Callable[[float, str], None]
+Choose = Callable[[str, float], list[Pattern]]
+
+SATURATED = 0.002  # of all pixels of a colour
+SATURATED_IN_ONE = 0.01  # of the pixels of one capture
+AIM = 0.93  # of full scale, for the brightest pixels that count
+EXPOSURES_MS = (0.02, 2000.0)
+
+
+class Lasers(Protocol):
+    """The lasers of a headset."""
+
+    def set_power(self, channel: str, fraction: float) -> None:
+        """Set a laser to a fraction of full power."""
+
+    def off(self) -> None:
+        """Switch every laser off."""
+
+
+class Headset(Protocol):
+    """What is needed of a bench: its panel, lasers and camera, a focus, and a clock."""
+
+    @property
+    def panel(self) -> Any: ...
+
+    @property
+    def lasers(self) -> Lasers: ...
+
+    @property
+    def camera(self) -> Any: ...
+
+    @property
+    def time_s(self) -> float: ...
+
+    def move_to_plane(self, plane_mm: float) -> None:
+        """Focus the camera on another plane."""
+
+
+@dataclass(frozen=True)
+class Taken:
+    """A capture set that was taken."""
+
+    folder: Path
+    captures: int
+    exposure_ms: dict[str, float]
+    saturated: float
+
+    def as_json(self) -> dict[str, Any]:
+        """For `--json`."""
+        return {
+            "folder": str(self.folder),
+            "captures": self.captures,
+            "exposure_ms": self.exposure_ms,
+            "saturated_share": self.saturated,
+        }
+
+
+def capture_from(
+    spec: str,
+    folder: Path,
+    patterns: int | None = None,
+    planes_mm: Sequence[float] | None = None,
+    channels: Sequence[str] | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+    known: Path | None = None,
+) -> Taken:
+    """A capture set from the bench that `spec` names: `virtual:NAME`, the TOML file of a virtual bench, or the
+    configuration of a real headset, with the bench.toml `known`.
+
+    Raises InputError for an unknown bench, channel or plane, or a folder that holds something already; DeviceError
+    where a device fails.
+    """
+    with open_bench(spec, seed, read_bench(known) if known else None) as opened:
+        planes = tuple(planes_mm) if planes_mm else opened.planes_mm
+        return capture_set(opened.headset, opened.bench, folder, patterns, planes, channels, seed, progress)
+
+
+def capture_set(
+    headset: Headset,
+    bench: Bench,
+    folder: Path,
+    patterns: int | None = None,
+    planes_mm: Sequence[float] = (),
+    channels: Sequence[str] | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+    choose: Choose | None = None,
+) -> Taken:
+    """Show patterns on a bench, capture them, and write the set.
+
+    patterns : how many for each colour and plane; the first is shown twice, for the noise
+    choose : gives the patterns of a colour and plane instead
+    """
+    names = [c.name for c in bench.channels]
+    chosen = list(dict.fromkeys(channels or names))
+    for name in chosen:
+        if name not in names:
+            raise InputError(f"--channels: there is no channel '{name}'; {nearest(name, names)}")
+    planes = list(dict.fromkeys(float(p) for p in planes_mm)) or [bench.distance_mm]
+    count = default_count(len(chosen)) if patterns is None else patterns
+    if choose is None:
+        choose = partial(choose_patterns, bench, count=count, seed=seed)
+    else:
+        count = len(choose(chosen[0], planes[0]))
+    steps = len(chosen) * len(planes) * (2 * count + 1)
+    done = 0
+
+    def say(what: str) -> None:
+        nonlocal done
+        if progress:
+            progress(done / steps, what)
+        done += 1
+
+    for plane in planes:  # before the patterns are made: a plane out of reach is said at once
+        headset.move_to_plane(plane)
+    exposures: dict[str, float] = {}
+    saturated: list[float] = []
+    started: float | None = None
+    with CaptureWriter(folder, bench) as writer:
+        for channel in chosen:
+            shown = [(p, choose(channel, p)) for p in planes]
+            headset.lasers.off()
+            headset.lasers.set_power(channel, 1.0)
+            try:
+                exposures[channel] = _expose(headset, bench.camera, shown, channel, say)
+                for plane, several in shown:
+                    headset.move_to_plane(plane)
+                    for number, pattern in _with_repeat(several):
+                        say(f"{channel}, {plane:g} mm")
+                        started = headset.time_s if started is None else started
+                        time = headset.time_s - started
+                        counts = _shot(headset, pattern)
+                        saturated.append(float((counts >= bench.camera.saturation).mean()))
+                        writer.add(
+                            pattern.gray,
+                            counts,
+                            channel,
+                            plane_mm=plane,
+                            pattern=f"{channel}-{plane:g}-{number:03d}",
+                            exposure_ms=exposures[channel],
+                            time_s=round(time, 6),
+                            kind=pattern.kind,
+                        )
+            finally:
+                headset.lasers.off()
+    if progress:
+        progress(1.0, "done")
+    return Taken(Path(folder), len(saturated), exposures, float(np.mean(saturated)))
+
+
+def _with_repeat(patterns: list[Pattern]) -> list[tuple[int, Pattern]]:
+    return [(0, patterns[0]), *enumerate(patterns)]
+
+
+def _shot(headset: Headset, pattern: Pattern) -> NDArray[np.uint16]:
+    headset.panel.show(pattern.gray)
+    counts: NDArray[np.uint16] = headset.camera.capture()
+    return counts
+
+
+def _expose(
+    headset: Headset,
+    camera: Camera,
+    shown: list[tuple[float, list[Pattern]]],
+    channel: str,
+    say: Callable[[str], None],
+) -> float:
+    """Sets and returns the exposure, ms, at which few pixels of these patterns saturate."""
+    exposure = 10.0
+    headset.camera.exposure_ms = exposure
+    looks: list[NDArray[np.uint16]] = []
+    for plane, several in shown:
+        headset.move_to_plane(plane)
+        for pattern in several:
+            say(f"exposure for {channel}")
+            counts = _shot(headset, pattern)
+            while _too_bright(counts, camera) and exposure > 2 * EXPOSURES_MS[0]:
+                exposure /= 4
+                headset.camera.exposure_ms = exposure
+                looks = [_dimmed(c, camera) for c in looks]
+                counts = _shot(headset, pattern)
+            looks.append(counts)
+    every = float(np.quantile(np.concatenate([c.reshape(-1) for c in looks]), 1 - SATURATED))
+    single = max(float(np.quantile(c, 1 - SATURATED_IN_ONE)) for c in looks)
+    bright = max(every, single) - camera.black_level
+    if bright <= 3 * camera.read_noise_e * camera.counts_per_electron + 1:
+        raise InputError(
+            f"the camera sees nothing at {exposure:g} ms: see that the laser is on and the light path open, "
+            "and try again"
+        )
+    factor = AIM * camera.full_scale / bright
+    longest = min(EXPOSURES_MS[1], headset.camera.longest_exposure_ms)
+    wanted = min(max(exposure * factor, EXPOSURES_MS[0]), longest)
+    exposure = float(f"{wanted:.3g}")
+    headset.camera.exposure_ms = exposure
+    return exposure
+
+
+def _too_bright(counts: NDArray[np.uint16], camera: Camera) -> bool:
+    return float((counts >= camera.saturation).mean()) > SATURATED_IN_ONE / 2
+
+
+def _dimmed(counts: NDArray[np.uint16], camera: Camera) -> NDArray[np.uint16]:
+    """What counts would be at a quarter of the exposure."""
+    below = (counts.astype(np.float32) - camera.black_level) / 4 + camera.black_level
+    return np.maximum(np.rint(below), 0).astype(np.uint16)

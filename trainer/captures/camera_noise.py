@@ -1,0 +1,126 @@
+"""What repeated pictures of one pattern say of a camera: its noise against its signal, and its black level.
+
+Light makes noise whose variance grows in proportion to the counts above black, so the line of variance
+against mean count points to the true black level, whatever light is in the picture (stray light carries
+its noise with it).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from trainer.captures.capture_set import Camera
+
+BINS = 32
+SLOPE_DOUBT = 0.008  # relative standard error that a stated full well has at best
+
+
+@dataclass(frozen=True)
+class Repeats:
+    """Variance against mean of pictures of one pattern, in bins of about equal numbers of pixels.
+
+    mean : float [n], raw counts; variance : float [n], counts^2
+    error : float [n], standard error of variance
+    ratio : measured noise over the camera model's, both averaged over the pixels
+    """
+
+    mean: np.ndarray
+    variance: np.ndarray
+    error: np.ndarray
+    ratio: float
+
+
+@dataclass(frozen=True)
+class BlackEstimate:
+    """The black level that the noise points to, and its standard error, raw counts."""
+
+    level: float
+    error: float
+
+
+def compare_repeats(first: np.ndarray, second: np.ndarray, camera: Camera) -> Repeats | None:
+    """The noise of two pictures of one pattern, counts [h, w]; None where too few pixels are unsaturated.
+
+    A difference in brightness between the two (the laser's drift) is taken out first.
+    """
+    use = (first < camera.saturation) & (second < camera.saturation)
+    if int(use.sum()) < 256:
+        return None
+    a, b = first[use].astype(np.float64), second[use].astype(np.float64)
+    spread = float(a.std()) / max(float(b.std()), 1e-9)
+    gain = spread if 0.5 < spread < 2 and np.corrcoef(a, b)[0, 1] > 0.5 else 1.0
+    mean = (a + b) / 2
+    halved = (a - a.mean() - gain * (b - b.mean())) ** 2 / (1 + gain**2)
+    edges = np.unique(np.quantile(mean, np.linspace(0, 1, BINS + 1)))
+    place = np.clip(np.searchsorted(edges, mean, side="right") - 1, 0, max(len(edges) - 2, 0))
+    number = np.bincount(place, minlength=max(len(edges) - 1, 1))
+    full = number >= 32
+    center = np.bincount(place, mean, minlength=len(number))[full] / number[full]
+    variance = np.bincount(place, halved, minlength=len(number))[full] / number[full]
+    expected = _expected(mean - camera.black_level, camera)
+    return Repeats(
+        center, variance, variance * np.sqrt(2 / number[full]), float(halved.mean() / expected.mean())
+    )
+
+
+def black_estimate(repeats: list[Repeats], camera: Camera) -> BlackEstimate | None:
+    """The black level at which the line of variance against mean reaches the stated read noise.
+
+    None where the pictures hold too little range of brightness to draw a line, or none rises.
+    """
+    mean = np.concatenate([r.mean for r in repeats]) if repeats else np.zeros(0)
+    variance = np.concatenate([r.variance for r in repeats]) if repeats else np.zeros(0)
+    if len(mean) < 8 or np.ptp(mean) < 0.02 * camera.full_scale or not (variance > 0).all():
+        return None
+    relative = np.concatenate([r.error for r in repeats]) / variance + 1e-3
+    low, step = float(mean.min()), float(np.ptp(mean))
+    place = (mean - low) / step
+    floor = float(_expected(np.zeros(1), camera)[0])
+    line = _fit(np.stack([np.ones_like(place), place], 1), variance, relative)
+    bent = _fit(np.stack([np.ones_like(place), place, place**2], 1), variance, relative)
+    if line is None or bent is None:
+        return None
+    fit, covariance = bent if abs(bent[0][2]) > 4 * math.sqrt(bent[1][2, 2]) else line
+    if fit[1] <= 3 * math.sqrt(covariance[1, 1]):
+        return None
+    reach = (fit[0] - floor) / fit[1]  # how far below the darkest bin, in units of the range
+    gradient = np.array([-1 / fit[1], reach / fit[1], 0])[: len(fit)]
+    free = BlackEstimate(low - step * float(reach), step * math.sqrt(float(gradient @ covariance @ gradient)))
+    slope, spread = float(fit[1]) / step, math.sqrt(covariance[1, 1]) / step
+    if abs(slope - camera.counts_per_electron) > 3 * spread:
+        return free
+    # the stated full well fits the slope: a line of that slope reaches down to black with less error
+    weight = 1 / (relative * np.maximum(line[0][0] + line[0][1] * place, 1e-2 * float(variance.mean()))) ** 2
+    above = (variance - floor) / camera.counts_per_electron
+    level = float(np.average(mean - above, weights=weight))
+    error = math.hypot(
+        1 / (math.sqrt(float(weight.sum())) * camera.counts_per_electron),
+        SLOPE_DOUBT * float(np.average(above, weights=weight)),
+    )
+    return BlackEstimate(level, error) if error < free.error else free
+
+
+def _fit(
+    terms: np.ndarray, variance: np.ndarray, relative: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Weighted least squares and its covariance; None where the terms do not determine it.
+
+    The weights follow the fit, not each bin's own variance: a bin that came out low must not count for more.
+    """
+    level = variance
+    try:
+        for _ in range(3):
+            scaled = terms / (level * relative)[:, None]
+            fit, *_ = np.linalg.lstsq(scaled, variance / (level * relative), rcond=None)
+            level = np.maximum(terms @ fit, 1e-2 * float(variance.mean()))
+        return fit, np.linalg.inv(scaled.T @ scaled)
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _expected(signal: np.ndarray, camera: Camera) -> np.ndarray:
+    gain = camera.counts_per_electron
+    return np.maximum(signal, 0) * gain + (camera.read_noise_e * gain) ** 2 + 1 / 12

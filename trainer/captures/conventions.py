@@ -1,0 +1,298 @@
+"""Which way round the camera sees, and which way the panel counts: the mismatch that is no physics.
+
+Sixteen combinations are compared: eight ways to turn and mirror the camera's image, times two signs of the
+panel's phase. (Mirroring the panel's pattern is the same as mirroring the image. Turning the sign of the
+phase conjugates the field, and so does counting the distance the other way: one picture cannot tell them
+apart, and one change puts both right.)
+
+A combination's score is the correlation of the ideal prediction with the measured images, after the slow
+variation of beam and field is taken out, at the best shift within a few pixels. Another combination than the
+stated one is *decisively* better when, over the images' tiles, the paired difference of Fisher's z has a
+t-statistic above `T_LEVEL`, its correlation is at least `R_RATIO` times the stated one's, and is at least
+`R_LEAST`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import fft as spfft
+from scipy.ndimage import gaussian_filter
+
+from firmware_iface.errors import InputError
+from trainer.captures.capture_set import Bench, CaptureSet
+
+T_LEVEL = 6.0
+R_RATIO = 2.0
+R_LEAST = 0.05
+WINDOW = 8  # pixels, the largest shift that is looked for along each axis
+CORE = 512  # pixels, the part of a large registered image that is compared
+
+Predict = Callable[[Bench, np.ndarray, str, float], np.ndarray]
+
+_TURNS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "as_stated": lambda a: a,
+    "mirror_left_right": lambda a: a[:, ::-1],
+    "mirror_top_bottom": lambda a: a[::-1],
+    "turn_180": lambda a: a[::-1, ::-1],
+    "transpose": lambda a: a.T,
+    "turn_90_left": np.rot90,
+    "turn_90_right": lambda a: np.rot90(a, -1),
+    "transpose_other_diagonal": lambda a: a[::-1, ::-1].T,
+}
+TURNS = tuple(_TURNS)
+_WORDS = {
+    "mirror_left_right": "mirror the images left-right",
+    "mirror_top_bottom": "mirror the images top-bottom",
+    "turn_180": "turn the images by 180 degrees",
+    "transpose": "exchange the images' rows and columns",
+    "turn_90_left": "turn the images by 90 degrees to the left",
+    "turn_90_right": "turn the images by 90 degrees to the right",
+    "transpose_other_diagonal": "exchange the images' rows and columns and turn them by 180 degrees",
+}
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One capture in memory: gray uint8 [H, W]; signal float [h, w], above black; valid bool [h, w]."""
+
+    capture: str
+    gray: np.ndarray
+    signal: np.ndarray
+    valid: np.ndarray
+    channel: str
+    plane_mm: float
+
+
+@dataclass(frozen=True)
+class Score:
+    """One combination: what is done to the images, the panel's phase sign, and how well they fit.
+
+    correlation : of prediction and images, -1 to 1, over all tiles
+    shift : (row, column) of the image against the prediction, pixels, one for each sample
+    t : t-statistic of its advantage over the stated combination
+    """
+
+    turn: str
+    phase_sign: int
+    correlation: float
+    shift: tuple[tuple[int, int], ...]
+    t: float = 0.0
+
+
+@dataclass(frozen=True)
+class Convention:
+    """The outcome. change : what to do, one sentence; "" when the stated convention stands.
+
+    scores : all combinations, best first; stated is the bench's own; decisive : another is surely right
+    alike : combinations that the data cannot tell from the best
+    """
+
+    best: Score
+    stated: Score
+    decisive: bool
+    change: str
+    scores: tuple[Score, ...]
+    alike: tuple[Score, ...] = ()
+
+
+def turned(image: np.ndarray, turn: str) -> np.ndarray:
+    """The image [h, w] after the named change (one of TURNS). Raises InputError for an unknown name."""
+    if turn not in _TURNS:
+        raise InputError(f"{turn!r} is no way to turn an image: use one of {', '.join(TURNS)}")
+    return _TURNS[turn](image)
+
+
+def find_convention(captures: CaptureSet, count: int = 3, predict: Predict | None = None) -> Convention:
+    """Compares the sixteen combinations on a few captures with different patterns.
+
+    Raises InputError if the set is empty or a picture cannot be used.
+    """
+    first = {c.pattern: c for c in reversed(captures.captures)}
+    distinct = [c for c in captures.captures if first[c.pattern] is c]
+    if not distinct:
+        raise InputError(f"{captures.folder} has no captures to compare: add at least one")
+    picks = sorted({round(i) for i in np.linspace(0, len(distinct) - 1, min(count, len(distinct)))})
+    samples = []
+    for capture in (distinct[i] for i in picks):
+        signal, valid = captures.signal(capture)
+        gray = captures.gray(capture)
+        samples.append(Sample(capture.capture, gray, signal, valid, capture.channel, capture.plane_mm))
+    return compare_conventions(captures.bench, samples, predict)
+
+
+def compare_conventions(
+    bench: Bench, samples: Sequence[Sample], predict: Predict | None = None, quick: bool = False
+) -> Convention:
+    """Scores every combination that the image's shape allows; see the module's text for the test.
+
+    predict : (bench, gray, channel, plane_mm) -> irradiance [h, w], any scale; the ideal model by default
+    quick : stop when a sample fits so well as stated that no other combination can be decisively better
+    Raises InputError if there is no sample.
+    """
+    if predict is None:
+        from trainer.prediction.predict import ideal_irradiance
+
+        predict = ideal_irradiance
+    if not samples:
+        raise InputError("there are no captures to compare conventions on: give at least one")
+    stated_sign = bench.panel.phase_sign
+    tiles: dict[tuple[str, int], list[np.ndarray]] = {}
+    shifts: dict[tuple[str, int], list[tuple[int, int]]] = {}
+    for sample in samples:
+        near, gray, image, valid, core = _central(bench, sample)
+        for sign in (stated_sign, -stated_sign):
+            model = replace(near, panel=replace(near.panel, phase_sign=sign))
+            made = np.asarray(predict(model, gray, sample.channel, sample.plane_mm), dtype=np.float32)[core]
+            flat = _flattened(made, np.ones(made.shape, bool))
+            for turn in TURNS:
+                seen, good = turned(image, turn), turned(valid, turn)
+                if seen.shape != made.shape:
+                    continue
+                values, shift = _tile_correlations(_flattened(seen, good), good, flat)
+                tiles.setdefault((turn, sign), []).append(values)
+                shifts.setdefault((turn, sign), []).append(shift)
+            if quick and R_RATIO * float(np.mean(tiles["as_stated", stated_sign][0])) > 1:
+                return _conclude(tiles, shifts, stated_sign)
+    return _conclude(tiles, shifts, stated_sign)
+
+
+def _conclude(
+    tiles: dict[tuple[str, int], list[np.ndarray]],
+    shifts: dict[tuple[str, int], list[tuple[int, int]]],
+    stated_sign: int,
+) -> Convention:
+    joined = {key: np.concatenate(values) for key, values in tiles.items()}
+    reference = joined["as_stated", stated_sign]
+    scores = [
+        Score(turn, sign, float(np.mean(values)), tuple(shifts[turn, sign]), _paired_t(values, reference))
+        for (turn, sign), values in joined.items()
+    ]
+    scores.sort(key=lambda score: -score.correlation)
+    best = scores[0]
+    stated = next(s for s in scores if s.turn == "as_stated" and s.phase_sign == stated_sign)
+    decisive = bool(
+        best is not stated
+        and best.t > T_LEVEL
+        and best.correlation >= R_LEAST
+        and best.correlation >= R_RATIO * max(stated.correlation, 0.0)
+    )
+    alike = tuple(
+        s
+        for s in scores[1:]
+        if decisive
+        and s.correlation * R_RATIO > best.correlation
+        and _paired_t(joined[best.turn, best.phase_sign], joined[s.turn, s.phase_sign]) < T_LEVEL
+    )
+    change = _change(best, stated, alike) if decisive else ""
+    return Convention(best, stated, decisive, change, tuple(scores), alike)
+
+
+def _change(best: Score, stated: Score, alike: tuple[Score, ...]) -> str:
+    steps = _steps(best, stated)
+    text = (
+        f"the images fit the ideal model with correlation {stated.correlation:.2f} as stated and "
+        f"{best.correlation:.2f} after a change of convention: {steps}"
+    )
+    if alike:
+        text += "; these captures cannot tell this from: " + ", or ".join(_steps(s, stated) for s in alike)
+    return text
+
+
+def _steps(score: Score, stated: Score) -> str:
+    steps = []
+    if score.phase_sign != stated.phase_sign:
+        steps.append(
+            f"in bench.toml [panel] set phase_sign = {score.phase_sign} (more gray means "
+            f"{'less' if score.phase_sign < 0 else 'more'} phase; a distance counted the other way "
+            "looks the same, and this puts it right too)"
+        )
+    if score.turn in _WORDS:
+        steps.append(_WORDS[score.turn] + " (or the panel's patterns)" * (score.turn.startswith("mirror")))
+    return " and ".join(steps) or "leave everything as stated"
+
+
+def _central(
+    bench: Bench, sample: Sample
+) -> tuple[Bench, np.ndarray, np.ndarray, np.ndarray, tuple[slice, slice]]:
+    """A large registered capture, cut to its centre and what diffracts into it.
+
+    Returns the smaller bench and gray pattern, the image and its mask, and where the image is in the
+    prediction.
+    """
+    whole = (slice(None), slice(None))
+    if not bench.camera.registered:
+        return bench, sample.gray, sample.signal, sample.valid, whole
+    wave, pitch = bench.channel(sample.channel).wavelength, bench.panel.pitch
+    reach = math.ceil(abs(sample.plane_mm) * 1e-3 * wave / (2 * pitch**2)) + 8
+    outer, core, inside = [], [], []
+    for size in bench.panel.shape:
+        small = min(size, CORE + size % 2)
+        large = min(size, small + 2 * reach)
+        if large == size:  # nothing to gain by cutting this axis of the panel
+            small = size if size <= 2 * CORE else small
+        outer.append(slice((size - large) // 2, (size - large) // 2 + large))
+        core.append(slice((size - small) // 2, (size - small) // 2 + small))
+        inside.append(slice((large - small) // 2, (large - small) // 2 + small))
+    gray = sample.gray[outer[0], outer[1]]
+    panel = replace(bench.panel, height=gray.shape[0], width=gray.shape[1])
+    camera = replace(bench.camera, height=gray.shape[0], width=gray.shape[1])
+    return (
+        replace(bench, panel=panel, camera=camera),
+        gray,
+        sample.signal[core[0], core[1]],
+        sample.valid[core[0], core[1]],
+        (inside[0], inside[1]),
+    )
+
+
+def _flattened(image: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Amplitude without its slow variation, slightly blurred, zero where not valid; float32 [h, w]."""
+    amplitude = np.sqrt(np.maximum(image, 0)).astype(np.float32)
+    amplitude = gaussian_filter(amplitude, 0.7, mode="nearest")
+    wide = max(4.0, min(16.0, min(image.shape) / 8))
+    detail = amplitude - gaussian_filter(amplitude, wide, mode="nearest")
+    spread = np.sqrt(gaussian_filter(detail**2, wide, mode="nearest"))
+    floor = 0.1 * float(np.sqrt(np.mean(detail**2))) + 1e-12
+    return np.where(valid, detail / (spread + floor), 0).astype(np.float32)
+
+
+def _tile_correlations(
+    image: np.ndarray, valid: np.ndarray, model: np.ndarray
+) -> tuple[np.ndarray, tuple[int, int]]:
+    """Correlation of each tile, at the shift (row, column) within WINDOW that suits the whole best."""
+    rows, columns = image.shape
+    window = max(1, min(WINDOW, min(rows, columns) // 8))
+    cross = spfft.irfft2(spfft.rfft2(image) * np.conj(spfft.rfft2(model)), s=image.shape)
+    near = np.roll(cross, (window, window), (0, 1))[: 2 * window + 1, : 2 * window + 1]
+    at = np.unravel_index(int(np.argmax(near)), near.shape)
+    shift = (int(at[0]) - window, int(at[1]) - window)
+    moved = np.roll(model, shift, (0, 1))
+    side = max(16, min(64, min(rows, columns) // 4))
+    values = []
+    for top in range(window, rows - window - side + 1, side):
+        for left in range(window, columns - window - side + 1, side):
+            cell = (slice(top, top + side), slice(left, left + side))
+            use = valid[cell]
+            if use.mean() < 0.5:
+                values.append(0.0)
+                continue
+            a, b = image[cell][use], moved[cell][use]
+            a, b = a - a.mean(), b - b.mean()
+            values.append(float(a @ b) / (math.sqrt(float(a @ a) * float(b @ b)) + 1e-12))
+    if not values:
+        a, b = image[valid], moved[valid]
+        values.append(float(a @ b) / (math.sqrt(float(a @ a) * float(b @ b)) + 1e-12) if a.size else 0.0)
+    return np.asarray(values), shift
+
+
+def _paired_t(values: np.ndarray, reference: np.ndarray) -> float:
+    """t-statistic of the mean difference of Fisher's z over tiles; 0 with fewer than four tiles."""
+    if len(values) != len(reference) or len(values) < 4:
+        return 0.0
+    gain = np.arctanh(np.clip(values, -0.999, 0.999)) - np.arctanh(np.clip(reference, -0.999, 0.999))
+    spread = float(np.std(gain, ddof=1)) / math.sqrt(len(gain))
+    return float(np.mean(gain)) / (spread + 1e-6)

@@ -1,0 +1,124 @@
+"""The bench that a command works on, opened by name: a virtual one, or a real headset by its configuration."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from firmware_iface.errors import InputError
+from trainer.captures.bench_file import Bench, read_bench
+
+if TYPE_CHECKING:
+    from runtime.headset.open_devices import Devices
+
+
+@dataclass(frozen=True)
+class OpenedBench:
+    """A headset, what is known of its bench, and the planes worth capturing (mm)."""
+
+    headset: Any
+    bench: Bench
+    planes_mm: tuple[float, ...]
+
+
+@dataclass
+class RealHeadset:
+    """Real devices as `capture_set` wants them: lasers within their set powers, a clock, and a focus.
+
+    power : fraction of full of each colour while it is lit. focus_mm : the plane that the camera is focused on
+    """
+
+    panel: Any
+    lasers: Any
+    camera: Any
+    power: Mapping[str, float]
+    focus_mm: float
+    focus: Any = None
+    started: float = field(default_factory=time.monotonic)
+
+    def __post_init__(self) -> None:
+        self.lasers = _Dimmed(self.lasers, self.power)
+
+    @property
+    def time_s(self) -> float:
+        """Seconds since it was opened."""
+        return time.monotonic() - self.started
+
+    def move_to_plane(self, plane_mm: float) -> None:
+        """Focus the camera on a plane. Raises InputError where the focus stays where it is and that is elsewhere."""
+        if self.focus is not None:
+            self.focus(plane_mm)
+        elif abs(plane_mm - self.focus_mm) > 1e-6:
+            raise InputError(
+                f"the camera is focused on {self.focus_mm:g} mm and cannot be moved to {plane_mm:g} mm: capture that "
+                "plane in a run of its own"
+            )
+
+
+@dataclass
+class _Dimmed:
+    """Lasers whose full power is what the configuration allows."""
+
+    lasers: Any
+    power: Mapping[str, float]
+
+    def set_power(self, channel: str, fraction: float) -> None:
+        self.lasers.set_power(channel, fraction * self.power.get(channel, 1.0))
+
+    def off(self) -> None:
+        self.lasers.off()
+
+
+@contextmanager
+def open_bench(spec: str, seed: int = 0, known: Bench | None = None) -> Iterator[OpenedBench]:
+    """The bench of `virtual:NAME`, of a virtual bench's TOML file, or of a real headset's configuration; then dark.
+
+    known : what is known of a real headset's bench, which its configuration does not say
+    Raises InputError, and DeviceError where a device fails.
+    """
+    from firmware_iface.virtual import open_headset
+    from runtime.headset.open_devices import configuration_of, open_devices
+
+    if configuration_of(spec) is None:
+        virtual = open_headset(spec, seed)
+        yield OpenedBench(virtual, nominal_bench(virtual), virtual.description.planes_mm)
+        return
+    if known is None:
+        raise InputError(
+            f"--bench {spec} is a real headset: give --known or --model, which says what is known of its bench"
+        )
+    with open_devices(spec, seed) as devices:
+        _check(devices, known)
+        headset = RealHeadset(
+            devices.panel, devices.lasers, devices.camera, devices.power, known.distance_mm, devices.focus
+        )
+        yield OpenedBench(headset, known, (known.distance_mm,))
+
+
+def _check(devices: Devices, bench: Bench) -> None:
+    """Raises InputError where the devices are not those of the bench."""
+    for what, has, said in (
+        ("panel is (rows, columns)", devices.panel.shape, bench.panel.shape),
+        ("camera's picture is (rows, columns)", devices.camera.shape, bench.camera.shape),
+        ("camera's bit depth is", devices.camera.bit_depth, bench.camera.bit_depth),
+    ):
+        if has != said:
+            raise InputError(f"the {what} {has} and the bench file says {said}: correct it there")
+    for channel in bench.channels:
+        if channel.name not in devices.lasers.channels:
+            names = ", ".join(devices.lasers.channels)
+            raise InputError(
+                f"the bench file has a channel '{channel.name}' and the lasers are {names}: correct one"
+            )
+
+
+def nominal_bench(headset: Any) -> Bench:
+    """What a person would write down of a virtual headset's bench."""
+    tables = headset.description.nominal()
+    levels = tables["panel"]["levels"]
+    if float(levels).is_integer():
+        tables["panel"]["levels"] = int(levels)
+    return read_bench(tables)

@@ -1,0 +1,1 @@
+"""What a model lacks: screening, ranking, verdicts, explanations, and where the error is."""

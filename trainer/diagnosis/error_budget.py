@@ -1,0 +1,107 @@
+"""Where the error of a prediction goes: named physics, what was learned, the camera's noise, and what is left.
+
+All are shares of the measured signal's variance on held-out captures, and add up to the ideal model's mean squared
+error: what the named effects take from it, what the panel's learned field and the network take after them (both are
+booked as `network`), the noise that nothing can take, and the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from firmware_iface.errors import InputError
+from trainer.captures.batches import load_batch, split
+from trainer.captures.capture_set import CaptureSet
+from trainer.fitting.excess import Errors, errors_of, join
+from trainer.fitting.gauss_newton import Predictor
+from trainer.model.model import Model
+from trainer.networks.approximator import Approximator
+from trainer.training.pairs import display_irradiance, expected_counts, onto_camera, stacked
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Shares of the signal's variance; `named_physics` and `network` are negative where they make it worse."""
+
+    named_physics: float
+    network: float
+    noise: float
+    unexplained: float
+
+    @property
+    def ideal(self) -> float:
+        """The ideal model's mean squared error, of which the others are parts."""
+        return self.named_physics + self.network + self.noise + self.unexplained
+
+
+def error_budget(
+    captures: CaptureSet, model: Model, network: Approximator | None = None, progress: Progress | None = None
+) -> Budget:
+    """The budget on the held-out captures of a set.
+
+    model : of the bench, with its gains. network : trained on what the model leaves; None: none
+    Raises InputError where the network is of another panel or other colours, and where there is no contrast.
+    """
+    from trainer.diagnosis.compare import with_gains
+
+    parts = split(captures)
+    if network is not None:
+        _check(network, captures)
+    ideal = with_gains(captures, Model(captures.bench, method=model.method), parts.fitted)
+    model = with_gains(captures, model, parts.fitted)
+    named = model
+    if model.panel_field is not None:
+        named = with_gains(captures, replace(model, gain={}, panel_field=None), parts.fitted)
+    stacks = stacked(captures, parts.held_out)
+    rows: list[tuple[Errors, Errors, Errors]] = []
+    with torch.no_grad():
+        for k, stack in enumerate(stacks):
+            batches = [None if c is None else load_batch(captures, [c]) for c in stack]
+            changes = _changes(model, network, batches)
+            for batch, change in zip(batches, changes, strict=True):
+                if batch is None or not bool(batch.weight.any()):
+                    continue
+                scene, stages, expected, sensitivity = expected_counts(model, batch)
+                with_network = expected
+                if change is not None:
+                    with_network = expected + sensitivity * onto_camera(scene, stages, change)
+                physical = expected if named is model else Predictor(named, batch).predict(named)
+                predictions = (Predictor(ideal, batch).predict(ideal), physical, with_network)
+                rows.append(tuple(errors_of(batch, one) for one in predictions))  # type: ignore[arg-type]
+            if progress:
+                progress((k + 1) / len(stacks))
+    if not rows or not float(sum(row[0].variance.sum() for row in rows)) > 0:
+        raise InputError(f"the held-out captures of {captures.folder} have no contrast to compare with")
+    bare, known, learned = (join([row[k] for row in rows]) for k in range(3))
+    return Budget(
+        bare.excess - known.excess,
+        known.excess - learned.excess,
+        learned.noise_nrmse**2,
+        learned.excess,
+    )
+
+
+def _changes(model: Model, network: Approximator | None, batches: list) -> list[Tensor | None]:
+    """What the network adds to the irradiance of each colour of a picture, [H, W]; None without a network."""
+    if network is None:
+        return [None] * len(batches)
+    shape = model.bench.panel.shape
+    planes = [torch.zeros(shape) if b is None else display_irradiance(model, b) for b in batches]
+    shown = torch.stack(planes)
+    return list((network(shown[None]) - shown)[0])
+
+
+def _check(network: Approximator, captures: CaptureSet) -> None:
+    one, bench = network.architecture, captures.bench
+    if one.shape != bench.panel.shape or one.planes != len(bench.channels):
+        raise InputError(
+            f"the network was trained for {one.planes} colours of {one.shape[0]} x {one.shape[1]} pixels and "
+            f"{captures.folder} has {len(bench.channels)} of {bench.panel.height} x {bench.panel.width}: train one "
+            "for it"
+        )

@@ -1,0 +1,62 @@
+"""Which captures would tell two explanations apart: where their predictions differ most."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+
+from firmware_iface.errors import InputError
+from trainer.captures.batches import Batch, load_batch
+from trainer.fitting.gauss_newton import Predictor
+from trainer.model.model import Model
+
+if TYPE_CHECKING:
+    from trainer.diagnosis.diagnose import Parts
+
+PLANES = (0.6, 1.6)  # other planes proposed, as shares of the distance
+
+
+def captures_that_separate(parts: Parts, one: tuple[str, Model], other: tuple[str, Model]) -> list[str]:
+    """Sentences, most telling first; none where no proposed capture tells more than those at hand.
+
+    For each proposal both models predict the same patterns; what counts is the squared difference, with the gain
+    left free, over the variance of the signal.
+    """
+    row = parts.fitted[0]
+    batch = load_batch(parts.captures, [row])
+    here = _difference(one[1], other[1], batch)
+    channels = [c.name for c in parts.captures.bench.channels]
+    proposals = [
+        (f"the same patterns at {row.plane_mm * f:.3g} mm", replace(batch, plane_mm=row.plane_mm * f))
+        for f in PLANES
+    ]
+    unused = [c for c in channels if c not in parts.captures.channels]
+    proposals += [(f"the same patterns in {c}", replace(batch, channel=c)) for c in unused]
+    found = []
+    for words, moved in proposals:
+        try:
+            there = _difference(one[1], other[1], moved)
+        except InputError:  # the plane is out of the light path's reach
+            continue
+        if there > max(3 * here, 1e-4):
+            found.append((there, words))
+    found.sort(reverse=True)
+    return [
+        f"{words}: {one[0]} and {other[0]} differ there by {100 * there**0.5:.1f} % of the signal's rms"
+        for there, words in found
+    ]
+
+
+def _difference(one: Model, other: Model, batch: Batch) -> float:
+    with torch.no_grad():
+        predictions = []
+        for model in (one, other):
+            gains = {batch.channel: next(iter(model.gain.values())), **model.gain}
+            model = Model(model.bench, model.present, gains, model.method)
+            predictor = Predictor(model, batch)
+            predictions.append(predictor.predict(model))
+        a, b = predictions
+        b = b * (a * b).sum() / (b * b).sum()
+        return float(((a - b) ** 2).mean() / a.var())

@@ -1,0 +1,185 @@
+"""Starting points read off the data, for effects that a derivative at "absent" does not reach.
+
+Displacement between prediction and picture is found tile by tile from the peak of their cross-correlation; a second,
+displaced picture from the cross-correlation of the residual with the prediction.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+if TYPE_CHECKING:  # effects name these starts, and the light path's trainer side names effects
+    from trainer.captures.batches import Batch
+    from trainer.captures.bench_file import Bench
+    from trainer.prediction.scene import Scene
+
+Starts = list[dict[str, Any]]
+TILE = 64
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """One colour and plane: its scene, the captures, and what the model predicts for them [B, h, w], counts."""
+
+    scene: Scene
+    batch: Batch
+    prediction: Tensor
+
+
+def displacements(evidence: Evidence) -> tuple[NDArray, NDArray, NDArray]:
+    """How far the picture lies from the prediction, tile by tile: centres [n, 2] and shifts [n, 2] (camera pixels),
+    weights [n]. Rows first; centres from the picture's; a positive shift moves the picture's content down or right.
+    """
+    batch = evidence.batch
+    seen = (batch.signal * batch.weight).double().numpy()
+    expected = (evidence.prediction * batch.weight).double().numpy()
+    height, width = seen.shape[-2:]
+    size = min(TILE, height // 2, width // 2)
+    taper = np.outer(np.hanning(size + 2)[1:-1], np.hanning(size + 2)[1:-1])
+    centres, shifts, weights = [], [], []
+    for top in _tops(height, size):
+        for left in _tops(width, size):
+            place = (slice(None), slice(top, top + size), slice(left, left + size))
+            peak = _peak(_correlation(seen[place], expected[place], taper))
+            centres.append((top + (size - height) / 2, left + (size - width) / 2))
+            shifts.append(peak[:2])
+            weights.append(max(peak[2], 0.0) ** 2)
+    return np.array(centres), np.array(shifts), np.array(weights)
+
+
+def registration_starts(evidence: Sequence[Evidence]) -> Starts:
+    """Shift, rotation and magnification that bring the prediction onto the picture."""
+    centres, shifts, weights = displacements(evidence[0])
+    y, x = centres.T
+    zero, one = np.zeros_like(y), np.ones_like(y)
+    # A camera pixel sees a place that much further on: the opposite of where the content went.
+    rows = np.concatenate([np.stack([one, zero, x, y], 1), np.stack([zero, one, -y, x], 1)])
+    solution = _robust(rows, np.concatenate([-shifts[:, 0], -shifts[:, 1]]), np.tile(weights, 2))
+    shift = np.median(-shifts[weights > np.median(weights) / 2], axis=0)
+    return [
+        {
+            "shift_y": solution[0],
+            "shift_x": solution[1],
+            "rotation": 1e3 * solution[2],
+            "magnification": 1e2 * solution[3],
+        },
+        {"shift_y": shift[0], "shift_x": shift[1]},
+    ]
+
+
+def wavefront_starts(evidence: Sequence[Evidence]) -> Starts:
+    """Legendre terms (second order) of the wavefront whose slope displaces the picture as it is displaced.
+
+    A phase slope k (rad/m) at the panel moves light by lambda z k / (2 pi).
+    """
+    one = evidence[0]
+    bench = one.scene.bench
+    centres, shifts, weights = _on_panel(bench, *displacements(one))
+    half = np.array(bench.panel.shape) / 2
+    to_pixels = one.scene.wavelength * one.scene.plane_mm * 1e-3 / (2 * math.pi * bench.panel.pitch**2)
+    y, x = (centres / half).T
+    zero, unit = np.zeros_like(y), np.ones_like(y)
+    # Slopes of P1(y), P1(x), P2(y), P1(y) P1(x), P2(x) in the order of `legendre_maps`: (0,1),(1,0) then n = 2.
+    slope_y = np.stack([unit, zero, 3 * y, x, zero], 1) / half[0]
+    slope_x = np.stack([zero, unit, zero, y, 3 * x], 1) / half[1]
+    rows = to_pixels * np.concatenate([slope_y, slope_x])
+    solution = _robust(rows, np.concatenate([shifts[:, 0], shifts[:, 1]]), np.tile(weights, 2))
+    colour = one.scene.wavelength / bench.channels[0].wavelength
+    return [{"wavefront": solution * colour}]
+
+
+def ghost_starts(evidence: Sequence[Evidence], most: int = 3) -> Starts:
+    """Displacements, panel pixels, at which the residual looks most like the prediction."""
+    one = evidence[0]
+    batch = one.batch
+    residual = ((batch.signal - one.prediction) * batch.weight).double().numpy()
+    expected = one.prediction.double().numpy()
+    height, width = expected.shape[-2:]
+    taper = np.outer(np.hanning(height + 2)[1:-1], np.hanning(width + 2)[1:-1])
+    correlation = np.abs(_correlation(residual, expected, taper, whiten=False))
+    correlation[:2, :2] = correlation[:2, -1:] = correlation[-1:, :2] = correlation[-1:, -1:] = 0
+    starts = []
+    for _ in range(most):
+        i, j = np.unravel_index(int(correlation.argmax()), correlation.shape)
+        dy, dx = (int(k) - n if k > n / 2 else int(k) for k, n in ((i, height), (j, width)))
+        _, shift, _ = _on_panel(one.scene.bench, np.zeros((1, 2)), np.array([[dy, dx]], float), np.ones(1))
+        starts.append({"amplitude": 0.02, "shift_y": shift[0, 0], "shift_x": shift[0, 1]})
+        for a in range(-2, 3):
+            for b in range(-2, 3):
+                correlation[(i + a) % height, (j + b) % width] = 0
+    return starts
+
+
+def gain_spread(evidence: Sequence[Evidence]) -> dict[str, Any]:
+    """Standard deviation (%) of the gain from capture to capture, about each colour's mean."""
+    own: dict[str, list[float]] = {}
+    for one in evidence:
+        seen, expected, weight = (t.double() for t in (one.batch.signal, one.prediction, one.batch.weight))
+        gains = (weight * seen * expected).sum((-2, -1)) / (weight * expected**2).sum((-2, -1))
+        own.setdefault(one.batch.channel, []).extend(gains.tolist())
+    deviations = np.concatenate([np.array(g) / np.mean(g) - 1 for g in own.values()])
+    return {"spread": max(0.01, 100 * float(np.std(deviations)))}
+
+
+def _on_panel(
+    bench: Bench, centres: NDArray, shifts: NDArray, weights: NDArray
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Displacements as `displacements` gives them, in panel pixels; centres from the panel's."""
+    camera = bench.camera
+    middle = (np.array(camera.shape) - 1) / 2
+    there = np.stack(camera.on_panel(*(centres + middle).T), 1)
+    moved = np.stack(camera.on_panel(*(centres + middle + shifts).T), 1)
+    return there - (np.array(bench.panel.shape) - 1) / 2, moved - there, weights
+
+
+def _tops(length: int, size: int) -> list[int]:
+    count = max(2, round(1.5 * length / size))
+    return [round(k * (length - size) / (count - 1)) for k in range(count)]
+
+
+def _correlation(seen: NDArray, expected: NDArray, taper: NDArray, whiten: bool = True) -> NDArray:
+    """Circular cross-correlation over the captures, normalised so that 1 is a perfect match; peak at the shift."""
+    a, b = (
+        np.fft.fft2((t - t.mean((-2, -1), keepdims=True)) * taper, axes=(-2, -1)) for t in (seen, expected)
+    )
+    cross = (a * np.conj(b)).sum(0)
+    if whiten:
+        cross = cross / np.sqrt(np.abs(cross) + 1e-3 * np.abs(cross).max() + 1e-30)
+    result = np.fft.ifft2(cross).real
+    return result / (np.sqrt((np.abs(cross) ** 2).sum()) / cross.size**0.5 + 1e-30)
+
+
+def _peak(correlation: NDArray) -> tuple[float, float, float]:
+    """Place (rows, columns; signed, to a fraction of a pixel) and height of the highest peak."""
+    height, width = correlation.shape
+    i, j = (int(k) for k in np.unravel_index(int(correlation.argmax()), correlation.shape))
+
+    def part(before: float, here: float, after: float) -> float:
+        bend = before - 2 * here + after
+        return 0.0 if bend >= 0 else max(-0.5, min(0.5, 0.5 * (before - after) / bend))
+
+    dy = part(correlation[i - 1, j], correlation[i, j], correlation[(i + 1) % height, j])
+    dx = part(correlation[i, j - 1], correlation[i, j], correlation[i, (j + 1) % width])
+    y, x = i + dy, j + dx
+    return (y - height if y > height / 2 else y, x - width if x > width / 2 else x, float(correlation[i, j]))
+
+
+def _robust(rows: NDArray, values: NDArray, weights: NDArray) -> NDArray:
+    """Weighted least squares that lets go of outliers (Huber, a few rounds)."""
+    weights = weights + 1e-12
+    solution = np.zeros(rows.shape[1])
+    factor = np.ones_like(values)
+    for _ in range(6):
+        root = np.sqrt(weights * factor)
+        solution = np.linalg.lstsq(rows * root[:, None], values * root, rcond=None)[0]
+        error = np.abs(values - rows @ solution)
+        typical = max(1.5 * float(np.median(error)), 0.05)
+        factor = np.minimum(1, typical / np.maximum(error, 1e-12))
+    return solution

@@ -1,1 +1,0 @@
-"""Every method side by side on one virtual bench: `evaluate`."""

@@ -1,0 +1,1 @@
+"""Fits of models to captures: Gauss-Newton, free-form maps, and where independent fits run."""

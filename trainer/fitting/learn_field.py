@@ -1,0 +1,150 @@
+"""Learning the panel's field from captures: what acts on the wave there and no effect names.
+
+Most probable maps given the captures: squared errors in units of the noise's variance, and a Gaussian prior a pixel
+about "absent", which holds what the captures do not say. Stopped by captures that the gradient does not see.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from trainer.captures.batches import Batch, load, sample, split
+from trainer.captures.capture_set import Capture, CaptureSet
+from trainer.diagnosis.candidates import evaluate_captures
+from trainer.diagnosis.compare import with_gains
+from trainer.diagnosis.diagnose import FIT_CAPTURES, heldout_json
+from trainer.diagnosis.explain import recorded
+from trainer.fitting.excess import Errors
+from trainer.fitting.free_form_maps import Kind, Tensors, Working, descend
+from trainer.fitting.gauss_newton import fit
+from trainer.model.model import Model
+from trainer.prediction.panel_field import NAME, UNITS, combined, with_field
+from trainer.prediction.scene import Stages
+
+SPREAD = {
+    "log_amplitude": 0.2,
+    "phase": 0.2,
+    "added_real": 0.03,
+    "added_imaginary": 0.03,
+}  # of the prior, UNITS
+FLOOR = 0.1  # of the mean noise variance, added to each pixel's: no dark pixel is trusted without end
+ITERATIONS, ROUNDS = 10, 20  # between two looks at the captures that say when to stop; of such
+REFITS = 8  # iterations of the effects' fit beside the field
+REFINED, REFINED_ROUNDS = 0.1, 10  # share of the prior's spread, and rounds, for the field of one picture
+
+
+@dataclass(frozen=True)
+class Learned:
+    """A model with its learned field, and held-out errors without and with it."""
+
+    model: Model
+    before: Errors
+    after: Errors
+
+    def as_json(self) -> dict[str, Any]:
+        """For `--json`: both errors, and the range of each map over the panel's pixels."""
+        assert self.model.panel_field is not None
+        maps = {
+            f"{name}_{unit}" if unit != "1" else name: {
+                "lowest": float(self.model.panel_field[name].min()),
+                "highest": float(self.model.panel_field[name].max()),
+            }
+            for name, unit in UNITS.items()
+        }
+        return {"before": heldout_json(self.before), "after": heldout_json(self.after), "maps": maps}
+
+
+def learn_field(
+    captures: CaptureSet, model: Model, progress: Callable[[float], None] | None = None
+) -> Learned:
+    """The model with a field learned from the captures that fits may see, judged on the others.
+
+    A field that is there already is learned anew. Raises InputError as the capture set's reader does.
+    """
+    parts = split(captures)
+    model = with_gains(captures, replace(model, gain={}, panel_field=None), parts.fitted)
+    before = evaluate_captures(captures, parts.held_out, model)
+    learned = with_learned_field(captures, parts.fitted, model, progress)
+    after = evaluate_captures(captures, parts.held_out, learned)
+    return Learned(recorded(learned, NAME, after), before, after)
+
+
+def with_learned_field(
+    captures: CaptureSet,
+    rows: Sequence[Capture],
+    model: Model,
+    progress: Callable[[float], None] | None = None,
+) -> Model:
+    """The model, whose gains are fitted, with a field learned from these captures.
+
+    Its effects were fitted to light that the field was missing from, so they are fitted once more beside the field,
+    and the field is learned anew beside them. The last capture of each colour and plane says when to stop, and is not
+    learned from unless it is the only one.
+    """
+    say = progress or (lambda done: None)
+    last = list({(c.channel, c.plane_mm): c for c in rows}.values())
+    first = [c for c in rows if c not in last] or list(rows)
+
+    def learned(begin: Model, share: float) -> Model:
+        seen, unseen = (_working(begin, load(captures, part)) for part in (first, last))
+        found = _descend(begin, SPREAD, seen, unseen, ROUNDS, lambda done: say(share + 0.5 * done))
+        return replace(begin, panel_field=found)
+
+    once = learned(model, 0.0)
+    if model.present:
+        pixels = captures.bench.camera.height * captures.bench.camera.width
+        few = load(captures, sample(rows, pixels, FIT_CAPTURES))
+        again = fit(once, once.names, few, iterations=REFITS).model
+        once = learned(replace(again, panel_field=None), 0.5)
+    return with_gains(captures, replace(once, gain={}), rows)
+
+
+def with_refined_field(model: Model, sets: Sequence[tuple[CaptureSet, Sequence[Capture]]]) -> Model:
+    """The model with its field refined for the few pictures of these captures (seed section 7, on the wave).
+
+    What pixels of this size cannot say of dust and the like differs from picture to picture; near one picture's
+    patterns a slightly different field says it.
+    """
+    assert model.panel_field is not None
+    narrow = {name: REFINED * spread for name, spread in SPREAD.items()}
+    seen = []
+    for captures, rows in sets:
+        seen += _working(with_gains(captures, replace(model, gain={}), rows), load(captures, rows))
+    found = _descend(model, narrow, seen, seen, REFINED_ROUNDS)
+    return replace(model, panel_field=combined(model.panel_field, found))
+
+
+def _descend(
+    model: Model,
+    spread: Mapping[str, float],
+    seen: Sequence[Working],
+    unseen: Sequence[Working],
+    rounds: int,
+    progress: Callable[[float], None] | None = None,
+) -> dict[str, np.ndarray]:
+    """Most probable maps on top of the model; a unit of the optimiser's variables is large, over the whole panel."""
+    height, width = model.bench.panel.shape
+    unit = 5 * math.sqrt(height * width)
+    shapes: dict[str, tuple[tuple[int, ...], float]] = {n: ((height, width), unit * spread[n]) for n in UNITS}
+
+    def apply(stages: Stages, maps: Tensors) -> Stages:
+        return replace(stages, panel=with_field(stages.panel, maps))
+
+    kind = Kind("panel", shapes, apply, lambda maps: [], spread)
+    pixels = sum(float((w.batch.weight > 0).sum()) for w in seen)
+    found = descend(kind, seen, unseen, max(pixels, 1.0), ITERATIONS, rounds, progress)
+    return {name: map_.numpy() for name, map_ in found.items()}
+
+
+def _working(model: Model, batches: Sequence[Batch]) -> list[Working]:
+    """Batches whose squared errors are multiples of the noise's variance."""
+    found = []
+    for batch in batches:
+        noise = batch.noise + FLOOR * batch.noise.mean()
+        found.append(Working(model, replace(batch, weight=batch.weight / noise)))
+    return found

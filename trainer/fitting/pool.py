@@ -1,0 +1,227 @@
+"""Where independent fits run: processes of this machine, this very process, or a Dask cluster."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import pickle
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import (
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    as_completed,
+)
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from firmware_iface.errors import InputError
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+T = TypeVar("T")
+
+ANSWER_S = 5.0  # a Dask scheduler that has not answered by then is not there
+LOST = (
+    "a process that was fitting has gone, as when memory runs out: "
+    "use fewer --workers or smaller captures, and try again"
+)
+
+
+@dataclass(frozen=True)
+class Pool:
+    """A `concurrent.futures` executor, how many tasks it runs at once, and whether in other processes."""
+
+    executor: Executor
+    workers: int
+    elsewhere: bool = True
+
+    def map(
+        self,
+        function: Callable[..., T],
+        tasks: Iterable[tuple[Any, ...]],
+        progress: Callable[[int], None] | None = None,
+    ) -> list[T]:
+        """Results of `function(*task)` in the order of the tasks; `progress` is told how many are done.
+
+        Raises what the function raises, and InputError when a process that works on tasks is lost.
+        """
+        if self.elsewhere:
+            packed = [pickle.dumps((function, task)) for task in tasks]
+            futures: list[Future[Any]] = [self.executor.submit(_packed, p) for p in packed]
+        else:
+            futures = [self.executor.submit(function, *task) for task in tasks]
+        try:
+            for done, _ in enumerate(as_completed(futures), 1):
+                if progress:
+                    progress(done)
+            results = [f.result() for f in futures]
+            return [pickle.loads(r) for r in results] if self.elsewhere else results
+        except (BrokenExecutor, CancelledError) as error:
+            raise InputError(LOST) from error
+        except BaseException:
+            for f in futures:
+                f.cancel()
+            raise
+
+
+def cores() -> int:
+    """Processors this process may use; OMP_NUM_THREADS lowers it, as everywhere."""
+    here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+    told = os.environ.get("OMP_NUM_THREADS", "")
+    return min(here, int(told)) if told.isdigit() and int(told) > 0 else here
+
+
+@contextmanager
+def open_pool(workers: int | None = None, cluster: str | None = None) -> Iterator[Pool]:
+    """A pool of `workers` processes (default: one a processor; 1: this process), or of a Dask cluster.
+
+    Cluster workers need hololoop installed, and the capture set and effect files at the same paths. Raises
+    InputError when the cluster does not answer, has no workers, or its workers have no hololoop.
+    """
+    if cluster is not None:
+        with _cluster(cluster) as pool:
+            yield pool
+        return
+    count = workers or cores()
+    if count < 1:
+        raise InputError(f"--workers {workers}: give a number of processes from 1 on")
+    if count == 1:
+        yield Pool(_Here(), 1, elsewhere=False)
+        return
+    executor = _Processes(count, multiprocessing.get_context("spawn"), _single_threaded)
+    try:
+        yield Pool(executor, count)
+    except BaseException:
+        busy = list((executor._processes or {}).values())  # which `shutdown` forgets
+        executor.shutdown(wait=False, cancel_futures=True)
+        for process in busy:
+            process.terminate()
+        raise
+    executor.shutdown()
+
+
+@contextmanager
+def _cluster(address: str) -> Iterator[Pool]:
+    try:
+        from distributed import Client
+        from distributed.scheduler import KilledWorker
+    except ImportError as error:
+        raise InputError("--cluster needs Dask: pip install 'hololoop[cluster]'") from error
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # one sentence says it, below
+    try:
+        _greet(address)
+        client = Client(address, timeout=ANSWER_S, set_as_default=False)
+    except Exception as error:  # whatever a stranger at that address may have said
+        known = str(error) if isinstance(error, OSError | ValueError) else ""
+        raise InputError(
+            f"no Dask scheduler answers at {address!r} ({known or 'what is there does not speak Dask'}): "
+            "start one, or leave --cluster out"
+        ) from error
+    try:
+        _prepare(client, address)
+        yield Pool(client.get_executor(pure=False), max(1, sum(client.nthreads().values())))
+    except KilledWorker as error:
+        raise InputError(LOST) from error
+    finally:
+        client.close(timeout=ANSWER_S)
+
+
+def _greet(address: str) -> None:
+    """Waits for a scheduler's first words; by itself a client waits for them for ever."""
+    import asyncio
+
+    from distributed.comm import connect
+
+    async def greeted() -> None:
+        comm = await connect(address, timeout=ANSWER_S)
+        comm.abort()
+
+    with ThreadPoolExecutor(1) as thread:  # a notebook's own thread runs a loop already
+        thread.submit(lambda: asyncio.run(asyncio.wait_for(greeted(), ANSWER_S))).result()
+
+
+def _prepare(client: Client, address: str) -> None:
+    """Sees that there are workers, that they have hololoop, and that they read effect files again."""
+    if not client.nthreads():
+        raise InputError(
+            f"the Dask scheduler at {address} has no workers: start one with: dask worker {address}"
+        )
+    try:
+        client.run(import_module, __name__)
+        client.run(_forget)
+    except ImportError as error:
+        raise InputError(
+            f"a Dask worker of {address} cannot use hololoop ({error}): "
+            "install it there, with the extra 'trainer'"
+        ) from error
+
+
+def _forget() -> None:
+    """Drops the effect files that an earlier run has left in a worker: they may have changed since."""
+    import trainer.diagnosis.candidates  # noqa: F401 - says early what a worker lacks
+    from trainer.effects import definition
+
+    definition._loaded.clear()
+
+
+class _Here(Executor):
+    """Runs each task at once in this process, so that Ctrl-C stops it there and then."""
+
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        """The finished future of a call."""
+        future: Future[T] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+class _Processes(ProcessPoolExecutor):
+    """Processes that Ctrl-C does not reach, from their very start: it is their parent's to handle."""
+
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        """The future of a call; starts a process where one is wanting."""
+        if not hasattr(signal, "pthread_sigmask"):  # Windows
+            return super().submit(fn, *args, **kwargs)
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # processes inherit it
+        try:
+            return super().submit(fn, *args, **kwargs)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _packed(task: bytes) -> bytes:
+    """Runs a task; a worker that cannot read it gives the error back, where Dask's own would never answer.
+
+    Results are bytes for torch's sake, which otherwise passes tensors through sockets and shared memory.
+    """
+    function, arguments = pickle.loads(task)
+    return pickle.dumps(function(*arguments))
+
+
+def _single_threaded() -> None:
+    import torch
+
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+    torch.set_num_threads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # where there are no masks
+
+
+def _end_with_parent() -> None:
+    """A worker whose parent was killed has nobody to work for, and would wait for tasks for ever."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

@@ -1,0 +1,186 @@
+"""A model as a bundle for the headset: each colour and plane's light path, baked into arrays.
+
+Only what the eye sees too goes in: effects that are told to the camera explain the measurement and stay out.
+Arrays are computed in double precision and stored as float32 and complex64.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from firmware_iface.errors import InputError
+from runtime.bundle.bundle_folder import write_bundle
+from runtime.bundle.light_path_arrays import pack_light_paths
+from runtime.lightpath.light_path import Grid, LightPath
+from trainer.captures.batches import scenes
+from trainer.captures.capture_set import CaptureSet
+from trainer.effects.definition import Effect
+from trainer.model.model import Model
+from trainer.model.parameters import json_values
+from trainer.prediction.predict import light_path
+from trainer.prediction.scene import scene_for, stages_of
+
+
+def export_bundle(
+    model: Model,
+    captures: CaptureSet | None,
+    folder: Path | str,
+    *,
+    network: Path | None = None,
+    replace_folder: bool = False,
+) -> dict[str, Any]:
+    """Write a model's light paths as a bundle, and say what went in.
+
+    captures: what the model was fitted to, for its planes and its hash; without it the bench's own distance,
+    for every colour. network: file of a trained approximator, which goes in as ONNX. Raises InputError where the
+    folder is not empty (unless `replace_folder`), where a plane cannot be computed, and where the network was
+    trained for another panel or other colours.
+    """
+    if model.method == "fraunhofer":
+        raise InputError(
+            "a far-field model cannot be exported: the headset's light path is angular_spectrum or fresnel; change "
+            "method under [propagation] in the model file"
+        )
+    shown, left_out = (
+        told_to_display(model),
+        [p.effect for p in model.present if p.effect.told_to != "display"],
+    )
+    wanted = _colours_and_planes(model, captures)
+    baked = [
+        (channel, plane, model.bench.channel(channel).wavelength_nm, baked_path(shown, channel, plane))
+        for channel, plane in wanted
+    ]
+    records, arrays = pack_light_paths(baked)
+    panel = model.bench.panel
+    description: dict[str, Any] = {
+        "panel": {
+            "height": panel.height,
+            "width": panel.width,
+            "pitch_um": panel.pitch_um,
+            "levels": panel.levels,
+            "phase_sign": panel.phase_sign,
+        },
+        "channels": [
+            {"name": c.name, "wavelength_nm": c.wavelength_nm}
+            for c in model.bench.channels
+            if c.name in {channel for channel, _ in wanted}
+        ],
+        "distance_mm": model.bench.distance_mm,
+        "planes_mm": sorted({plane for _, plane in wanted}),
+        "method": model.method,
+        "paths": records,
+    }
+    provenance: dict[str, Any] = {
+        "bench": model.bench.name,
+        "captures_sha256": captures.content_hash() if captures else None,
+        "code_version": code_version(),
+        "heldout": _last_errors(model),
+        "history": list(model.history),
+        "effects": [
+            {"effect": p.effect.name, "stage": p.effect.stage, "parameters": json_values(p, model.bench)}
+            for p in shown.present
+        ],
+        "effects_left_out": [_named(e) for e in left_out],
+        "panel_field": shown.panel_field is not None,
+    }
+    files: dict[str, bytes] = {}
+    if network is not None:
+        files, provenance["network"] = _network_files(
+            network, model, [c["name"] for c in description["channels"]]
+        )
+    write_bundle(folder, arrays, description, provenance, networks=files, replace=replace_folder)
+    return {
+        "bundle": str(folder),
+        "channels": [c["name"] for c in description["channels"]],
+        "planes_mm": description["planes_mm"],
+        "effects": list(shown.names),
+        "effects_left_out": [e.name for e in left_out],
+        "panel_field": shown.panel_field is not None,
+        "heldout": provenance["heldout"],
+        "arrays": len(arrays),
+        "network": None if network is None else str(network),
+        "megabytes": round((sum(a.nbytes for a in arrays.values()) + sum(map(len, files.values()))) / 1e6, 3),
+    }
+
+
+def _network_files(path: Path, model: Model, channels: list[str]) -> tuple[dict[str, bytes], dict[str, Any]]:
+    """ONNX files of a trained approximator, and what its own file says of it."""
+    from trainer.networks.approximator import read_approximator
+    from trainer.networks.onnx_files import onnx_files
+
+    network, about = read_approximator(path)
+    shape = network.architecture.shape
+    if shape != model.bench.panel.shape:
+        raise InputError(
+            f"{path} was trained for a panel of {shape[0]} x {shape[1]} and the model's has "
+            f"{model.bench.panel.height} x {model.bench.panel.width} pixels: train one for it"
+        )
+    learned = about.get("channels", [])
+    if learned != channels or network.architecture.planes != len(channels):
+        raise InputError(
+            f"{path} was trained on {', '.join(learned) or 'no known colours'} and the bundle has "
+            f"{', '.join(channels)}: give the captures of the same colours"
+        )
+    beyond = about.get("effects", list(model.parts))
+    if sorted(beyond) != sorted(model.parts):
+        raise InputError(
+            f"{path} was trained beyond {', '.join(beyond) or 'the ideal model'} and the model has "
+            f"{', '.join(model.parts) or 'no effects'}: give the model that it was trained with"
+        )
+    return onnx_files(network), about
+
+
+def told_to_display(model: Model) -> Model:
+    """The model with the effects that the eye sees too, and no others."""
+    return replace(model, present=tuple(p for p in model.present if p.effect.told_to == "display"))
+
+
+def baked_path(model: Model, channel: str, plane_mm: float) -> LightPath:
+    """A model's light path for one colour and plane, as float32 and complex64 NumPy arrays."""
+    with torch.no_grad():
+        scene = scene_for(model, channel, plane_mm, torch.float64)
+        path = light_path(scene, stages_of(scene, model))
+    return LightPath(**{f.name: _single(getattr(path, f.name)) for f in fields(path)})
+
+
+def code_version() -> str:
+    """Version of the installed distribution."""
+    try:
+        return version("hololoop")
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def _single(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(_single(part) for part in value)
+    if isinstance(value, Tensor):
+        return value.to(torch.complex64 if value.is_complex() else torch.float32).numpy()
+    if value is None or isinstance(value, Grid):
+        return value
+    raise TypeError(f"a light path does not hold {type(value).__name__}")
+
+
+def _colours_and_planes(model: Model, captures: CaptureSet | None) -> Sequence[tuple[str, float]]:
+    if captures is not None and len(captures):
+        return scenes(captures.captures)
+    return [(c.name, model.bench.distance_mm) for c in model.bench.channels]
+
+
+def _last_errors(model: Model) -> dict[str, float] | None:
+    for record in reversed(model.history):
+        errors = {k: record[k] for k in ("nrmse", "noise_nrmse", "excess") if k in record}
+        if errors:
+            return errors
+    return None
+
+
+def _named(effect: Effect) -> dict[str, str]:
+    return {"effect": effect.name, "stage": effect.stage, "told_to": effect.told_to}

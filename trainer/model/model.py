@@ -1,0 +1,106 @@
+"""A model of a bench: what the bench file says, and the effects that have been added to it, in order."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from trainer.captures.bench_file import Bench
+from trainer.effects.definition import Effect, Parameter
+from trainer.prediction.panel_field import NAME
+
+Values = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Present:
+    """An effect in a model: its order, and its parameters' values and standard errors."""
+
+    effect: Effect
+    order: int
+    values: Values
+    errors: Values | None = None
+
+    def with_values(self, values: Mapping[str, np.ndarray]) -> Present:
+        """The same with other values; errors are forgotten."""
+        return replace(self, values=dict(values), errors=None)
+
+
+@dataclass(frozen=True)
+class Model:
+    """The light path that is believed in.
+
+    present : effects in the order in which they were added
+    gain : counts a unit of irradiance and millisecond, by channel; empty before anything was fitted
+    method : propagation
+    history : one record a step: what was added, and the held-out error after it
+    panel_field : maps of the panel's learned field by name, float32 [m, n]; None: nothing was learned
+    """
+
+    bench: Bench
+    present: tuple[Present, ...] = ()
+    gain: Mapping[str, float] = field(default_factory=dict)
+    method: str = "angular_spectrum"
+    history: tuple[dict[str, Any], ...] = ()
+    panel_field: Mapping[str, np.ndarray] | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects that are present."""
+        return tuple(p.effect.name for p in self.present)
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Names of all that a network learns beyond: the effects, and the learned field."""
+        return self.names if self.panel_field is None else (*self.names, NAME)
+
+    def having(self, added: Present) -> Model:
+        """The model with an effect added, or put in the place of one of the same name."""
+        others = tuple(p for p in self.present if p.effect.name != added.effect.name)
+        if len(others) == len(self.present):
+            return replace(self, present=(*self.present, added))
+        return replace(
+            self, present=tuple(added if p.effect.name == added.effect.name else p for p in self.present)
+        )
+
+
+def absent(effect: Effect, bench: Bench, order: int | None = None) -> Present:
+    """The effect at the values at which it is not there, at its lowest order unless another is given."""
+    order = effect.orders[0] if order is None else order
+    channels = len(bench.channels)
+    values = {
+        p.name: np.full(p.shape(order, channels), p.absent_value(bench), dtype=np.float64)
+        for p in effect.parameters
+    }
+    return Present(effect, order, values)
+
+
+def raised(present: Present, bench: Bench, order: int) -> Present:
+    """The same effect at a higher order: known terms kept, new ones absent.
+
+    Terms are ordered lowest first within each row; a parameter whose rows change length (rows of displacement, say)
+    must say so by having its own layout: each leading block of equal parts keeps its first terms.
+    """
+    higher = absent(present.effect, bench, order)
+    values = {}
+    for p in present.effect.parameters:
+        old, new = present.values[p.name], higher.values[p.name].copy()
+        blocks = _blocks(p, present.effect)
+        source, target = old.reshape(-1), new.reshape(-1)
+        rows = (len(bench.channels) if p.per_channel else 1) * blocks
+        if new.ndim == 0:
+            new = old.copy()
+        elif source.size:
+            length, longer = source.size // rows, target.size // rows
+            for k in range(rows):
+                target[k * longer : k * longer + length] = source[k * length : (k + 1) * length]
+        values[p.name] = new
+    return replace(higher, values=values)
+
+
+def _blocks(parameter: Parameter, effect: Effect) -> int:
+    """Equal parts that a parameter's numbers fall into: two for a field of displacements."""
+    return 2 if (effect.name, parameter.name) == ("misregistration", "distortion") else 1

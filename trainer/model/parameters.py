@@ -1,0 +1,58 @@
+"""Parameters of an effect in a model, for people and for JSON."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from trainer.captures.bench_file import Bench
+from trainer.effects.definition import Parameter
+from trainer.formatting import measured
+from trainer.model.model import Model, Present
+
+
+def present_named(model: Model, name: str) -> Present:
+    """The effect of that name in a model."""
+    return next(p for p in model.present if p.effect.name == name)
+
+
+def json_values(present: Present, bench: Bench) -> dict[str, dict[str, Any]]:
+    """{name with unit: {"value", "error", "unit"}}; per-channel values by channel name."""
+    result = {}
+    for p in present.effect.parameters:
+        errors = None if present.errors is None else present.errors[p.name]
+        result[p.key] = {
+            "value": _plain(p, present.values[p.name], bench),
+            "error": None if errors is None else _plain(p, errors, bench),
+            "unit": p.unit,
+        }
+    return result
+
+
+def _plain(parameter: Parameter, values: np.ndarray, bench: Bench) -> Any:
+    if parameter.per_channel:
+        return {c.name: values[k].tolist() for k, c in enumerate(bench.channels)}
+    return values.tolist()
+
+
+def describe(present: Present, bench: Bench) -> str:
+    """The effect's size in physical units with an error, in a few words: what differs from "absent"."""
+    words = []
+    for p in present.effect.parameters:
+        values = present.values[p.name]
+        errors = np.zeros_like(values) if present.errors is None else present.errors[p.name]
+        label = p.name.replace("_", " ")
+        away = values - p.absent_value(bench)
+        if values.size == 0 or not np.any(np.abs(away) > 1e-12):
+            continue
+        if values.ndim == 0:
+            words.append(f"{label} {measured(float(values), float(errors), p.unit)}")
+        elif p.per_channel and values.ndim == 1:
+            for k, channel in enumerate(bench.channels):
+                name = f"{label} " if len(bench.channels) == 1 else f"{label} ({channel.name}) "
+                words.append(f"{name}{measured(float(values[k]), float(errors[k]), p.unit)}")
+        else:
+            size, error = float(np.sqrt((away**2).sum())), float(np.sqrt((errors**2).mean()))
+            words.append(f"{label} {measured(size, error, p.unit)} in {values.size} terms")
+    return ", ".join(words) or "at its absent values"

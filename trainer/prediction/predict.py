@@ -1,0 +1,282 @@
+"""What the camera would have counted, for a model and a set of patterns: the trainer's use of the light path.
+
+A prediction runs through three points at which it can be picked up again when only a later stage has changed: the
+panel's spectrum, irradiance, counts.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from runtime.lightpath.fft import irfft2, rfft2
+from runtime.lightpath.light_path import (
+    FINE,
+    LightPath,
+    at_pixels,
+    mode_irradiance,
+    panel_phase,
+    panel_spectrum,
+)
+from runtime.lightpath.propagation import (
+    band_limit,
+    far_field_matrix,
+    transfer_function,
+)
+from trainer.captures.bench_file import Bench
+from trainer.model.model import Model
+from trainer.prediction.scene import Scene, Stages, bare_stages, scene_for, stages_for
+from trainer.prediction.stages import Pupil, Sensor
+
+FINER = (
+    2  # times as many samples for a spline to run through: it is exact up to half of the band that they hold
+)
+
+
+def light_path(scene: Scene, stages: Stages) -> LightPath:
+    """The arrays that stand for drive, panel and pupil, ready for `runtime.lightpath.light_path`."""
+    transfers, weights = pupil_modes(scene, stages.pupil)
+    return LightPath(
+        grid=scene.grid,
+        response=stages.drive.response,
+        source=stages.panel.source,
+        transfers=transfers,
+        weights=weights,
+        gain=stages.drive.gain,
+        crosstalk=stages.drive.crosstalk,
+        leak=stages.panel.leak,
+        aperture=(stages.panel.aperture[0], stages.panel.aperture[1]),
+        irradiance_filter=display_filter(stages),
+        far_field=_far_field(scene, stages.pupil) if scene.method == "fraunhofer" else None,
+    )
+
+
+def _far_field(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
+    """Matrices from the band to the fine image grid, about the panel's axis. A laser's line is its centre here."""
+    grid = scene.grid
+    matrices = []
+    for axis in (0, 1):
+        count = grid.shape[axis]
+        sample = torch.arange(grid.image_shape[axis], dtype=scene.dtype) / FINE - grid.margin
+        position = (sample - (count - 1) / 2) * grid.pitch
+        band = grid.frequency_index(axis)
+        matrices.append(
+            far_field_matrix(
+                band, grid.padded[axis], count, grid.pitch, position, scene.wavelength, pupil.distance
+            )
+        )
+    return matrices[0], matrices[1]
+
+
+def display_filter(stages: Stages) -> Tensor | None:
+    """The irradiance filter that the eye sees too: source extent and ghosts."""
+    parts = [f for f in (stages.pupil.irradiance_filter, stages.sensor.irradiance_filter) if f is not None]
+    if not parts:
+        return None
+    return parts[0] if len(parts) == 1 else parts[0] * parts[1]
+
+
+@lru_cache(maxsize=16)
+def _bare_modes(scene: Scene) -> tuple[Tensor, Tensor]:
+    return _modes(scene, bare_stages(scene).pupil)
+
+
+def pupil_modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
+    """Transfer functions [M, n, m] and weights [M] of the pupil's modes; kept where no effect touches the pupil."""
+    return _bare_modes(scene) if pupil is bare_stages(scene).pupil else _modes(scene, pupil)
+
+
+def _modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
+    if pupil.lines is None:
+        offsets, weights = torch.zeros(1, dtype=scene.dtype), torch.ones(1, dtype=scene.dtype)
+    else:
+        offsets, weights = pupil.lines
+    opening = iris_opening(scene, pupil)
+    if pupil.transmission is not None:
+        opening = opening * pupil.transmission
+    grid = scene.grid
+    limits = tuple(band_limit(scene.wavelength, scene.plane_mm * 1e-3, n * grid.pitch) for n in grid.padded)
+    modes = []
+    for offset in offsets:
+        wavelength = scene.wavelength + offset
+        mode = opening
+        if scene.method != "fraunhofer":
+            mode = opening * transfer_function(
+                pupil.fy, pupil.fx, wavelength, pupil.distance, (limits[0], limits[1]), scene.method
+            )
+        if pupil.path_difference is not None:
+            angle = 2 * math.pi / wavelength * pupil.path_difference
+            mode = mode * torch.polar(torch.ones_like(angle), angle)
+        modes.append(mode)
+    return torch.stack(modes), weights
+
+
+def iris_opening(scene: Scene, pupil: Pupil) -> Tensor:
+    """What the iris passes of each frequency, 0 .. 1.
+
+    A frequency sample passes by the share of its width that lies inside, so the iris's size and place have gradients
+    and the result does not depend on the padding. The edge lies half a frequency sample of the doubled panel,
+    1 / (4 N pitch), beyond the nominal one: a frequency on the edge passes.
+    """
+    panel = scene.bench.panel.shape
+    beyond = [1 / (2 * n) for n in panel]  # share of the band
+    bins = [2 / n for n in scene.grid.padded]  # width of a frequency sample, share of the band
+    v, u = pupil.v - pupil.centre[0], pupil.u - pupil.centre[1]
+    if pupil.shape == "circle":
+        width = math.sqrt(bins[0] * bins[1])
+        edge = pupil.half_width + math.sqrt(beyond[0] * beyond[1])
+        return torch.clamp((edge - torch.sqrt(v**2 + u**2 + 1e-12)) / width + 0.5, 0, 1)
+    rows = torch.clamp((pupil.half_width + beyond[0] - torch.abs(v)) / bins[0] + 0.5, 0, 1)
+    columns = torch.clamp((pupil.half_width + beyond[1] - torch.abs(u)) / bins[1] + 0.5, 0, 1)
+    return rows * columns
+
+
+@dataclass(frozen=True)
+class Trace:
+    """Points of a prediction at which it can be picked up: the panel's spectrum, and irradiance before filters."""
+
+    spectrum: Tensor
+    image: Tensor
+
+
+def trace(
+    scene: Scene, stages: Stages, gray: Tensor, start: str = "drive", before: Trace | None = None
+) -> Trace:
+    """Spectrum and irradiance of patterns [B, H, W], recomputed from stage `start` on; earlier ones from `before`."""
+    if before is not None and start == "sensor":
+        return before
+    path = light_path(scene, stages)
+    if before is not None and start == "pupil":
+        spectrum = before.spectrum
+    else:
+        spectrum = panel_spectrum(path, panel_phase(path, gray))
+    return Trace(spectrum, mode_irradiance(path, spectrum))
+
+
+def light_on_camera(scene: Scene, stages: Stages, image: Tensor) -> Tensor:
+    """Irradiance that camera pixels integrate [B, h, w], before gain, offset and response."""
+    grid, camera = scene.grid, scene.bench.camera
+    sensor = stages.sensor
+    transfer = _pixel_area(scene, sensor)
+    for extra in (stages.pupil.irradiance_filter, sensor.irradiance_filter, sensor.blur):
+        if extra is not None:
+            transfer = transfer * extra
+    if sensor.displacement is None and camera.registered:
+        return at_pixels(grid, irfft2(rfft2(image) * transfer, grid.image_shape))
+    if sensor.displacement is None:
+        y, x = camera_positions(scene)
+    else:
+        dy, dx = sensor.displacement
+        rows = torch.arange(dy.shape[-2], dtype=dy.dtype)[:, None]
+        y, x = camera.on_panel(rows + dy, torch.arange(dy.shape[-1], dtype=dy.dtype) + dx)
+    samples = FINER * FINE
+    transfer = transfer / (_spline_transfer(sensor.iy / samples) * _spline_transfer(sensor.ix / samples))
+    finer = _finer(rfft2(image) * transfer, grid.image_shape)
+    return _spline_samples(finer, samples * (y + grid.margin), samples * (x + grid.margin))
+
+
+def counts(
+    scene: Scene, stages: Stages, light: Tensor, gain: Tensor, measured: tuple[Tensor, Tensor] | None
+) -> Tensor:
+    """Counts above black [B, h, w] for light on the camera; `gain` [B, 1, 1] is counts a unit of light.
+
+    `measured` (signal, weight) is what each capture's own gain is taken from where laser power drifts.
+    """
+    sensor = stages.sensor
+    signal = light * gain
+    if sensor.gain is not None:
+        signal = signal * sensor.gain
+    if sensor.free_capture_gain and measured is not None:
+        seen, weight = measured
+        if sensor.offset is not None:
+            seen = seen - sensor.offset
+        own = (seen * signal * weight).sum((-2, -1)) / (signal**2 * weight).sum((-2, -1))
+        signal = signal * own[:, None, None]
+    if sensor.offset is not None:
+        signal = signal + sensor.offset
+    if sensor.response is not None:
+        signal = sensor.response(signal / sensor.full_scale) * sensor.full_scale
+    return signal
+
+
+@lru_cache(maxsize=32)
+def camera_positions(scene: Scene) -> tuple[Tensor, Tensor]:
+    """Where each camera pixel's centre looks, in panel pixels: (y, x), each [h, w]."""
+    y, x = scene.bench.camera.looks_at()
+    return torch.as_tensor(y, dtype=scene.dtype), torch.as_tensor(x, dtype=scene.dtype)
+
+
+def _pixel_area(scene: Scene, sensor: Sensor) -> Tensor:
+    """Transfer function of the camera pixel's area."""
+    camera = scene.bench.camera
+    side = camera.pixel_um / scene.bench.panel.pitch_um
+    if camera.homography is None:
+        rows, columns = sensor.iy * side, sensor.ix * side
+    else:
+        # The pixel's two sides as the homography puts them on the panel, at the picture's centre.
+        y, x = camera_positions(scene)
+        i, j = camera.height // 2, camera.width // 2
+        rows = sensor.iy * (y[i + 1, j] - y[i, j]) + sensor.ix * (x[i + 1, j] - x[i, j])
+        columns = sensor.iy * (y[i, j + 1] - y[i, j]) + sensor.ix * (x[i, j + 1] - x[i, j])
+    return torch.sinc(rows) * torch.sinc(columns)
+
+
+def _finer(spectrum: Tensor, shape: tuple[int, int]) -> Tensor:
+    """The picture of a spectrum as from `rfft2` of `shape`, on a grid that is FINER times as fine."""
+    height, width = (FINER * n for n in shape)
+    half = shape[0] // 2
+    between = spectrum.new_zeros((*spectrum.shape[:-2], height - shape[0], spectrum.shape[-1]))
+    rows = torch.cat((spectrum[..., :half, :], between, spectrum[..., half:, :]), dim=-2)
+    return FINER**2 * irfft2(
+        torch.nn.functional.pad(rows, (0, width // 2 + 1 - rows.shape[-1])), (height, width)
+    )
+
+
+def _spline_transfer(cycles_per_sample: Tensor) -> Tensor:
+    """Sum of cubic B-splines at whole samples: dividing by it makes spline samples pass through the data."""
+    return (2 + torch.cos(2 * math.pi * cycles_per_sample)) / 3
+
+
+def _spline_samples(coefficients: Tensor, y: Tensor, x: Tensor) -> Tensor:
+    """Cubic B-spline sum at positions y, x [h, w] (samples) of coefficients [B, m, n]: [B, h, w]."""
+    height, width = coefficients.shape[-2:]
+    flat = coefficients.reshape(coefficients.shape[0], -1)
+    rows, row_weights = _spline_taps(y, height)
+    columns, column_weights = _spline_taps(x, width)
+    total = torch.zeros(1, dtype=coefficients.dtype)
+    for i in range(4):
+        inner = torch.zeros(1, dtype=coefficients.dtype)
+        for j in range(4):
+            index = (rows[i] * width + columns[j]).reshape(-1)
+            inner = inner + flat[:, index].reshape(-1, *y.shape) * column_weights[j]
+        total = total + inner * row_weights[i]
+    return total
+
+
+def _spline_taps(position: Tensor, count: int) -> tuple[list[Tensor], list[Tensor]]:
+    position = torch.clamp(position, 1, count - 3)
+    whole = torch.floor(position.detach())
+    t = position - whole
+    first = whole.long()
+    weights = [
+        (1 - t) ** 3 / 6,
+        (3 * t**3 - 6 * t**2 + 4) / 6,
+        (-3 * t**3 + 3 * t**2 + 3 * t + 1) / 6,
+        t**3 / 6,
+    ]
+    return [first + k - 1 for k in range(4)], weights
+
+
+def ideal_irradiance(bench: Bench, gray: np.ndarray, channel: str, plane_mm: float) -> np.ndarray:
+    """What the bench file alone predicts for one pattern: float32 [h, w] in camera pixels, of arbitrary scale."""
+    model = Model(bench)
+    scene = scene_for(model, channel, plane_mm)
+    stages = stages_for(scene, ())
+    with torch.no_grad():
+        patterns = torch.as_tensor(gray.astype(np.int64))[None]
+        return light_on_camera(scene, stages, trace(scene, stages, patterns).image)[0].numpy()

@@ -1,0 +1,176 @@
+"""Scenes and their stages: one colour and one plane of a bench, before and after a model's effects.
+
+A `Scene` holds what is fixed for one colour and one plane; `Stages` are its drive, panel, pupil and sensor as the
+effects see them, with the effects of a model applied in their order.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from runtime.lightpath.light_path import Grid, band_frequencies, grid_for, image_frequencies
+from runtime.lightpath.propagation import Aperture, check_sampling
+from trainer.captures.bench_file import Bench
+from trainer.model.model import Model, Present
+from trainer.prediction.panel_field import with_field
+from trainer.prediction.stages import Drive, Panel, Pupil, Sensor
+
+IRIS_ROOM = 1.25  # how far an effect may open or move the iris, in units of what the bench says
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One colour and one plane of a bench: sizes, and coordinates as tensors of one precision."""
+
+    bench: Bench
+    channel: str
+    plane_mm: float
+    method: str
+    grid: Grid
+    dtype: torch.dtype
+
+    @property
+    def wavelength(self) -> float:
+        """Metres."""
+        return self.bench.channel(self.channel).wavelength
+
+    def channel_row(self) -> int:
+        """Index of the colour in per-channel parameters."""
+        return [c.name for c in self.bench.channels].index(self.channel)
+
+
+def scene_for(model: Model, channel: str, plane_mm: float, dtype: torch.dtype = torch.float32) -> Scene:
+    """The scene of a model. Raises InputError where the propagation method's sampling does not hold."""
+    opened = IRIS_ROOM if any(p.effect.touches_iris for p in model.present) else 1.0
+    return _scene(model.bench, channel, plane_mm, model.method, opened, dtype)
+
+
+@lru_cache(maxsize=64)
+def _scene(
+    bench: Bench, channel: str, plane_mm: float, method: str, opened: float, dtype: torch.dtype
+) -> Scene:
+    wavelength = bench.channel(channel).wavelength
+    panel = bench.panel
+    half_width = min(bench.iris.half_width * opened, 1.95)
+    distance = plane_mm * 1e-3
+    # In the far field nothing walks out of the grid: the image has its own, and the panel needs no room.
+    spread = 0.0 if method == "fraunhofer" else distance
+    grid = grid_for(panel.shape, panel.pitch, wavelength, spread, half_width)
+    check_sampling(
+        method,
+        Aperture(panel.shape, grid.padded, panel.pitch),
+        wavelength,
+        distance,
+        half_width / (2 * panel.pitch),
+    )
+    return Scene(bench, channel, plane_mm, method, grid, dtype)
+
+
+@dataclass(frozen=True)
+class Stages:
+    """The four stages of a scene with a model's effects applied."""
+
+    drive: Drive
+    panel: Panel
+    pupil: Pupil
+    sensor: Sensor
+
+
+@lru_cache(maxsize=32)
+def bare_stages(scene: Scene) -> Stages:
+    """The stages as the bench file has them."""
+    bench, grid, dtype = scene.bench, scene.grid, scene.dtype
+    height, width = bench.panel.shape
+    panel_y, panel_x = _coordinates(height, width, dtype)
+    camera_y, camera_x = _coordinates(*bench.camera.shape, dtype)
+    like = torch.zeros((), dtype=dtype)
+    reference = bench.channels[0].wavelength
+    level = torch.arange(256, dtype=dtype) / bench.panel.levels
+    drive = Drive(
+        scene.channel,
+        scene.wavelength,
+        reference,
+        bench.panel.phase_sign,
+        panel_y,
+        panel_x,
+        level,
+        bench.panel.phase_sign * 2 * math.pi * level,
+    )
+    side = torch.full((2,), math.sqrt(bench.panel.fill_factor), dtype=dtype)
+    source = torch.ones((height, width), dtype=dtype).to(
+        torch.complex64 if dtype == torch.float32 else torch.complex128
+    )
+    panel = Panel(
+        scene.channel, scene.wavelength, reference, bench.panel.pitch, panel_y, panel_x, source, None, side
+    )
+    fy, fx = band_frequencies(grid, like)
+    iy, ix = image_frequencies(grid, like)
+    edge = 1 / (2 * bench.panel.pitch)
+    zero = torch.zeros((), dtype=dtype)
+    pupil = Pupil(
+        scene.channel,
+        scene.wavelength,
+        reference,
+        bench.panel.pitch,
+        fy[:, None],
+        fx[None, :],
+        fy[:, None] / edge,
+        fx[None, :] / edge,
+        iy[:, None],
+        ix[None, :],
+        torch.tensor(scene.plane_mm * 1e-3, dtype=dtype),
+        torch.tensor(bench.iris.half_width, dtype=dtype),
+        (zero, zero),
+        bench.iris.shape,
+    )
+    sensor = Sensor(
+        scene.channel,
+        bench.camera.full_scale,
+        camera_y,
+        camera_x,
+        iy[:, None] * bench.panel.pitch,
+        ix[None, :] * bench.panel.pitch,
+    )
+    return Stages(drive, panel, pupil, sensor)
+
+
+def _coordinates(height: int, width: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    y = (torch.arange(height, dtype=dtype) - (height - 1) / 2) / (height / 2)
+    x = (torch.arange(width, dtype=dtype) - (width - 1) / 2) / (width / 2)
+    return torch.broadcast_tensors(y[:, None], x[None, :])
+
+
+def stages_for(scene: Scene, present: tuple[Present, ...], tensors: Any = None) -> Stages:
+    """The scene's stages with effects applied in the order of `present`.
+
+    `tensors` gives {effect name: {parameter: tensor}} where values are to be differentiated; others are taken from
+    `present`. Per-channel parameters are cut to the scene's own colour.
+    """
+    stages = bare_stages(scene)
+    row = scene.channel_row()
+    for one in present:
+        given = (tensors or {}).get(one.effect.name, {})
+        arguments = {}
+        for p in one.effect.parameters:
+            value = given.get(p.name)
+            if value is None:
+                value = torch.as_tensor(one.values[p.name], dtype=scene.dtype)
+            arguments[p.name] = value[row] if p.per_channel else value
+        stage = one.effect.stage
+        stages = replace(stages, **{stage: one.effect.apply(getattr(stages, stage), **arguments)})
+    return stages
+
+
+def stages_of(scene: Scene, model: Model) -> Stages:
+    """The scene's stages under a model: its effects, and the field learned at the panel after them."""
+    stages = stages_for(scene, model.present)
+    if model.panel_field is None:
+        return stages
+    maps = {name: torch.as_tensor(map_, dtype=scene.dtype) for name, map_ in model.panel_field.items()}
+    return replace(stages, panel=with_field(stages.panel, maps))
