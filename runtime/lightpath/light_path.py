@@ -62,13 +62,16 @@ class Grid:
         return list(range(-self.band[axis], self.band[axis] + 1))
 
 
+MARGIN = 24  # panel pixels beyond the panel's border for which irradiance is computed
+
+
 def grid_for(
     shape: tuple[int, int],
     pitch: float,
     wavelength: float,
     distance: float,
     half_width: float,
-    margin: int = 24,
+    margin: int = MARGIN,
 ) -> Grid:
     """The smallest grid that keeps the light path linear.
 

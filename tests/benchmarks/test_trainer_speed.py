@@ -23,14 +23,16 @@ from tests.trainer.hidden import bench_file
 from trainer.captures.acquire import capture_from
 from trainer.captures.batches import load
 from trainer.captures.capture_set import read_captures
-from trainer.diagnosis.candidates import evaluate_captures, screen_batches
-from trainer.diagnosis.diagnose import parts_of, with_gains
+from trainer.captures.held_out import capture_roles
 from trainer.diagnosis.explain import add_from
-from trainer.effects import catalogue
+from trainer.diagnosis.screen import screen_batches
+from trainer.effects import effect_catalogue as catalogue
+from trainer.fitting.gains import with_gains
 from trainer.fitting.gauss_newton import fit
+from trainer.fitting.predictor import evaluate_captures
 from trainer.model.model import Model, absent
+from trainer.model.model_stages import scene_for, stages_for
 from trainer.prediction.predict import light_on_camera, trace
-from trainer.prediction.scene import scene_for, stages_for
 
 HOLOLOOP = Path(sys.executable).with_name("hololoop-trainer")
 ROWS: list[tuple[str, str]] = []
@@ -75,8 +77,8 @@ def test_screen_against_fits(tmp_path):
     capture_from("virtual:zero_order", captures, patterns=15)
     known = catalogue()
     rows = read_captures(captures)
-    parts = parts_of(rows)
-    model = with_gains(parts, Model(rows.bench))
+    parts = capture_roles(rows)
+    model = with_gains(rows, Model(rows.bench), parts.fitted)
     screened, fitted = load(rows, parts.screened), load(rows, parts.fitted)
     screen = median_seconds(lambda: screen_batches(screened, model, tuple(known.values())), 3)
 

@@ -9,7 +9,7 @@ import pytest
 
 from firmware_iface.errors import InputError
 from firmware_iface.virtual import VirtualHeadset, load_bench
-from trainer.captures.acquire import Taken, capture_from, capture_set
+from trainer.captures.acquire import CaptureSummary, capture_from, capture_set
 from trainer.captures.bench_file import Bench, read_bench
 from trainer.captures.capture_set import read_captures
 from trainer.captures.check_set import check_captures
@@ -26,7 +26,7 @@ def small(name: str, seed: int = 0) -> tuple[VirtualHeadset, Bench]:
     return headset, read_bench(tables)
 
 
-def take(folder: Path, name: str, **options: object) -> Taken:
+def take(folder: Path, name: str, **options: object) -> CaptureSummary:
     headset, bench = small(name)
     return capture_set(headset, bench, folder, **options)  # type: ignore[arg-type]
 

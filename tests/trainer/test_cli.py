@@ -20,7 +20,7 @@ from firmware_iface.errors import InputError
 from trainer import cli
 from trainer.commands.screen import Screen
 from trainer.effects import testing
-from trainer.effects.catalogue import catalogue
+from trainer.effects.effect_catalogue import catalogue
 from trainer.model.model import Model
 from trainer.model.model_file import read_model, write_model
 

@@ -16,8 +16,9 @@ from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet, read_captures, write_captures
 from trainer.diagnosis import compare as module
 from trainer.diagnosis.compare import Comparison, compare
-from trainer.effects import catalogue
-from trainer.fitting.gauss_newton import evaluate
+from trainer.effects import effect_catalogue as catalogue
+from trainer.fitting.gains import with_gains
+from trainer.fitting.predictor import evaluate
 from trainer.model.model import Model, absent
 
 HEIGHT, WIDTH, PITCH, DISTANCE = 96, 128, 8e-6, 10e-3
@@ -225,7 +226,7 @@ def test_the_gain_of_a_curved_response_is_fitted(ideal: CaptureSet) -> None:
     curve = absent(catalogue()["sensor_response"], ideal.bench)
     model = Model(ideal.bench, (curve.with_values({"bend": np.array([0.3, 0.0])}),))
     rows = [c for c in ideal.captures if c.channel == "green"][:3]
-    found = module.with_gains(ideal, model, rows)
+    found = with_gains(ideal, model, rows)
     batches = load(ideal, rows)
 
     def excess(factor: float) -> float:

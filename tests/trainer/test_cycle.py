@@ -94,7 +94,7 @@ def test_recorded_captures_stand_in_for_the_camera(tmp_path: Path) -> None:
 
 def run_shown(stage: Stage, patterns: dict[str, np.ndarray], wanted: Volume, folder: Path) -> float:
     from trainer.cycle.show_on_bench import display_likeness, seen_pairs
-    from trainer.diagnosis.compare import with_gains
+    from trainer.fitting.gains import with_gains
 
     captures = stage.show(patterns, wanted.planes_mm, folder)
     seen = seen_pairs(captures, with_gains(captures, stage.model, captures.captures))

@@ -16,11 +16,12 @@ from runtime.lightpath.fft import irfft2
 from runtime.lightpath.legendre import legendre_maps
 from runtime.lightpath.light_path import FINE
 from trainer.captures.bench_file import Bench, read_bench
-from trainer.effects import catalogue
+from trainer.effects import effect_catalogue as catalogue
 from trainer.effects.zernike import zernike_maps
-from trainer.model.model import Model, Present, absent
+from trainer.model.model import EffectInstance, Model, absent
+from trainer.model.model_stages import scene_for, stages_for
 from trainer.prediction.predict import counts, light_on_camera, light_path, trace
-from trainer.prediction.scene import Scene, Stages, scene_for, stages_for
+from trainer.prediction.scene import Scene, Stages
 
 TABLE = {
     "phase_response": ("drive", "display"),
@@ -80,13 +81,15 @@ def gray() -> Tensor:
     return torch.remainder((smooth * 160 + 128).long(), 256)
 
 
-def present(name: str, order: int | None = None, colours: bool = False, **values: Any) -> Present:
+def present(name: str, order: int | None = None, colours: bool = False, **values: Any) -> EffectInstance:
     start = absent(KNOWN[name], bench(colours), order)
     given = {k: np.array(np.broadcast_to(v, start.values[k].shape), float) for k, v in values.items()}
     return start.with_values({**start.values, **given})
 
 
-def scene_of(*effects: Present, channel: str = "green", plane: float = PLANE, colours: bool = False) -> Scene:
+def scene_of(
+    *effects: EffectInstance, channel: str = "green", plane: float = PLANE, colours: bool = False
+) -> Scene:
     return scene_for(Model(bench(colours), effects), channel, plane, torch.float64)
 
 
@@ -96,13 +99,13 @@ def predicted(scene: Scene, stages: Stages, measured: tuple[Tensor, Tensor] | No
     return counts(scene, stages, light, torch.full((2, 1, 1), 400.0, dtype=torch.float64), measured)
 
 
-def seen(*effects: Present, plane: float = PLANE, bare: bool = False) -> Tensor:
+def seen(*effects: EffectInstance, plane: float = PLANE, bare: bool = False) -> Tensor:
     """Counts with effects; `bare`: on the same grid, without them."""
     scene = scene_of(*effects, plane=plane)
     return predicted(scene, stages_for(scene, () if bare else effects))
 
 
-def moved(name: str, order: int | None = None) -> Present:
+def moved(name: str, order: int | None = None) -> EffectInstance:
     """An effect well away from absent: every number a few scales off, each by another amount."""
     start = absent(KNOWN[name], bench(), order)
     values = {}
@@ -114,7 +117,7 @@ def moved(name: str, order: int | None = None) -> Present:
 
 
 def test_the_catalogue_is_the_one_that_is_described() -> None:
-    built_in = {n: (e.stage, e.told_to) for n, e in KNOWN.items() if n in TABLE}
+    built_in = {n: (e.stage, e.acts_on) for n, e in KNOWN.items() if n in TABLE}
     assert built_in == TABLE
     assert list(built_in) == list(TABLE)  # in the order that light meets them
     for one in KNOWN.values():
@@ -185,7 +188,7 @@ def test_laser_drift_is_a_switch_and_the_gain_is_measured() -> None:
     torch.testing.assert_close(held, truth)
 
 
-def flat_light(*effects: Present) -> Tensor:
+def flat_light(*effects: EffectInstance) -> Tensor:
     """Light in the middle of the picture of a panel that shows gray 0."""
     scene = scene_of(*effects)
     stages = stages_for(scene, effects)

@@ -19,17 +19,17 @@ from runtime.lightpath.light_path import irradiance, panel_phase
 from tests.trainer.test_effects import HEIGHT, PLANE, WIDTH, bench, gray, present
 from tests.trainer.test_networks import disturbed
 from trainer.captures.capture_set import read_captures, write_captures
-from trainer.effects import catalogue
+from trainer.effects import effect_catalogue as catalogue
 from trainer.model.export import export_bundle
-from trainer.model.model import Model, Present, absent
+from trainer.model.model import EffectInstance, Model, absent
+from trainer.model.model_stages import scene_for, stages_for
 from trainer.networks.approximator import write_approximator
 from trainer.prediction.predict import light_path
-from trainer.prediction.scene import scene_for, stages_for
 
 CAMERA = ("sensor_blur", "misregistration", "vignetting", "stray_light", "sensor_response", "laser_drift")
 
 
-def every_effect(colours: bool = False) -> tuple[Present, ...]:
+def every_effect(colours: bool = False) -> tuple[EffectInstance, ...]:
     """Each built-in effect a little away from absent."""
     effects = []
     for one in catalogue().values():
@@ -44,7 +44,7 @@ def every_effect(colours: bool = False) -> tuple[Present, ...]:
 
 def trained_irradiance(model: Model, channel: str, plane: float) -> np.ndarray:
     """What the trainer computes for the patterns, with the display effects that the model has."""
-    shown = replace(model, present=tuple(p for p in model.present if p.effect.told_to == "display"))
+    shown = replace(model, present=tuple(p for p in model.present if p.effect.acts_on == "display"))
     scene = scene_for(shown, channel, plane)
     with torch.no_grad():
         path = light_path(scene, stages_for(scene, shown.present))
@@ -82,12 +82,12 @@ def test_camera_effects_stay_out(tmp_path: Path) -> None:
         np.testing.assert_array_equal(array, arrays[1][name])
     provenance = read_bundle(tmp_path / "full").provenance
     assert [e["effect"] for e in provenance["effects_left_out"]] == list(CAMERA)
-    assert {e["told_to"] for e in provenance["effects_left_out"]} == {"camera"}
+    assert {e["acts_on"] for e in provenance["effects_left_out"]} == {"camera"}
     assert "ghost" in [e["effect"] for e in provenance["effects"]]
 
 
 def test_ghosts_and_the_sources_extent_go_in_as_one_filter(tmp_path: Path) -> None:
-    def stored(*effects: Present) -> np.ndarray | None:
+    def stored(*effects: EffectInstance) -> np.ndarray | None:
         folder = tmp_path / ("-".join(e.effect.name for e in effects) or "none")
         export_bundle(Model(bench(), effects), None, folder)
         return load_light_path(read_bundle(folder)).irradiance_filter

@@ -10,11 +10,11 @@ import pytest
 from runtime.lightpath.legendre import legendre_count
 from trainer.captures.batches import Batch, load
 from trainer.captures.capture_set import CaptureSet
-from trainer.diagnosis.candidates import least_for_order
-from trainer.effects import catalogue
+from trainer.effects import effect_catalogue as catalogue
 from trainer.effects.testing import captures_with, placed
-from trainer.fitting.gauss_newton import fit, raise_order
-from trainer.model.model import Model, Present, absent
+from trainer.fitting.gauss_newton import fit
+from trainer.fitting.refit import least_for_order, raise_order
+from trainer.model.model import EffectInstance, Model, absent
 
 KNOWN = catalogue()
 
@@ -23,7 +23,7 @@ def batches_of(captures: CaptureSet) -> list[Batch]:
     return load(captures, captures.captures)
 
 
-def fitted(captures: CaptureSet, start: Present) -> Present:
+def fitted(captures: CaptureSet, start: EffectInstance) -> EffectInstance:
     model = Model(captures.bench).having(start)
     return fit(model, [start.effect.name], batches_of(captures)).model.present[0]
 

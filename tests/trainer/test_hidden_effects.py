@@ -12,7 +12,7 @@ import pytest
 
 from tests.trainer.hidden import captured, ran
 from trainer.cli import main
-from trainer.effects import catalogue
+from trainer.effects import effect_catalogue as catalogue
 
 ALONE = {name: f'kind = "{name}"' for name in catalogue()}
 
@@ -69,7 +69,7 @@ import math
 import torch
 from trainer.effects import Parameter, effect
 
-@effect(stage="sensor", told_to="camera", parameters=[
+@effect(stage="sensor", acts_on="camera", parameters=[
     Parameter("even", "1", scale=0.03, low=-1, high=1),
     Parameter("odd", "1", scale=0.03, low=-1, high=1),
     Parameter("period", "pixels", scale=0.3, absent=20.0, low=4, high=100, starts=(10.0, 14.0, 17.0, 21.0, 28.0)),
@@ -102,7 +102,7 @@ def test_what_the_catalogue_does_not_name_is_placed_and_then_explained_by_a_user
 
 
 def test_a_ghost_beside_a_blur_is_found_by_fitting_both_together(tmp_path, capsys):
-    # Fitted alone, each takes up a part of the other, and then stands in its way.
+    # FitResult alone, each takes up a part of the other, and then stands in its way.
     blur = 'kind = "sensor_blur"\nsigma_x_px = 0.5'
     ghost = 'kind = "ghost"\nshare = 0.1\nshift_x_px = 6.5\nshift_y_px = -3'
     found = explained(capsys, captured(capsys, tmp_path, ghost, blur), tmp_path)

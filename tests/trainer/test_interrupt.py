@@ -17,7 +17,7 @@ import pytest
 from firmware_iface.errors import InputError
 from tests.trainer.hidden import bench_file
 from trainer.captures.acquire import capture_from
-from trainer.effects.catalogue import catalogue
+from trainer.effects.effect_catalogue import catalogue
 from trainer.model.model import Model
 from trainer.model.model_file import read_model
 

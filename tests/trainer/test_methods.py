@@ -14,8 +14,8 @@ from tests.trainer.hidden import BENCH
 from trainer.captures.bench_file import Bench, read_bench
 from trainer.model.export import export_bundle
 from trainer.model.model import Model
+from trainer.model.model_stages import scene_for, stages_for
 from trainer.prediction.predict import light_on_camera, light_path, trace
-from trainer.prediction.scene import scene_for, stages_for
 
 
 def bench(side: int, distance_mm: float) -> Bench:

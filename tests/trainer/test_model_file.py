@@ -13,9 +13,9 @@ import pytest
 
 from firmware_iface.errors import InputError
 from trainer.captures.bench_file import Bench, Camera, Channel, Iris, Panel
-from trainer.effects.catalogue import catalogue
 from trainer.effects.definition import Effect, Parameter
-from trainer.model.model import Model, Present, absent
+from trainer.effects.effect_catalogue import catalogue
+from trainer.model.model import EffectInstance, Model, absent
 from trainer.model.model_file import read_model, write_model
 
 
@@ -56,7 +56,7 @@ def bench(*names: str) -> Bench:
     return Bench("practice", Panel(64, 48, 8.0), channels, 30.0, Iris(), camera)
 
 
-def filled(effect: Effect, on: Bench, rng: np.random.Generator, order: int | None = None) -> Present:
+def filled(effect: Effect, on: Bench, rng: np.random.Generator, order: int | None = None) -> EffectInstance:
     """The effect with values all over its range, and with errors."""
     base = absent(effect, on, order)
     values, errors = {}, {}
@@ -64,7 +64,7 @@ def filled(effect: Effect, on: Bench, rng: np.random.Generator, order: int | Non
         low, high = (max(p.low, -50.0), min(p.high, 50.0))
         values[p.name] = rng.uniform(low, high, base.values[p.name].shape)
         errors[p.name] = np.abs(rng.standard_normal(values[p.name].shape)) * 1e-7
-    return Present(effect, base.order, values, errors)
+    return EffectInstance(effect, base.order, values, errors)
 
 
 def whole_model(on: Bench, seed: int = 0) -> Model:

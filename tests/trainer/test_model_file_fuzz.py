@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from firmware_iface.errors import InputError
 from trainer.captures.bench_file import Bench, Camera, Channel, Iris, Panel
-from trainer.effects.catalogue import catalogue
+from trainer.effects.effect_catalogue import catalogue
 from trainer.model.model import Model, absent
 from trainer.model.model_file import read_model, write_model
 

@@ -11,10 +11,10 @@ import pytest
 
 from firmware_iface.errors import InputError
 from trainer.diagnosis.explain import add
-from trainer.effects import catalogue as registry
+from trainer.effects import effect_catalogue as registry
 from trainer.effects import testing
-from trainer.effects.catalogue import catalogue, load_effects
 from trainer.effects.definition import Effect
+from trainer.effects.effect_catalogue import catalogue, load_effects
 from trainer.effects.new_effect import EXAMPLES, STAGES, write_new_effect
 from trainer.model.model import Model
 

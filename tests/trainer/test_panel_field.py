@@ -27,14 +27,14 @@ from trainer.cycle.retrieval import retrieve
 from trainer.cycle.show_on_bench import Stage
 from trainer.cycle.test_pictures import photographs
 from trainer.diagnosis.error_budget import error_budget
-from trainer.effects.catalogue import catalogue
+from trainer.effects.effect_catalogue import catalogue
 from trainer.fitting.learn_field import learn_field
 from trainer.model.export import export_bundle
 from trainer.model.model import Model, absent
 from trainer.model.model_file import read_model, write_model
+from trainer.model.model_stages import scene_for, stages_for, stages_of
 from trainer.prediction.panel_field import UNITS, combined, with_field
 from trainer.prediction.predict import trace
-from trainer.prediction.scene import scene_for, stages_for, stages_of
 from trainer.training.recipe import RECIPES
 
 

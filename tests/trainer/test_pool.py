@@ -20,7 +20,7 @@ from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.cli import main
 from trainer.diagnosis.diagnose import diagnose
 from trainer.effects import testing
-from trainer.effects.catalogue import Catalogue, catalogue, load_effects
+from trainer.effects.effect_catalogue import Catalogue, catalogue, load_effects
 from trainer.fitting import pool
 from trainer.fitting.pool import open_pool
 from trainer.model.model import Model
@@ -31,12 +31,12 @@ OWN = '''
 """A sensor that is more sensitive at the bottom, and at the corners."""
 from trainer.effects import Parameter, effect
 
-@effect(stage="sensor", told_to="camera", parameters=[Parameter("tilt", "1", scale=0.03, low=-1, high=1)])
+@effect(stage="sensor", acts_on="camera", parameters=[Parameter("tilt", "1", scale=0.03, low=-1, high=1)])
 def row_tilt(sensor, tilt):
     """Rows differ in sensitivity."""
     return sensor.multiplied(1 + tilt * sensor.y)
 
-@effect(stage="sensor", told_to="camera", parameters=[Parameter("twist", "1", scale=0.03, low=-1, high=1)])
+@effect(stage="sensor", acts_on="camera", parameters=[Parameter("twist", "1", scale=0.03, low=-1, high=1)])
 def corner_twist(sensor, twist):
     """Corners differ in sensitivity."""
     return sensor.multiplied(1 + twist * sensor.y * sensor.x)
@@ -193,7 +193,7 @@ Run = Callable[..., dict[str, Any]]
 def diagnosed(captures: CaptureSet, own: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> Run:
     """`diagnose --json` of the set with a user's effects; only a few of the others are tried, to be quick."""
     monkeypatch.setattr("trainer.fitting.pool.cores", lambda: 1)
-    monkeypatch.setattr("trainer.effects.catalogue.catalogue", lambda files=(): few(catalogue(files), own))
+    monkeypatch.setattr("trainer.effects.effect_catalogue.catalogue", lambda files=(): few(catalogue(files), own))
 
     def run(*options: str) -> dict[str, Any]:
         capsys.readouterr()

@@ -23,12 +23,12 @@ from trainer.captures.batches import load_batch
 from trainer.captures.bench_file import read_bench
 from trainer.captures.capture_set import CaptureSet, read_captures, write_captures
 from trainer.cli import main
-from trainer.diagnosis.compare import with_gains
-from trainer.effects import catalogue
+from trainer.effects import effect_catalogue as catalogue
+from trainer.fitting.gains import with_gains
 from trainer.model.model import Model, absent
+from trainer.model.model_stages import scene_for, stages_for
 from trainer.networks.approximator import read_approximator
 from trainer.networks.weights import ALEXNET, VGG19
-from trainer.prediction.scene import scene_for, stages_for
 from trainer.training.likeness import evaluate, likeness, noise_floor
 from trainer.training.losses import Critic, content_loss, matching_loss, picture, where_seen
 from trainer.training.pairs import measured_on_panel, onto_camera, onto_panel, pairs_of, stacked

@@ -16,7 +16,7 @@ from trainer.captures.batches import in_view
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.diagnosis.compare import compare
 from trainer.diagnosis.diagnose import Diagnosis, diagnose
-from trainer.effects.catalogue import catalogue
+from trainer.effects.effect_catalogue import catalogue
 from trainer.fitting.pool import open_pool
 from trainer.model.model import Model
 

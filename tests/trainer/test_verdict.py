@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from runtime.excess import TILE, PredictionErrors, RemovedExcess, joined, removed_excess, tile_sums
 from trainer.captures.batches import Batch
 from trainer.diagnosis.verdict import Thresholds
-from trainer.fitting.excess import TILE, Errors, Removed, errors_of, join, removed, tiles
 
 CANDIDATES = 18  # as many as the catalogue has
 REAL = Thresholds(share=0, excess=0)  # asks only whether an improvement is real, not whether it matters
@@ -19,11 +19,11 @@ REAL = Thresholds(share=0, excess=0)  # asks only whether an improvement is real
 Draw = Callable[[np.random.Generator, tuple[int, int]], np.ndarray]
 
 
-def errors(squared: np.ndarray, variance: float = 1.0) -> Errors:
-    """Errors of captures [K, tiles] whose signal has this variance, a capture, and no noise."""
-    count = torch.full((len(squared),), float(squared.shape[1]), dtype=torch.float64)
+def errors(squared: np.ndarray, variance: float = 1.0) -> PredictionErrors:
+    """PredictionErrors of captures [K, tiles] whose signal has this variance, a capture, and no noise."""
+    count = np.full(len(squared), float(squared.shape[1]))
     ids = tuple(f"{k:03d}" for k in range(len(squared)))
-    return Errors(ids, torch.as_tensor(squared, dtype=torch.float64), 0 * count, 0 * count + variance, count)
+    return PredictionErrors(ids, np.asarray(squared, np.float64), 0 * count, 0 * count + variance, count)
 
 
 @pytest.mark.parametrize(
@@ -44,7 +44,7 @@ def test_the_interval_of_a_difference_holds_its_mean_as_often_as_it_says(mean: f
     held = 0
     for _ in range(runs):
         after = rng.gamma(4.0, 1.0, shape)
-        gone = removed(errors(after + draw(rng, shape), variance), errors(after, variance))
+        gone = removed_excess(errors(after + draw(rng, shape), variance), errors(after, variance))
         low, high = gone.interval()
         held += low <= true <= high
     assert 0.93 < held / runs < 0.97
@@ -53,17 +53,17 @@ def test_the_interval_of_a_difference_holds_its_mean_as_often_as_it_says(mean: f
 def test_a_difference_is_that_of_the_excesses_and_errors_shrink_with_captures() -> None:
     rng = np.random.default_rng(0)
     one, other = rng.gamma(4, 1, (3, 50)), rng.gamma(3, 1, (3, 50))
-    gone = removed(errors(one, 9), errors(other, 9))
+    gone = removed_excess(errors(one, 9), errors(other, 9))
     assert gone.value == pytest.approx(errors(one, 9).excess - errors(other, 9).excess)
-    assert removed(errors(other, 9), errors(one, 9)).value == pytest.approx(-gone.value)
-    assert removed(errors(one), errors(one)).interval() == (0, 0)
-    more = removed(join([errors(one, 9)] * 4), join([errors(other, 9)] * 4))
+    assert removed_excess(errors(other, 9), errors(one, 9)).value == pytest.approx(-gone.value)
+    assert removed_excess(errors(one), errors(one)).interval() == (0, 0)
+    more = removed_excess(joined([errors(one, 9)] * 4), joined([errors(other, 9)] * 4))
     assert more.value == pytest.approx(gone.value)
     assert more.error == pytest.approx(gone.error / 2, rel=0.02)
 
 
 def test_intervals_widen_with_confidence_and_candidates() -> None:
-    gone = Removed(1.0, 0.1)
+    gone = RemovedExcess(1.0, 0.1)
     assert gone.interval() == pytest.approx((1 - 0.196, 1 + 0.196), abs=1e-4)
     assert gone.interval(0.95, 20) == pytest.approx(gone.interval(1 - 0.05 / 20))
     lows = [gone.interval(c, k)[0] for c, k in ((0.9, 1), (0.95, 1), (0.95, 2), (0.95, 18), (0.999, 18))]
@@ -73,10 +73,10 @@ def test_intervals_widen_with_confidence_and_candidates() -> None:
 def test_tiles_keep_the_sum_whatever_the_shape() -> None:
     rng = np.random.default_rng(0)
     for shape in ((20, 40), (21, 39), (5, 7), (1, 100), (96, 128)):
-        values = torch.as_tensor(rng.normal(size=(2, *shape)))
-        found = tiles(values)
-        assert found.shape == (2, math.ceil(shape[0] / TILE) * math.ceil(shape[1] / TILE))
-        assert found.sum(1).numpy() == pytest.approx(values.sum((1, 2)).numpy())
+        values = rng.normal(size=(2, *shape))
+        found = tile_sums(values)
+        assert found.shape == (2, math.ceil(shape[0] / TILE), math.ceil(shape[1] / TILE))
+        assert found.sum((1, 2)) == pytest.approx(values.sum((1, 2)))
 
 
 # --- nothing is missing: camera noise on a right prediction ---
@@ -117,7 +117,7 @@ def test_noise_alone_is_not_worth_adding(fitted: bool) -> None:
     runs, found, matters = 250, 0, 0
     for _ in range(runs):
         seen, held = noisy(rng, speckle), noisy(rng, speckle)
-        before = errors_of(held, prediction)
+        before = held.errors(prediction)
         assert abs(before.excess) < 1e-3
         real = []
         for column in tried:
@@ -125,7 +125,7 @@ def test_noise_alone_is_not_worth_adding(fitted: bool) -> None:
                 size = float((column * (seen.signal - prediction)).sum() / (column**2).sum())
             else:  # too small to do harm, so that only chance decides: the hardest case
                 size = 1e-4 * float(rng.choice([-1, 1]))
-            gone = removed(before, errors_of(held, prediction + size * column))
+            gone = removed_excess(before, held.errors(prediction + size * column))
             real.append(REAL.worth_adding(gone, 0.0, CANDIDATES))
             matters += Thresholds().worth_adding(gone, 1.0, CANDIDATES)
         found += any(real)
@@ -140,9 +140,9 @@ def test_what_is_really_there_is_worth_adding() -> None:
     speckle = rng.gamma(2.0, 150.0, (CAPTURES, *SHAPE))
     tilt = speckle * np.linspace(-1, 1, SHAPE[1])
     held = noisy(rng, speckle + 0.05 * tilt)
-    before, after = (errors_of(held, torch.as_tensor(p)) for p in (speckle, speckle + 0.05 * tilt))
+    before, after = (held.errors(torch.as_tensor(p)) for p in (speckle, speckle + 0.05 * tilt))
     assert abs(after.excess) < 1e-3
-    assert Thresholds().worth_adding(removed(before, after), before.excess, CANDIDATES)
+    assert Thresholds().worth_adding(removed_excess(before, after), before.excess, CANDIDATES)
 
 
 # --- the edges of the verdicts ---
@@ -153,18 +153,20 @@ def test_an_effect_must_be_real_and_matter() -> None:
     assert t.least(0.0) == t.least(0.004) == 1e-4
     assert t.least(0.5) == pytest.approx(0.01)
     assert t.least(-1e-5) == 1e-4  # an ideal model at the noise may lie below zero
-    assert t.worth_adding(Removed(0.02, 0.001), 0.5, 18)
-    assert not t.worth_adding(Removed(0.0099, 1e-6), 0.5, 18)  # real, but too little of what is wrong
-    assert not t.worth_adding(Removed(1e-4, 0.0), 0.0, 18)  # not more than the least
-    assert t.worth_adding(Removed(1.01e-4, 0.0), 0.0, 18)
-    assert not t.worth_adding(Removed(-0.1, 0.001), 0.5, 1)
-    for broken in (Removed(math.nan, 0.1), Removed(0.1, math.nan)):
+    assert t.worth_adding(RemovedExcess(0.02, 0.001), 0.5, 18)
+    assert not t.worth_adding(RemovedExcess(0.0099, 1e-6), 0.5, 18)  # real, but too little of what is wrong
+    assert not t.worth_adding(RemovedExcess(1e-4, 0.0), 0.0, 18)  # not more than the least
+    assert t.worth_adding(RemovedExcess(1.01e-4, 0.0), 0.0, 18)
+    assert not t.worth_adding(RemovedExcess(-0.1, 0.001), 0.5, 1)
+    for broken in (RemovedExcess(math.nan, 0.1), RemovedExcess(0.1, math.nan)):
         assert not t.worth_adding(broken, 0.5, 18)
     # 2.5 standard errors are enough for one candidate, and for eighteen they are not.
-    assert t.worth_adding(Removed(0.25, 0.1), 0.5, 1)
-    assert not t.worth_adding(Removed(0.25, 0.1), 0.5, 18)
-    assert t.worth_adding(Removed(0.25, 0.1), 0.5, 3) and not t.worth_adding(Removed(0.25, 0.1), 0.5, 5)
-    assert not Thresholds(level=1e-9).worth_adding(Removed(0.5, 0.1), 0.5, 1)
+    assert t.worth_adding(RemovedExcess(0.25, 0.1), 0.5, 1)
+    assert not t.worth_adding(RemovedExcess(0.25, 0.1), 0.5, 18)
+    assert t.worth_adding(RemovedExcess(0.25, 0.1), 0.5, 3) and not t.worth_adding(
+        RemovedExcess(0.25, 0.1), 0.5, 5
+    )
+    assert not Thresholds(level=1e-9).worth_adding(RemovedExcess(0.5, 0.1), 0.5, 1)
 
 
 def test_a_model_is_complete_below_the_larger_threshold() -> None:
@@ -179,19 +181,19 @@ def test_a_model_is_complete_below_the_larger_threshold() -> None:
 
 def test_explanations_are_inseparable_where_their_difference_may_be_none() -> None:
     t = Thresholds(excess=1e-4)
-    assert t.inseparable(Removed(0.0, 0.0), 0.0)
-    assert t.inseparable(Removed(0.01, 0.01), 0.0)
-    assert not t.inseparable(Removed(0.01, 0.001), 0.0)
-    assert t.inseparable(Removed(0.99e-4, 1e-9), 0.0)  # sure, but too little to choose by
-    assert not t.inseparable(Removed(1e-4, 1e-9), 0.0)
-    assert t.inseparable(Removed(-0.1, 0.001), 0.0)
+    assert t.inseparable(RemovedExcess(0.0, 0.0), 0.0)
+    assert t.inseparable(RemovedExcess(0.01, 0.01), 0.0)
+    assert not t.inseparable(RemovedExcess(0.01, 0.001), 0.0)
+    assert t.inseparable(RemovedExcess(0.99e-4, 1e-9), 0.0)  # sure, but too little to choose by
+    assert not t.inseparable(RemovedExcess(1e-4, 1e-9), 0.0)
+    assert t.inseparable(RemovedExcess(-0.1, 0.001), 0.0)
     # The level is one comparison's: 1.97 standard errors part two explanations, 1.95 do not.
-    assert not t.inseparable(Removed(0.0197, 0.01), 0.0)
-    assert t.inseparable(Removed(0.0195, 0.01), 0.0)
+    assert not t.inseparable(RemovedExcess(0.0197, 0.01), 0.0)
+    assert t.inseparable(RemovedExcess(0.0195, 0.01), 0.0)
     # A fifth of what the better one leaves may be its own wrong shape.
-    assert t.inseparable(Removed(0.0099, 1e-6), 0.05)
-    assert not t.inseparable(Removed(0.0101, 1e-6), 0.05)
-    assert not t.inseparable(Removed(0.01, 0.001), -1e-5)
+    assert t.inseparable(RemovedExcess(0.0099, 1e-6), 0.05)
+    assert not t.inseparable(RemovedExcess(0.0101, 1e-6), 0.05)
+    assert not t.inseparable(RemovedExcess(0.01, 0.001), -1e-5)
 
 
 def test_thresholds_are_told_in_full() -> None:

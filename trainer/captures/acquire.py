@@ -60,7 +60,7 @@ class Headset(Protocol):
 
 
 @dataclass(frozen=True)
-class Taken:
+class CaptureSummary:
     """A capture set that was taken."""
 
     folder: Path
@@ -87,7 +87,7 @@ def capture_from(
     seed: int = 0,
     progress: Progress | None = None,
     known: Path | None = None,
-) -> Taken:
+) -> CaptureSummary:
     """A capture set from the bench that `spec` names: `virtual:NAME`, the TOML file of a virtual bench, or the
     configuration of a real headset, with the bench.toml `known`.
 
@@ -109,7 +109,7 @@ def capture_set(
     seed: int = 0,
     progress: Progress | None = None,
     choose: Choose | None = None,
-) -> Taken:
+) -> CaptureSummary:
     """Show patterns on a bench, capture them, and write the set.
 
     patterns : how many for each colour and plane; the first is shown twice, for the noise
@@ -169,7 +169,7 @@ def capture_set(
                 headset.lasers.off()
     if progress:
         progress(1.0, "done")
-    return Taken(Path(folder), len(saturated), exposures, float(np.mean(saturated)))
+    return CaptureSummary(Path(folder), len(saturated), exposures, float(np.mean(saturated)))
 
 
 def _with_repeat(patterns: list[Pattern]) -> list[tuple[int, Pattern]]:

@@ -13,9 +13,10 @@ import hashlib
 import io
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
+from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -337,3 +338,19 @@ def _row(
     return Capture(
         name, cells["channel"], plane, cells.get("pattern") or name, files[0], files[1], exposure, time, extra
     ), faults
+
+
+def opened(folder: Path) -> CaptureSet:
+    """The capture set of a folder, read once a process, and again when its tables have changed."""
+    return _opened(folder, *((folder / name).stat().st_mtime_ns for name in ("bench.toml", "captures.csv")))
+
+
+@lru_cache(maxsize=4)
+def _opened(folder: Path, *changed: int) -> CaptureSet:
+    return read_captures(folder)
+
+
+def chosen(captures: CaptureSet, ids: Sequence[str]) -> list[Capture]:
+    """Captures by id, in the order of the set."""
+    wanted = set(ids)
+    return [c for c in captures.captures if c.capture in wanted]

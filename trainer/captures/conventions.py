@@ -134,7 +134,7 @@ def compare_conventions(
     Raises InputError if there is no sample.
     """
     if predict is None:
-        from trainer.prediction.predict import ideal_irradiance
+        from trainer.model.model_stages import ideal_irradiance
 
         predict = ideal_irradiance
     if not samples:

@@ -19,7 +19,7 @@ from trainer.commands.screen import Screen
 if TYPE_CHECKING:
     from trainer.captures.capture_set import CaptureSet
     from trainer.diagnosis.verdict import Thresholds
-    from trainer.effects.catalogue import Catalogue
+    from trainer.effects.effect_catalogue import Catalogue
     from trainer.model.model import Model
 
 PROGRAM = "hololoop-trainer"
@@ -183,7 +183,7 @@ def thresholds_of(args: Namespace) -> Thresholds:
 def inputs_of(args: Namespace) -> tuple[CaptureSet, Catalogue, Model]:
     """The capture set, the effects that are known, and the model to start from. Raises InputError."""
     from trainer.captures.capture_set import read_captures
-    from trainer.effects.catalogue import catalogue
+    from trainer.effects.effect_catalogue import catalogue
     from trainer.model.model import Model
     from trainer.model.model_file import read_model
 

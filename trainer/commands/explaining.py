@@ -110,7 +110,7 @@ def run_diagnose(args: Namespace, screen: Screen) -> Result:
 def run_add(args: Namespace, screen: Screen) -> Result:
     """One effect more."""
     refuse_folder(args.out, "--out")
-    from trainer.effects.catalogue import catalogue, find_effect
+    from trainer.effects.effect_catalogue import catalogue, find_effect
 
     effect = find_effect(catalogue(args.effects), args.effect)
     captures, known, model = inputs_of(args)

@@ -40,7 +40,7 @@ def run_loop(args: Namespace, screen: Screen) -> Result:
     from trainer.cycle.retrieval import beside_zero_order
     from trainer.cycle.show_on_bench import Stage, with_iris_beside
     from trainer.cycle.test_pictures import LEARNED, in_depth, photographs, volumes_of
-    from trainer.effects.catalogue import catalogue
+    from trainer.effects.effect_catalogue import catalogue
     from trainer.model.model import Model
     from trainer.model.model_file import read_model
     from trainer.training.weight_files import left_out
@@ -139,7 +139,7 @@ def show_loop(result: Result, args: Namespace, screen: Screen) -> None:
         names = ("psnr_db", "ssim", "one_minus_lpips")
         screen.table(("round", *names), [(one["round"], *(one["mean"][n] for n in names)) for one in rounds])
     else:
-        screen.say("Learned from recorded captures; nothing was shown.", style="bold")
+        screen.say("LearnedField from recorded captures; nothing was shown.", style="bold")
     for sentence in result["left_out"]:
         screen.say(f"\nLeft out: {sentence}.", style="yellow")
     screen.say(f"\nPatterns, captures and networks of each round are in {result['folder']}.")
@@ -154,7 +154,7 @@ def run_evaluate(args: Namespace, screen: Screen) -> Result:
     from dataclasses import replace
 
     from trainer.cycle.evaluate import METHODS, Sizes, run_evaluation
-    from trainer.effects.catalogue import catalogue
+    from trainer.effects.effect_catalogue import catalogue
     from trainer.model.model_file import read_model
     from trainer.training.weight_files import read_judges
 

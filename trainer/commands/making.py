@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 def run_effects(args: Namespace, screen: Screen) -> Result:
     """The catalogue, or one effect of it."""
-    from trainer.effects.catalogue import catalogue, find_effect
+    from trainer.effects.effect_catalogue import catalogue, find_effect
 
     known = catalogue(args.effects)
     chosen = [find_effect(known, args.name)] if args.name else list(known.values())
@@ -37,12 +37,12 @@ def run_effects(args: Namespace, screen: Screen) -> Result:
 
 
 def _described(effect: Effect) -> Result:
-    from trainer.effects.catalogue import BUILT_IN
+    from trainer.effects.effect_catalogue import BUILT_IN
 
     return {
         "name": effect.name,
         "stage": effect.stage,
-        "told_to": effect.told_to,
+        "acts_on": effect.acts_on,
         "about": effect.about,
         "orders": list(effect.orders),
         "source": "built in" if effect in BUILT_IN else effect.source,
@@ -67,13 +67,13 @@ def show_effects(result: Result, args: Namespace, screen: Screen) -> None:
     if not args.name:
         screen.table(
             ("effect", "stage", "told to", "what it is"),
-            [(e["name"], e["stage"], e["told_to"], e["about"]) for e in result["effects"]],
+            [(e["name"], e["stage"], e["acts_on"], e["about"]) for e in result["effects"]],
         )
         screen.next(command_line("effects", "zero_order"), "More on one of them")
         return
     one = result["effects"][0]
     screen.say(f"{one['name']}: {one['about']}", style="bold")
-    screen.say(f"Stage {one['stage']}, told to the {one['told_to']}, {one['source']}.")
+    screen.say(f"Stage {one['stage']}, told to the {one['acts_on']}, {one['source']}.")
     rows = []
     for p in one["parameters"]:
         low, high = plain(p["low"]), plain(p["high"])
@@ -87,7 +87,7 @@ def show_effects(result: Result, args: Namespace, screen: Screen) -> None:
 
 def run_new_effect(args: Namespace, screen: Screen) -> Result:
     """A file with an effect to edit, and its test."""
-    from trainer.effects.catalogue import catalogue
+    from trainer.effects.effect_catalogue import catalogue
     from trainer.effects.new_effect import write_new_effect
 
     paths = write_new_effect(args.name, args.stage, args.out, catalogue(args.effects))
@@ -133,7 +133,7 @@ def run_export(args: Namespace, screen: Screen) -> Result:
     if args.out.exists() and not args.out.is_dir():
         raise InputError(f"--out {args.out} is a file: give the name of a folder")
     from trainer.captures.capture_set import read_captures
-    from trainer.effects.catalogue import catalogue
+    from trainer.effects.effect_catalogue import catalogue
     from trainer.model.export import export_bundle
     from trainer.model.model_file import read_model
 

@@ -27,7 +27,7 @@ from runtime.solver.targets import decode_srgb, encode_srgb, fit_area
 from runtime.solving import write_gray
 from trainer.captures.bench_file import Bench
 from trainer.captures.open_bench import nominal_bench
-from trainer.effects.catalogue import catalogue
+from trainer.effects.effect_catalogue import catalogue
 from trainer.formatting import listed
 from trainer.model.export import export_bundle
 from trainer.model.model import Model

@@ -26,7 +26,7 @@ from trainer.cycle.loop import Cycle, Settings, run_cycle
 from trainer.cycle.retrieval import Volume, retrieve
 from trainer.cycle.show_on_bench import Stage, display_likeness, seen_pairs, with_iris_beside
 from trainer.cycle.test_pictures import HELD_OUT, LEARNED, in_depth, photographs
-from trainer.diagnosis.compare import with_gains
+from trainer.fitting.gains import with_gains
 from trainer.fitting.learn_field import with_learned_field
 from trainer.model.model import Model
 from trainer.networks.approximator import Approximator, read_approximator
@@ -130,7 +130,7 @@ class _Comparison:
                 raise InputError(f"--model is of another bench than {self.spec}: its panel or colours differ")
             return self.given
         from trainer.diagnosis.explain import explain
-        from trainer.effects.catalogue import catalogue
+        from trainer.effects.effect_catalogue import catalogue
         from trainer.fitting.pool import open_pool
 
         captures = self.captured("usual", None)

@@ -27,7 +27,7 @@ from runtime.solving import write_gray
 from trainer.captures.capture_set import CaptureSet
 from trainer.cycle.retrieval import ITERATIONS, Volume, retrieve
 from trainer.cycle.show_on_bench import Stage, display_likeness, rows_of, seen_pairs
-from trainer.diagnosis.compare import with_gains
+from trainer.fitting.gains import with_gains
 from trainer.fitting.learn_field import with_refined_field
 from trainer.model.model import Model
 from trainer.model.model_file import write_model

@@ -21,12 +21,12 @@ from torch import Tensor
 from firmware_iface.errors import InputError, nearest
 from runtime.lightpath.light_path import LightPath, irradiance, panel_phase, pixel_irradiance
 from runtime.solver import DriveRange, solve
-from trainer.effects.catalogue import BUILT_IN
-from trainer.model.export import baked_path, told_to_display
+from trainer.effects.effect_catalogue import BUILT_IN
+from trainer.model.export import acting_on_display, baked_path
 from trainer.model.model import Model, absent
+from trainer.model.model_stages import scene_for, stages_of
 from trainer.networks.approximator import Approximator, amplitude
 from trainer.prediction.predict import light_path
-from trainer.prediction.scene import scene_for, stages_of
 
 SOLVERS = {
     "double_phase": "double_phase",
@@ -92,7 +92,7 @@ def retrieve(
     """
     if method not in METHODS:
         raise InputError(f"there is no phase retrieval '{method}': {nearest(method, METHODS)}")
-    model = told_to_display(model)
+    model = acting_on_display(model)
     if method == "wirtinger_no_zero_order":
         model = beside_zero_order(model)
     if method != "hardware_in_the_loop":

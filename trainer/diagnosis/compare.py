@@ -6,26 +6,24 @@ One capture is in memory at a time. Saturated pixels are left out of every stati
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 
 from firmware_iface.errors import InputError
-from trainer.captures.batches import load, load_batch, split
+from runtime.excess import PredictionErrors, joined
+from trainer.captures.batches import load_batch
 from trainer.captures.camera_noise import compare_repeats
 from trainer.captures.capture_set import Capture, CaptureSet
-from trainer.diagnosis.diagnose import parts_of
-from trainer.diagnosis.localise import BrightnessSums, FieldSums, FrequencySums, Seen
-from trainer.fitting.excess import Errors, errors_of, join
-from trainer.fitting.gauss_newton import Predictor, fit, with_gain
+from trainer.captures.held_out import capture_roles, split
+from trainer.diagnosis.error_budget import ErrorBudget
+from trainer.diagnosis.localise import BrightnessSums, CaptureResidual, FieldSums, FrequencySums
+from trainer.fitting.gains import with_gains
+from trainer.fitting.predictor import Predictor
 from trainer.model.model import Model
-from trainer.prediction.scene import scene_for, stages_of
-
-if TYPE_CHECKING:
-    from trainer.diagnosis.error_budget import Budget
 
 PICTURES = 3  # held-out captures whose pictures are kept for the report
 PAIRS = 12  # pairs of repeats that the noise is checked on
@@ -66,7 +64,7 @@ class Comparison:
 
     model: Model
     captures: tuple[Capture, ...]
-    errors: Errors
+    errors: PredictionErrors
     gains: tuple[float | None, ...]
     psnr_db: float | None
     field: list[list[float | None]]
@@ -75,7 +73,7 @@ class Comparison:
     brightness: list[dict[str, Any]]
     noise_from_repeats: float | None
     pictures: tuple[Picture, ...] = ()
-    budget: Budget | None = None
+    budget: ErrorBudget | None = None
     """Where the ideal model's error goes; None where nobody asked, or there is no contrast."""
 
     def by_capture(self) -> list[dict[str, Any]]:
@@ -85,7 +83,7 @@ class Comparison:
                 "capture": c.capture,
                 "channel": c.channel,
                 "plane_mm": c.plane_mm,
-                **summary(part_of(self.errors, [k])),
+                **summary(self.errors.part([k])),
                 "gain": self.gains[k],
             }
             for k, c in enumerate(self.captures)
@@ -125,28 +123,16 @@ class Comparison:
 
     def _by(self, labels: Sequence[str]) -> dict[str, dict[str, float | None]]:
         return {
-            label: summary(part_of(self.errors, [k for k, other in enumerate(labels) if other == label]))
+            label: summary(self.errors.part([k for k, other in enumerate(labels) if other == label]))
             for label in dict.fromkeys(labels)
         }
 
 
-def summary(errors: Errors) -> dict[str, float | None]:
+def summary(errors: PredictionErrors) -> dict[str, float | None]:
     """nrmse, noise_nrmse and excess; None where the captures have no contrast to compare with."""
     if not float(errors.variance.sum()) > 0:
         return {"nrmse": None, "noise_nrmse": None, "excess": None}
-    return {"nrmse": errors.nrmse, "noise_nrmse": errors.noise_nrmse, "excess": errors.excess}
-
-
-def part_of(errors: Errors, which: Sequence[int]) -> Errors:
-    """The errors of some of the captures, by their place."""
-    index = torch.tensor(list(which), dtype=torch.long)
-    return Errors(
-        tuple(errors.ids[k] for k in which),
-        errors.squared[index],
-        errors.noise[index],
-        errors.variance[index],
-        errors.pixels[index],
-    )
+    return {**errors.as_json()}
 
 
 def compare(captures: CaptureSet, model: Model, progress: Progress | None = None) -> Comparison:
@@ -159,7 +145,7 @@ def compare(captures: CaptureSet, model: Model, progress: Progress | None = None
     """
     parts = split(captures)
     wanted = {c.channel for c in parts.held_out} - set(model.gain)
-    for_gain = [c for c in parts_of(captures).fitted if c.channel in wanted]
+    for_gain = [c for c in capture_roles(captures).fitted if c.channel in wanted]
     steps = len(for_gain) + len(parts.held_out)
 
     def done(count: int) -> None:
@@ -180,43 +166,6 @@ def compare(captures: CaptureSet, model: Model, progress: Progress | None = None
     return sums.finish(captures, model)
 
 
-def with_gains(
-    captures: CaptureSet, model: Model, rows: Sequence[Capture], done: Callable[[int], None] | None = None
-) -> Model:
-    """The model with the gains of the channels of `rows` fitted to these captures, one in memory at a time.
-
-    done : called with the number of captures that were used
-    """
-    channels = list(dict.fromkeys(c.channel for c in rows))
-    found = with_gain(replace(model, gain={}), _Predictors(captures, model, rows, done))
-    scene = scene_for(model, rows[0].channel, rows[0].plane_mm)
-    if stages_of(scene, model).sensor.response is not None:
-        # Counts are not proportional to light: least squares is only where the fit starts.
-        found = fit(found, [], load(captures, rows)).model
-    return replace(model, gain={**model.gain, **{c: found.gain[c] for c in channels}})
-
-
-class _Predictors(Sequence[Predictor]):
-    """Predictors of single captures, made when asked for."""
-
-    def __init__(
-        self, captures: CaptureSet, model: Model, rows: Sequence[Capture], done: Callable[[int], None] | None
-    ) -> None:
-        self.captures, self.model, self.rows, self.done = captures, model, rows, done
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    def __getitem__(self, index: Any) -> Any:
-        return Predictor(self.model, load_batch(self.captures, [self.rows[index]]))
-
-    def __iter__(self) -> Iterator[Predictor]:
-        for k in range(len(self)):
-            yield self[k]
-            if self.done:
-                self.done(k + 1)
-
-
 class _Sums:
     """What is gathered while the held-out captures pass by."""
 
@@ -225,7 +174,7 @@ class _Sums:
         shape = captures.bench.camera.shape
         self.field, self.frequency = FieldSums(shape), FrequencySums(shape)
         self.brightness = BrightnessSums(captures.bench.camera.full_scale)
-        self.errors: list[Errors] = []
+        self.errors: list[PredictionErrors] = []
         self.gains: list[float | None] = []
         self.used: list[Capture] = []
         self.pictures: list[Picture] = []
@@ -233,12 +182,12 @@ class _Sums:
     def add(self, capture: Capture, model: Model) -> None:
         """Compare one capture; one without an unsaturated pixel says nothing and is left out."""
         batch = load_batch(self.set, [capture])
-        if not bool(batch.weight.any()):
+        if not bool(batch.mask.any()):
             return
         prediction = Predictor(model, batch).predict(model)
-        errors = errors_of(batch, prediction)
-        tensors = (batch.signal, prediction, batch.noise, batch.weight)
-        seen = Seen(*(t[0].double().numpy() for t in tensors))
+        errors = batch.errors(prediction)
+        tensors = (batch.signal, prediction, batch.noise, batch.mask)
+        seen = CaptureResidual(*(t[0].double().numpy() for t in tensors))
         self.errors.append(errors)
         self.used.append(capture)
         square = float((seen.weight * seen.predicted**2).sum())
@@ -263,7 +212,7 @@ class _Sums:
 
     def finish(self, captures: CaptureSet, model: Model) -> Comparison:
         """Everything that was gathered."""
-        errors = join(self.errors)
+        errors = joined(self.errors)
         pixels = float(errors.pixels.sum())
         mse = float(errors.squared.sum()) / pixels
         peak = captures.bench.camera.full_scale

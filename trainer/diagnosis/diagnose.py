@@ -4,64 +4,60 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from trainer.captures.batches import load, sample, scenes, split
-from trainer.captures.capture_set import Capture, CaptureSet
-from trainer.diagnosis.candidates import Screened, Tried, evaluate_captures, screen, try_effect, try_together
-from trainer.diagnosis.probes import Probed, probe
+from runtime.excess import PredictionErrors, RemovedExcess, removed_excess
+from trainer.captures.capture_set import CaptureSet
+from trainer.captures.held_out import CaptureRoles, capture_roles
+from trainer.diagnosis.candidates import CandidateFit, try_effect, try_together
+from trainer.diagnosis.probes import ProbeResult, probe
+from trainer.diagnosis.screen import ScreenResult, screen
 from trainer.diagnosis.separate import captures_that_separate
-from trainer.diagnosis.verdict import Thresholds
-from trainer.effects.catalogue import Catalogue
+from trainer.diagnosis.verdict import Thresholds, verdict_of
 from trainer.effects.definition import STAGES, Effect
-from trainer.fitting.excess import Errors, Removed, removed
-from trainer.fitting.gauss_newton import fit
+from trainer.effects.effect_catalogue import Catalogue
+from trainer.fitting.gains import with_gains
 from trainer.fitting.pool import Pool
+from trainer.fitting.predictor import evaluate_captures
 from trainer.formatting import number
 from trainer.model.model import Model
-from trainer.model.parameters import describe, json_values, present_named
+from trainer.model.parameters import describe, json_values
 
 Progress = Callable[[float, str], None]
 
 FIRST_TRIED = 5  # candidates fitted after the screen; all of them when none of these explains anything
 TRIED_TOGETHER = 3  # candidates fitted with the present effects free, when none explains anything beside them
-FIT_CAPTURES = 4
-PROBE_CAPTURES = 9
-HELD_PIXELS = 24 * 480 * 640  # held-out pixels a candidate is judged on
 
 
 @dataclass(frozen=True)
-class Ranked:
+class RankedEffect:
     """A candidate in the ranking."""
 
     effect: Effect
     model: Model
-    held_out: Errors
-    gone: Removed
+    held_out: PredictionErrors
+    removed: RemovedExcess
     worth: bool
     indistinguishable_from: tuple[str, ...] = ()
 
     @property
     def base(self) -> Model:
         """The model without the candidate; other effects as they are beside it."""
-        return replace(
-            self.model, present=tuple(p for p in self.model.present if p.effect.name != self.effect.name)
-        )
+        return self.model.without(self.effect.name)
 
     def as_json(self) -> dict[str, Any]:
         """The contract's keys."""
-        low, high = self.gone.interval()
+        low, high = self.removed.interval()
         return {
             "effect": self.effect.name,
             "stage": self.effect.stage,
             "excess_after": self.held_out.excess,
-            "excess_removed": self.gone.value,
+            "excess_removed": self.removed.value,
             "ci95": [low, high],
             "worth_adding": self.worth,
-            "parameters": json_values(present_named(self.model, self.effect.name), self.model.bench),
+            "parameters": json_values(self.model.instance(self.effect.name), self.model.bench),
             "indistinguishable_from": list(self.indistinguishable_from),
         }
 
@@ -71,25 +67,25 @@ class Diagnosis:
     """What is missing, how sure that is, and what would tell more."""
 
     model: Model
-    held_out: Errors
+    held_out: PredictionErrors
     ideal_excess: float
     verdict: str
     stage: str | None
-    ranking: tuple[Ranked, ...]
-    probes: tuple[Probed, ...]
+    ranking: tuple[RankedEffect, ...]
+    probes: tuple[ProbeResult, ...]
     suggested_captures: tuple[str, ...]
     thresholds: Thresholds
-    screened: tuple[Screened, ...] = field(default=())
+    screened: tuple[ScreenResult, ...] = field(default=())
 
     @property
-    def best(self) -> Ranked | None:
+    def best(self) -> RankedEffect | None:
         """The effect to add, if one is worth adding."""
         return self.ranking[0] if self.ranking and self.ranking[0].worth else None
 
     @property
     def probe_pictures(self) -> list[tuple[str, str, np.ndarray, str]]:
         """(stage, title, array, unit) of what the free-form probes found, where they found anything."""
-        found = [p for p in self.probes if p.gone.value > 0.01 * self.held_out.excess]
+        found = [p for p in self.probes if p.removed.value > 0.01 * self.held_out.excess]
         return [(p.stage, *picture) for p in found for picture in p.pictures]
 
     @property
@@ -106,8 +102,8 @@ class Diagnosis:
             )
             return f"Something is missing that the catalogue does not name (excess {left}).{where}"
         best = self.best
-        size = describe(present_named(best.model, best.effect.name), best.model.bench)
-        share = 100 * best.gone.value / max(self.held_out.excess, 1e-12)
+        size = describe(best.model.instance(best.effect.name), best.model.bench)
+        share = 100 * best.removed.value / max(self.held_out.excess, 1e-12)
         also = ""
         if best.indistinguishable_from:
             also = f" These captures cannot tell it from {' or '.join(best.indistinguishable_from)}."
@@ -117,7 +113,7 @@ class Diagnosis:
     def as_json(self) -> dict[str, Any]:
         """The contract's keys, and the thresholds and the sentence."""
         return {
-            "heldout": heldout_json(self.held_out),
+            "heldout": self.held_out.as_json(),
             "verdict": self.verdict,
             "stage": self.stage,
             "stages": [p.as_json() for p in self.probes],
@@ -125,57 +121,14 @@ class Diagnosis:
             "suggested_captures": list(self.suggested_captures),
             "ideal_excess": self.ideal_excess,
             "thresholds": self.thresholds.as_json(),
-            "screen": [{"effect": s.effect, "excess_removed": s.removed} for s in self.screened],
+            "screen": [{"effect": s.effect, "excess_removed": s.removed_excess} for s in self.screened],
             "sentence": self.sentence,
         }
 
 
-def heldout_json(errors: Errors) -> dict[str, float]:
-    """The contract's three numbers."""
-    return {"nrmse": errors.nrmse, "noise_nrmse": errors.noise_nrmse, "excess": errors.excess}
-
-
-@dataclass(frozen=True)
-class Parts:
-    """Which captures a diagnosis uses for what."""
-
-    captures: CaptureSet
-    fitted: tuple[Capture, ...]
-    screened: tuple[Capture, ...]
-    probed: tuple[Capture, ...]
-    held_out: tuple[Capture, ...]
-
-    @property
-    def folder(self) -> Path:
-        """Folder of the capture set."""
-        return self.captures.folder
-
-
-def parts_of(captures: CaptureSet) -> Parts:
-    """Choose captures for fits, the screen, the probes and the judgement."""
-    divided = split(captures)
-    height, width = captures.bench.panel.shape
-    pixels = height * width
-    count = len(scenes(divided.fitted))
-    fitted = sample(divided.fitted, pixels, max(FIT_CAPTURES, count))
-    screened = sample(divided.fitted, pixels, count)
-    probed = sample(divided.fitted, pixels // 2, max(PROBE_CAPTURES, count))
-    most = max(2 * count, HELD_PIXELS // pixels)
-    held_out = list(divided.held_out)
-    if len(held_out) > most:
-        held_out = held_out[:: -(-len(held_out) // most)]
-    return Parts(captures, tuple(fitted), tuple(screened), tuple(probed), tuple(held_out))
-
-
-def with_gains(parts: Parts, model: Model) -> Model:
-    """The model with gains fitted where it has none."""
-    rows = [c for c in parts.fitted if c.channel not in model.gain]
-    return fit(model, [], load(parts.captures, rows)).model if rows else model
-
-
-def ideal_errors(parts: Parts, model: Model) -> Errors:
+def ideal_errors(parts: CaptureRoles, model: Model) -> PredictionErrors:
     """Held-out errors of the bench file's own model."""
-    ideal = with_gains(parts, Model(model.bench, method=model.method))
+    ideal = with_gains(parts.captures, Model(model.bench, method=model.method), parts.fitted)
     return evaluate_captures(parts.captures, parts.held_out, ideal)
 
 
@@ -186,7 +139,7 @@ def diagnose(
     pool: Pool,
     thresholds: Thresholds | None = None,
     progress: Progress | None = None,
-    ideal: Errors | None = None,
+    ideal: PredictionErrors | None = None,
     with_probes: bool = True,
 ) -> Diagnosis:
     """What is missing from `model` on a capture set.
@@ -196,9 +149,9 @@ def diagnose(
     """
     thresholds = thresholds or Thresholds()
     say = progress or (lambda done, what: None)
-    parts = parts_of(captures)
+    parts = capture_roles(captures)
     say(0.0, "comparing the model with held-out captures")
-    model = with_gains(parts, model)
+    model = with_gains(captures, model, parts.fitted)
     before = evaluate_captures(captures, parts.held_out, model)
     ideal_excess = (ideal or (before if not model.present else ideal_errors(parts, model))).excess
     complete = thresholds.complete(before.excess, ideal_excess)
@@ -208,10 +161,10 @@ def diagnose(
 
     candidates = [e for e in known.values() if e.name not in model.names]
     screened = screen_all(parts, model, candidates, pool, say)
-    order = sorted(screened, key=lambda s: -s.removed)
-    promising = [s for s in order[:FIRST_TRIED] if s.removed > 0.05 * max(order[0].removed, 1e-12)] or order[
-        :1
-    ]
+    order = sorted(screened, key=lambda s: -s.removed_excess)
+    promising = [
+        s for s in order[:FIRST_TRIED] if s.removed_excess > 0.05 * max(order[0].removed_excess, 1e-12)
+    ] or order[:1]
     # The screen says little of an effect whose derivatives do not reach, or that shows from capture to capture only.
     blind = [s for s in order if known[s.effect].rugged or known[s.effect].measure]
     first = promising + [s for s in blind if s not in promising]
@@ -226,10 +179,9 @@ def diagnose(
             settled, together = try_together_with_present(parts, model, tried, pool)
             jointly = rank(settled, together, known, thresholds, ideal_excess, len(candidates))
             ranking = jointly + [r for r in ranking if r.effect.name not in {t.effect for t in together}]
-    found = not complete and bool(ranking) and ranking[0].worth
-    verdict = "complete" if complete else "missing" if found else "outside_catalogue"
+    verdict = verdict_of(complete, bool(ranking) and ranking[0].worth)
 
-    probes: list[Probed] = []
+    probes: list[ProbeResult] = []
     if with_probes or verdict == "outside_catalogue":
         probes = probe_all(parts, model, before, pool, say)
     stage = None
@@ -237,8 +189,8 @@ def diagnose(
         stage = ranking[0].effect.stage
     elif verdict == "outside_catalogue":
         # A probe of a few thousand numbers that removes nothing on held-out captures points nowhere.
-        telling = [p for p in probes if thresholds.worth_adding(p.gone, ideal_excess, len(probes))]
-        stage = max(telling, key=lambda p: p.gone.value).stage if telling else None
+        telling = [p for p in probes if thresholds.worth_adding(p.removed, ideal_excess, len(probes))]
+        stage = max(telling, key=lambda p: p.removed.value).stage if telling else None
     suggestions = suggest(parts, verdict, ranking)
     say(1.0, "done")
     return Diagnosis(
@@ -256,8 +208,8 @@ def diagnose(
 
 
 def screen_all(
-    parts: Parts, model: Model, effects: Sequence[Effect], pool: Pool, say: Progress
-) -> list[Screened]:
+    parts: CaptureRoles, model: Model, effects: Sequence[Effect], pool: Pool, say: Progress
+) -> list[ScreenResult]:
     """Screen every effect, dealt out among the pool's workers."""
     hands = min(pool.workers, len(effects)) or 1
     ids = tuple(c.capture for c in parts.screened)
@@ -270,15 +222,15 @@ def screen_all(
 
 
 def try_all(
-    parts: Parts,
+    parts: CaptureRoles,
     model: Model,
-    before: Errors,
-    screened: Sequence[Screened],
+    before: PredictionErrors,
+    screened: Sequence[ScreenResult],
     pool: Pool,
     say: Progress,
     start: float,
     end: float,
-) -> list[Tried]:
+) -> list[CandidateFit]:
     """Fit candidates at their lowest order, then raise the order of those that do about as well as the best."""
     ids = tuple(c.capture for c in parts.fitted)
     held = tuple(c.capture for c in parts.held_out)
@@ -294,7 +246,7 @@ def try_all(
     again = [
         k
         for k, t in enumerate(tried)
-        if len(present_named(t.model, t.effect).effect.orders) > 1
+        if len(t.model.instance(t.effect).effect.orders) > 1
         and most - t.held_out.excess > 0.3 * (most - least)
     ]
     tasks = [
@@ -303,7 +255,7 @@ def try_all(
             ids,
             held,
             _without_gain_of(tried[k].model, model),
-            present_named(tried[k].model, tried[k].effect),
+            tried[k].model.instance(tried[k].effect),
             True,
         )
         for k in again
@@ -316,8 +268,8 @@ def try_all(
 
 
 def try_together_with_present(
-    parts: Parts, model: Model, tried: Sequence[Tried], pool: Pool
-) -> tuple[Errors, list[Tried]]:
+    parts: CaptureRoles, model: Model, tried: Sequence[CandidateFit], pool: Pool
+) -> tuple[PredictionErrors, list[CandidateFit]]:
     """The candidates that came closest, with the present effects fitted beside them, and the errors without any.
 
     An effect that was added alone may have taken up a part of one that is still missing, and stands in its way.
@@ -337,58 +289,65 @@ def _without_gain_of(fitted: Model, model: Model) -> Model:
 
 
 def rank(
-    before: Errors,
-    tried: Sequence[Tried],
+    before: PredictionErrors,
+    tried: Sequence[CandidateFit],
     known: Catalogue,
     thresholds: Thresholds,
     ideal_excess: float,
     candidates: int,
-) -> list[Ranked]:
+) -> list[RankedEffect]:
     """Candidates by excess removed, each with those that the captures cannot tell it from."""
     complete = thresholds.complete(before.excess, ideal_excess)
     ordered = sorted(tried, key=lambda t: t.held_out.excess)
     ranked = []
     for one in ordered:
-        gone = removed(before, one.held_out)
-        worth = not complete and thresholds.worth_adding(gone, ideal_excess, candidates)
-        twins = tuple(
+        removed = removed_excess(before, one.held_out)
+        worth = not complete and thresholds.worth_adding(removed, ideal_excess, candidates)
+        alike = tuple(
             other.effect
             for other in ordered
             if other is not one
             and worth
             and _inseparable(one, other, before, thresholds, ideal_excess, candidates)
         )
-        ranked.append(Ranked(known[one.effect], one.model, one.held_out, gone, worth, twins))
+        ranked.append(RankedEffect(known[one.effect], one.model, one.held_out, removed, worth, alike))
     return ranked
 
 
 def _inseparable(
-    one: Tried, other: Tried, before: Errors, thresholds: Thresholds, ideal_excess: float, candidates: int
+    one: CandidateFit,
+    other: CandidateFit,
+    before: PredictionErrors,
+    thresholds: Thresholds,
+    ideal_excess: float,
+    candidates: int,
 ) -> bool:
-    if not thresholds.worth_adding(removed(before, other.held_out), ideal_excess, candidates):
+    if not thresholds.worth_adding(removed_excess(before, other.held_out), ideal_excess, candidates):
         return False
     worse, better = (one, other) if one.held_out.excess > other.held_out.excess else (other, one)
-    return thresholds.inseparable(removed(worse.held_out, better.held_out), better.held_out.excess)
+    return thresholds.inseparable(removed_excess(worse.held_out, better.held_out), better.held_out.excess)
 
 
-def probe_all(parts: Parts, model: Model, before: Errors, pool: Pool, say: Progress) -> list[Probed]:
+def probe_all(
+    parts: CaptureRoles, model: Model, before: PredictionErrors, pool: Pool, say: Progress
+) -> list[ProbeResult]:
     """Fit each stage's free-form probe alone."""
     ids = tuple(c.capture for c in parts.probed)
     held = tuple(c.capture for c in parts.held_out)
     tasks = [(parts.folder, ids, held, model, stage) for stage in STAGES]
     say(0.7, "probing the stages")
     found = pool.map(probe, tasks, lambda n: say(0.7 + 0.25 * n / len(tasks), "probing the stages"))
-    return [Probed.judged(p, before) for p in found]
+    return [ProbeResult.judged(p, before) for p in found]
 
 
-def suggest(parts: Parts, verdict: str, ranking: Sequence[Ranked]) -> list[str]:
+def suggest(parts: CaptureRoles, verdict: str, ranking: Sequence[RankedEffect]) -> list[str]:
     """Captures that would tell more, most telling first."""
     suggestions: list[str] = []
     if verdict == "missing" and ranking[0].indistinguishable_from:
-        twins = {r.effect.name: r.model for r in ranking}
+        alike = {r.effect.name: r.model for r in ranking}
         for other in ranking[0].indistinguishable_from:
             suggestions += captures_that_separate(
-                parts, (ranking[0].effect.name, ranking[0].model), (other, twins[other])
+                parts, (ranking[0].effect.name, ranking[0].model), (other, alike[other])
             )
     patterns = [c.pattern for c in parts.captures.captures]
     if len(set(patterns)) == len(patterns):

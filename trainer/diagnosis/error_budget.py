@@ -14,10 +14,11 @@ import torch
 from torch import Tensor
 
 from firmware_iface.errors import InputError
-from trainer.captures.batches import load_batch, split
+from runtime.excess import PredictionErrors, joined
+from trainer.captures.batches import load_batch
 from trainer.captures.capture_set import CaptureSet
-from trainer.fitting.excess import Errors, errors_of, join
-from trainer.fitting.gauss_newton import Predictor
+from trainer.captures.held_out import split
+from trainer.fitting.predictor import Predictor
 from trainer.model.model import Model
 from trainer.networks.approximator import Approximator
 from trainer.training.pairs import display_irradiance, expected_counts, onto_camera, stacked
@@ -26,7 +27,7 @@ Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
-class Budget:
+class ErrorBudget:
     """Shares of the signal's variance; `named_physics` and `network` are negative where they make it worse."""
 
     named_physics: float
@@ -42,45 +43,45 @@ class Budget:
 
 def error_budget(
     captures: CaptureSet, model: Model, network: Approximator | None = None, progress: Progress | None = None
-) -> Budget:
+) -> ErrorBudget:
     """The budget on the held-out captures of a set.
 
     model : of the bench, with its gains. network : trained on what the model leaves; None: none
     Raises InputError where the network is of another panel or other colours, and where there is no contrast.
     """
-    from trainer.diagnosis.compare import with_gains
+    from trainer.fitting.gains import with_gains
 
     parts = split(captures)
     if network is not None:
         _check(network, captures)
     ideal = with_gains(captures, Model(captures.bench, method=model.method), parts.fitted)
-    model = with_gains(captures, model, parts.fitted)
+    model = with_gains(captures, replace(model, gain={}), parts.fitted)
     named = model
     if model.panel_field is not None:
         named = with_gains(captures, replace(model, gain={}, panel_field=None), parts.fitted)
     stacks = stacked(captures, parts.held_out)
-    rows: list[tuple[Errors, Errors, Errors]] = []
+    rows: list[tuple[PredictionErrors, PredictionErrors, PredictionErrors]] = []
     with torch.no_grad():
         for k, stack in enumerate(stacks):
             batches = [None if c is None else load_batch(captures, [c]) for c in stack]
             changes = _changes(model, network, batches)
             for batch, change in zip(batches, changes, strict=True):
-                if batch is None or not bool(batch.weight.any()):
+                if batch is None or not bool(batch.mask.any()):
                     continue
                 scene, stages, expected, sensitivity = expected_counts(model, batch)
                 with_network = expected
                 if change is not None:
                     with_network = expected + sensitivity * onto_camera(scene, stages, change)
                 physical = expected if named is model else Predictor(named, batch).predict(named)
-                predictions = (Predictor(ideal, batch).predict(ideal), physical, with_network)
-                rows.append(tuple(errors_of(batch, one) for one in predictions))  # type: ignore[arg-type]
+                bare = Predictor(ideal, batch).predict(ideal)
+                rows.append((batch.errors(bare), batch.errors(physical), batch.errors(with_network)))
             if progress:
                 progress((k + 1) / len(stacks))
     if not rows or not float(sum(row[0].variance.sum() for row in rows)) > 0:
         raise InputError(f"the held-out captures of {captures.folder} have no contrast to compare with")
-    bare, known, learned = (join([row[k] for row in rows]) for k in range(3))
-    return Budget(
-        bare.excess - known.excess,
+    without, known, learned = (joined([row[k] for row in rows]) for k in range(3))
+    return ErrorBudget(
+        without.excess - known.excess,
         known.excess - learned.excess,
         learned.noise_nrmse**2,
         learned.excess,

@@ -3,39 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from runtime.excess import PredictionErrors, removed_excess
 from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet
-from trainer.diagnosis.candidates import (
-    Screened,
-    evaluate_captures,
-    fit_from,
-    least_for_order,
-    screen_batches,
-    settled,
-)
-from trainer.diagnosis.diagnose import (
-    Diagnosis,
-    Parts,
-    Progress,
-    diagnose,
-    heldout_json,
-    ideal_errors,
-    parts_of,
-    with_gains,
-)
+from trainer.captures.held_out import CaptureRoles, capture_roles
+from trainer.diagnosis.diagnose import Diagnosis, Progress, diagnose, ideal_errors
+from trainer.diagnosis.screen import ScreenResult, screen_batches
 from trainer.diagnosis.verdict import Thresholds
-from trainer.effects.catalogue import Catalogue
 from trainer.effects.definition import Effect
-from trainer.fitting.excess import Errors, removed
-from trainer.fitting.gauss_newton import fit, raise_order
+from trainer.effects.effect_catalogue import Catalogue
+from trainer.fitting.gains import with_gains
+from trainer.fitting.gauss_newton import fit
 from trainer.fitting.pool import Pool
-from trainer.model.model import Model, Present
-from trainer.model.parameters import json_values, present_named
+from trainer.fitting.predictor import evaluate_captures
+from trainer.fitting.refit import fit_from, least_for_order, raise_order, settled
+from trainer.model.history import recorded
+from trainer.model.model import EffectInstance, Model
+from trainer.model.parameters import json_values
 
 MOST_EFFECTS = 8  # an explanation longer than this explains nothing
 
@@ -46,15 +34,15 @@ class Addition:
 
     effect: str
     model: Model
-    before: Errors
-    after: Errors
+    before: PredictionErrors
+    after: PredictionErrors
 
     def as_json(self) -> dict[str, Any]:
         """The contract's keys."""
-        present = present_named(self.model, self.effect)
+        present = self.model.instance(self.effect)
         return {
-            "before": heldout_json(self.before),
-            "after": heldout_json(self.after),
+            "before": self.before.as_json(),
+            "after": self.after.as_json(),
             "parameters": json_values(present, self.model.bench),
         }
 
@@ -64,7 +52,7 @@ class Step:
     """A rung of the ladder: what was added (or removed again), and the held-out errors then."""
 
     added: str | None
-    held_out: Errors
+    held_out: PredictionErrors
     indistinguishable_from: tuple[str, ...] = ()
     removed: str | None = None
 
@@ -112,14 +100,14 @@ def add(
 ) -> Addition:
     """Add one effect to a model and refit all that is in it; an effect that is already there is refitted."""
     say = progress or (lambda done, what: None)
-    parts = parts_of(captures)
-    model = with_gains(parts, model)
+    parts = capture_roles(captures)
+    model = with_gains(captures, model, parts.fitted)
     before = evaluate_captures(captures, parts.held_out, model)
     say(0.1, f"finding where {effect.name} starts")
     if effect.name in model.names:
-        start = present_named(model, effect.name)
+        start = model.instance(effect.name)
     else:
-        screened: list[Screened] = screen_batches(load(captures, parts.screened), model, (effect,))
+        screened: list[ScreenResult] = screen_batches(load(captures, parts.screened), model, (effect,))
         start = screened[0].start
     say(0.3, f"fitting {effect.name}")
     added = add_from(parts, model, start)
@@ -129,25 +117,13 @@ def add(
     return Addition(effect.name, added, before, after)
 
 
-def add_from(parts: Parts, model: Model, start: Present) -> Model:
+def add_from(parts: CaptureRoles, model: Model, start: EffectInstance) -> Model:
     """The model with an effect fitted from a start, its order raised, and everything present refitted together."""
     batches = load(parts.captures, parts.fitted)
     name = start.effect.name
     fitted = fit_from(model, start, batches)
     fitted = raise_order(fitted, name, batches, least_for_order)
     return settled(fitted.model, batches).model if len(fitted.model.names) > 1 else fitted.model
-
-
-def recorded(model: Model, name: str | None, errors: Errors, dropped: str | None = None) -> Model:
-    """The model with one more record in its history."""
-    record: dict[str, Any] = {
-        "added": name or "",
-        **heldout_json(errors),
-        "date": datetime.now(UTC).date().isoformat(),
-    }
-    if dropped:
-        record["removed"] = dropped
-    return replace(model, history=(*model.history, record))
 
 
 def explain(
@@ -166,8 +142,8 @@ def explain(
     """
     thresholds = thresholds or Thresholds()
     say = progress or (lambda done, what: None)
-    parts = parts_of(captures)
-    model = with_gains(parts, model)
+    parts = capture_roles(captures)
+    model = with_gains(captures, model, parts.fitted)
     errors = evaluate_captures(captures, parts.held_out, model)
     ideal = ideal_errors(parts, model) if model.present else errors
     model = recorded(model, None, errors)
@@ -187,9 +163,9 @@ def explain(
         if best is None or len(model.names) >= MOST_EFFECTS:
             break
         told(0.9, f"adding {best.effect.name}")
-        candidate = add_from(parts, best.base, present_named(best.model, best.effect.name))
+        candidate = add_from(parts, best.base, best.model.instance(best.effect.name))
         after = evaluate_captures(captures, parts.held_out, candidate)
-        if not thresholds.worth_adding(removed(errors, after), ideal.excess, 1):
+        if not thresholds.worth_adding(removed_excess(errors, after), ideal.excess, 1):
             break
         errors = after
         model = recorded(candidate, best.effect.name, errors)
@@ -209,17 +185,22 @@ def explain(
 
 
 def _without_needless(
-    parts: Parts, model: Model, errors: Errors, newest: str, thresholds: Thresholds, ideal_excess: float
-) -> tuple[str, Model, Errors] | None:
+    parts: CaptureRoles,
+    model: Model,
+    errors: PredictionErrors,
+    newest: str,
+    thresholds: Thresholds,
+    ideal_excess: float,
+) -> tuple[str, Model, PredictionErrors] | None:
     """The model without an earlier effect that the newest has made needless, if there is one."""
     for name in model.names:
         if name == newest:
             continue
-        rest = replace(model, present=tuple(p for p in model.present if p.effect.name != name))
+        rest = model.without(name)
         batches = load(parts.captures, parts.fitted)
         unexplained = not thresholds.complete(errors.excess, ideal_excess)
         fitted = (settled(rest, batches) if unexplained else fit(rest, rest.names, batches)).model
         without = evaluate_captures(parts.captures, parts.held_out, fitted)
-        if not thresholds.worth_adding(removed(without, errors), ideal_excess, 1):
+        if not thresholds.worth_adding(removed_excess(without, errors), ideal_excess, 1):
             return name, fitted, without
     return None

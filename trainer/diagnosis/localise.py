@@ -11,10 +11,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from trainer.fitting.excess import tiles
+from runtime.excess import tile_sums
 
 CELLS = 16  # tiles along the longer side of the picture
 RINGS = 0.025  # width of a ring of spatial frequencies, cycles/pixel
@@ -26,7 +25,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Seen:
+class CaptureResidual:
     """One capture beside its prediction.
 
     measured, predicted : counts above black; noise : expected variance, counts^2
@@ -53,13 +52,13 @@ class FieldSums:
         self._above = np.zeros(self.shape)
         self._pixels = np.zeros(self.shape)
 
-    def add(self, seen: Seen) -> None:
+    def add(self, seen: CaptureResidual) -> None:
         """Take one capture in."""
         self._above += self._sums(seen.residual**2 - seen.noise * seen.weight)
         self._pixels += self._sums(seen.weight)
 
     def _sums(self, values: Array) -> Array:
-        return tiles(torch.from_numpy(values)[None], self.tile)[0].numpy().reshape(self.shape)
+        return tile_sums(values, self.tile)
 
     def excess(self, variance: float) -> list[list[float | None]]:
         """Excess of each tile, [row][column]; None for a tile that is saturated in every capture.
@@ -100,7 +99,7 @@ class FrequencySums:
         self._signal: Array = np.zeros(len(self._count))
         self._noise, self._captures = 0.0, 0
 
-    def add(self, seen: Seen) -> None:
+    def add(self, seen: CaptureResidual) -> None:
         """Take one capture in."""
         pixels = seen.weight.sum()
         mean = float((seen.measured * seen.weight).sum() / pixels) if pixels else 0.0
@@ -139,7 +138,7 @@ class BrightnessSums:
     full_scale: float
     _sums: Array = field(default_factory=lambda: np.zeros((5, FINE)))
 
-    def add(self, seen: Seen) -> None:
+    def add(self, seen: CaptureResidual) -> None:
         """Take one capture in."""
         use = seen.weight > 0
         predicted, residual = seen.predicted[use], seen.residual[use]

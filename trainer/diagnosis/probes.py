@@ -16,15 +16,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from runtime.excess import PredictionErrors, RemovedExcess, joined, removed_excess
 from runtime.lightpath.legendre import legendre_count, legendre_curve, legendre_surface
-from trainer.captures.batches import Batch, load, load_batch, scenes
-from trainer.captures.capture_set import Capture
-from trainer.diagnosis.candidates import chosen, opened
-from trainer.fitting.excess import Errors, Removed, errors_of, join, removed
-from trainer.fitting.free_form_maps import Kind, Picture, Tensors, Working, descend
+from runtime.lightpath.light_path import mode_irradiance, panel_phase, panel_spectrum
+from trainer.captures.batches import Batch, load, load_batch
+from trainer.captures.capture_set import Capture, chosen, opened
+from trainer.captures.held_out import scenes
+from trainer.fitting.free_form_maps import FreeFormBatch, FreeFormStage, Picture, Tensors, descend
 from trainer.model.model import Model
 from trainer.prediction.panel_field import UNITS, resized, with_field
-from trainer.prediction.scene import Stages
+from trainer.prediction.predict import light_path
+from trainer.prediction.scene import Scene, Stages
 
 ROUND = 2  # iterations between two looks at the capture that says when to stop
 ROUNDS = {"drive": 7, "panel": 12, "pupil": 10, "sensor": 12}
@@ -42,30 +44,30 @@ class ProbeFit:
     """A fitted probe: held-out errors with it, and what it looks like."""
 
     stage: str
-    held_out: Errors
+    held_out: PredictionErrors
     pictures: tuple[Picture, ...]
 
 
 @dataclass(frozen=True)
-class Probed:
+class ProbeResult:
     """A probe judged against the model without it."""
 
     stage: str
-    gone: Removed
+    removed: RemovedExcess
     excess_after: float
     pictures: tuple[Picture, ...]
 
     @classmethod
-    def judged(cls, found: ProbeFit, before: Errors) -> Probed:
+    def judged(cls, found: ProbeFit, before: PredictionErrors) -> ProbeResult:
         """How much held-out excess the probe removes."""
-        return cls(found.stage, removed(before, found.held_out), found.held_out.excess, found.pictures)
+        return cls(found.stage, removed_excess(before, found.held_out), found.held_out.excess, found.pictures)
 
     def as_json(self) -> dict[str, Any]:
         """The contract's keys, and an interval."""
-        low, high = self.gone.interval()
+        low, high = self.removed.interval()
         return {
             "stage": self.stage,
-            "excess_removed": self.gone.value,
+            "excess_removed": self.removed.value,
             "excess_after": self.excess_after,
             "ci95": [low, high],
         }
@@ -81,16 +83,16 @@ def probe(
     each = max(1, CAPTURES[stage] // len(last))
     batches = load(captures, [c for scene in scenes(rows) for c in _of(scene, rows, last)[:each]])
     kind = PROBES[stage](model, batches[0])
-    scale = sum(float(errors_of(b, torch.zeros_like(b.signal)).variance.sum()) for b in batches)
+    scale = sum(float(b.errors(torch.zeros_like(b.signal)).variance.sum()) for b in batches)
     # One capture a colour and plane is kept from the gradient and says when to stop.
-    seen, unseen = ([Working(model, b) for b in part] for part in (batches, load(captures, last)))
+    seen, unseen = ([FreeFormBatch(model, b) for b in part] for part in (batches, load(captures, last)))
     found = descend(kind, seen, unseen, scale, ROUND, ROUNDS[stage])
     with torch.no_grad():
         parts = []
         for row in chosen(captures, held_ids):
-            working = Working(model, load_batch(captures, [row]))
-            parts.append(errors_of(working.batch, working.predict(kind, found, 0)))
-        return ProbeFit(stage, join(parts), tuple(kind.pictures(found)))
+            working = FreeFormBatch(model, load_batch(captures, [row]))
+            parts.append(working.batch.errors(working.predict(kind, found, 0)))
+        return ProbeFit(stage, joined(parts), tuple(kind.pictures(found)))
 
 
 def _of(scene: tuple[str, float], rows: list[Capture], last: Collection[Capture]) -> list[Capture]:
@@ -99,7 +101,7 @@ def _of(scene: tuple[str, float], rows: list[Capture], last: Collection[Capture]
     return [c for c in own if c not in last] or own
 
 
-def _drive(model: Model, batch: Batch) -> Kind:
+def _drive(model: Model, batch: Batch) -> FreeFormStage:
     y, x = _field(*model.bench.panel.shape)
     channels = [c.name for c in model.bench.channels]
     taps = torch.tensor([[0.0, 0, 1, 0, 0], [0, 0, 1, 0, 0]])
@@ -129,10 +131,18 @@ def _drive(model: Model, batch: Batch) -> Kind:
         "columns": ((2, 5), 0.5),
         "spread": ((), 0.3),
     }
-    return Kind("drive", shapes, apply, pictures)
+    return FreeFormStage("drive", shapes, apply, pictures, irradiance=_spread_in_time)
 
 
-def _panel(model: Model, batch: Batch) -> Kind:
+def _spread_in_time(scene: Scene, stages: Stages, gray: Tensor, tensors: Tensors) -> Tensor:
+    """Mean irradiance over a phase whose gain swings by +-`spread` while the camera looks."""
+    path = light_path(scene, stages)
+    phase = panel_phase(path, gray)
+    swings = [phase * (1 + s * tensors["spread"]) for s in (-1, 1)]
+    return 0.5 * sum(mode_irradiance(path, panel_spectrum(path, swing)) for swing in swings)
+
+
+def _panel(model: Model, batch: Batch) -> FreeFormStage:
     height, width = model.bench.panel.shape
     nodes = _nodes(height, width, "panel")
     unit = math.sqrt(nodes[0] * nodes[1])
@@ -148,10 +158,10 @@ def _panel(model: Model, batch: Batch) -> Kind:
             ("amplitude added", _array(added), "of the modulated"),
         ]
 
-    return Kind("panel", {n: (nodes, unit) for n in UNITS}, apply, pictures)
+    return FreeFormStage("panel", {n: (nodes, unit) for n in UNITS}, apply, pictures)
 
 
-def _pupil(model: Model, batch: Batch) -> Kind:
+def _pupil(model: Model, batch: Batch) -> FreeFormStage:
     def apply(stages: Stages, t: Tensors) -> Stages:
         pupil = stages.pupil
         log = _sampled(t["log"], pupil.v / PUPIL_EXTENT, pupil.u / PUPIL_EXTENT)
@@ -174,10 +184,10 @@ def _pupil(model: Model, batch: Batch) -> Kind:
 
     nodes = (PUPIL_NODES, PUPIL_NODES)
     shapes = {"log": (nodes, PUPIL_NODES), "phase": (nodes, PUPIL_NODES), "extent": ((2,), 0.5)}
-    return Kind("pupil", shapes, apply, pictures)
+    return FreeFormStage("pupil", shapes, apply, pictures)
 
 
-def _sensor(model: Model, batch: Batch) -> Kind:
+def _sensor(model: Model, batch: Batch) -> FreeFormStage:
     height, width = model.bench.camera.shape
     nodes = _nodes(height, width, "sensor")
     full_scale = model.bench.camera.full_scale
@@ -230,10 +240,10 @@ def _sensor(model: Model, batch: Batch) -> Kind:
         "kernel": ((TAPS, TAPS), 0.5),
         "bend": ((6,), 1.0),
     }
-    return Kind("sensor", shapes, apply, pictures)
+    return FreeFormStage("sensor", shapes, apply, pictures)
 
 
-PROBES: dict[str, Callable[[Model, Batch], Kind]] = {
+PROBES: dict[str, Callable[[Model, Batch], FreeFormStage]] = {
     "drive": _drive,
     "panel": _panel,
     "pupil": _pupil,

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import torch
 
 from firmware_iface.errors import InputError
 from trainer.captures.batches import Batch, load_batch
-from trainer.fitting.gauss_newton import Predictor
+from trainer.captures.held_out import CaptureRoles
+from trainer.fitting.predictor import Predictor
 from trainer.model.model import Model
-
-if TYPE_CHECKING:
-    from trainer.diagnosis.diagnose import Parts
 
 PLANES = (0.6, 1.6)  # other planes proposed, as shares of the distance
 
 
-def captures_that_separate(parts: Parts, one: tuple[str, Model], other: tuple[str, Model]) -> list[str]:
+def captures_that_separate(
+    parts: CaptureRoles, one: tuple[str, Model], other: tuple[str, Model]
+) -> list[str]:
     """Sentences, most telling first; none where no proposed capture tells more than those at hand.
 
     For each proposal both models predict the same patterns; what counts is the squared difference, with the gain
@@ -54,7 +53,7 @@ def _difference(one: Model, other: Model, batch: Batch) -> float:
         predictions = []
         for model in (one, other):
             gains = {batch.channel: next(iter(model.gain.values())), **model.gain}
-            model = Model(model.bench, model.present, gains, model.method)
+            model = replace(model, gain=gains)
             predictor = Predictor(model, batch)
             predictions.append(predictor.predict(model))
         a, b = predictions

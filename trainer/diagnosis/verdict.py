@@ -13,8 +13,26 @@ named is the work of the least amounts.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from typing import Literal
 
-from trainer.fitting.excess import Removed
+from runtime.excess import COMPLETE_EXCESS, COMPLETE_SHARE, RemovedExcess, is_complete
+
+Verdict = Literal["complete", "missing", "outside_catalogue"]
+
+
+def verdict_of(complete: bool, worth_adding: bool) -> Verdict:
+    """The three answers to "is something missing?".
+
+    Parameters
+    ----------
+    complete : bool
+        What remains is too little to explain.
+    worth_adding : bool
+        An effect of the catalogue is worth adding.
+    """
+    if complete:
+        return "complete"
+    return "missing" if worth_adding else "outside_catalogue"
 
 
 @dataclass(frozen=True)
@@ -27,8 +45,8 @@ class Thresholds:
     level: float = 0.05
     share: float = 0.02
     excess: float = 1e-4
-    complete_share: float = 0.02
-    complete_excess: float = 3e-4
+    complete_share: float = COMPLETE_SHARE
+    complete_excess: float = COMPLETE_EXCESS
 
     def as_json(self) -> dict[str, float]:
         """For reports."""
@@ -38,16 +56,16 @@ class Thresholds:
         """Excess that an effect must remove to be worth adding."""
         return max(self.share * ideal_excess, self.excess)
 
-    def worth_adding(self, gone: Removed, ideal_excess: float, candidates: int) -> bool:
+    def worth_adding(self, removed: RemovedExcess, ideal_excess: float, candidates: int) -> bool:
         """Is it real, and does it matter?"""
-        low, _ = gone.interval(1 - self.level, candidates)
-        return low > 0 and gone.value > self.least(ideal_excess)
+        low, _ = removed.interval(1 - self.level, candidates)
+        return low > 0 and removed.value > self.least(ideal_excess)
 
     def complete(self, excess: float, ideal_excess: float) -> bool:
         """Is what remains too little to explain?"""
-        return excess < max(self.complete_share * ideal_excess, self.complete_excess)
+        return is_complete(excess, ideal_excess, self.complete_share, self.complete_excess)
 
-    def inseparable(self, difference: Removed, unexplained: float) -> bool:
+    def inseparable(self, difference: RemovedExcess, unexplained: float) -> bool:
         """Can the data not tell two explanations apart?
 
         So it is when the interval of their difference holds zero, or when the difference is small: below `excess`, or

@@ -18,7 +18,7 @@ from trainer.captures.bench_file import Bench
 from trainer.formatting import UNIT_SUFFIX
 
 STAGES = ("drive", "panel", "pupil", "sensor")
-TOLD_TO = ("display", "camera")
+ACTS_ON = ("display", "camera")
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,7 @@ class Parameter:
     low, high : physical range, inclusive
     count : 0 for a single number; otherwise how many numbers, or a function of the effect's order
     per_channel : one value (or row of values) a colour
+    blocks : equal parts that the numbers fall into, each with its terms lowest first (2 for a field of displacements)
     even : the effect depends on the square of this parameter, so its derivative at absent is zero
     starts : values to start a fit from, where the derivative at absent does not reach far; () for absent alone
     """
@@ -47,6 +48,7 @@ class Parameter:
     even: bool = False
     starts: tuple[float, ...] = ()
     about: str = ""
+    blocks: int = 1
 
     def absent_value(self, bench: Bench) -> float:
         """The value at which the effect is not there, on this bench."""
@@ -73,11 +75,12 @@ class Effect:
     touches_iris : the effect may open the iris beyond what the bench says
     rugged : derivatives do not reach far anywhere, so a pattern search comes before a fit
     measure : optional `(evidence) -> {parameter: value}`: values read off the captures once all else is fitted
+    takes_order : `apply` is given the effect's order as the keyword `order`
     """
 
     name: str
     stage: str
-    told_to: str
+    acts_on: str
     about: str
     parameters: tuple[Parameter, ...]
     apply: Callable[..., Any]
@@ -87,57 +90,44 @@ class Effect:
     rugged: bool = False
     measure: Callable[..., dict[str, Any]] | None = None
     source: str = "built in"
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        # An effect travels to other processes by name: the function of a decorated effect cannot be pickled.
-        return _named, (self.name, self.source)
+    takes_order: bool = False
 
     def parameter(self, name: str) -> Parameter:
         """The parameter of that name."""
         return next(p for p in self.parameters if p.name == name)
 
 
-def _named(name: str, source: str) -> Effect:
-    from pathlib import Path
-
-    from trainer.effects.catalogue import BUILT_IN, catalogue, load_effects
-
-    for one in BUILT_IN:
-        if one.name == name:
-            return one
-    if source not in _loaded:
-        _loaded[source] = {e.name: e for e in load_effects(Path(source))}
-    return _loaded[source].get(name) or catalogue()[name]
-
-
-_loaded: dict[str, dict[str, Effect]] = {}
-
-
 def effect(
     *,
     stage: str,
-    told_to: str,
+    acts_on: str | None = None,
     parameters: list[Parameter],
     orders: tuple[int, ...] = (0,),
     starts: Callable[..., list[dict[str, Any]]] | None = None,
     touches_iris: bool = False,
     rugged: bool = False,
     measure: Callable[..., dict[str, Any]] | None = None,
+    told_to: str | None = None,
 ) -> Callable[[Callable[..., Any]], Effect]:
     """Make an effect of a function: its name is the function's, its description the docstring's first line.
 
-    Raises InputError where stage, audience or parameters do not fit the function.
+    The function takes the stage, then its parameters in their order; a keyword-only argument `order` is given the
+    effect's order. `told_to` is the former name of `acts_on`. Raises InputError where stage, what is acted on or
+    parameters do not fit the function.
     """
+    audience = acts_on or told_to
 
     def make(function: Callable[..., Any]) -> Effect:
         name = getattr(function, "__name__", "effect")
         if stage not in STAGES:
             raise InputError(f"effect '{name}': stage '{stage}' is not one of {', '.join(STAGES)}")
-        if told_to not in TOLD_TO:
-            raise InputError(f"effect '{name}': told_to '{told_to}' is not one of {', '.join(TOLD_TO)}")
+        if audience not in ACTS_ON:
+            raise InputError(f"effect '{name}': acts_on '{audience}' is not one of {', '.join(ACTS_ON)}")
         if not parameters:
             raise InputError(f"effect '{name}': give it at least one Parameter")
-        taken = list(inspect.signature(function).parameters)[1:]
+        arguments = list(inspect.signature(function).parameters.values())[1:]
+        takes_order = any(a.name == "order" and a.kind is a.KEYWORD_ONLY for a in arguments)
+        taken = [a.name for a in arguments if not (takes_order and a.name == "order")]
         named = [p.name for p in parameters]
         if taken != named:
             raise InputError(
@@ -150,7 +140,7 @@ def effect(
         return Effect(
             name,
             stage,
-            told_to,
+            audience,
             about,
             tuple(parameters),
             function,
@@ -160,6 +150,7 @@ def effect(
             rugged,
             measure,
             source,
+            takes_order,
         )
 
     return make

@@ -18,7 +18,7 @@ REACH = 2  # neighbours on either side that a pixel hears
 
 @effect(
     stage="drive",
-    told_to="display",
+    acts_on="display",
     orders=(2, 4, 6),
     parameters=[
         Parameter(
@@ -53,7 +53,7 @@ def phase_response(drive: Drive, gain: Tensor, curvature: Tensor) -> Drive:
 
 @effect(
     stage="drive",
-    told_to="display",
+    acts_on="display",
     orders=(2, 4, 6, 8, 10),
     parameters=[
         Parameter(
@@ -74,7 +74,7 @@ def phase_nonuniformity(drive: Drive, map: Tensor) -> Drive:
 
 @effect(
     stage="drive",
-    told_to="display",
+    acts_on="display",
     parameters=[
         Parameter("width_y", "pixels", scale=0.08, low=0, high=1.5, even=True, starts=(0.1, 0.3)),
         Parameter("width_x", "pixels", scale=0.08, low=0, high=1.5, even=True, starts=(0.1, 0.3)),

@@ -15,7 +15,7 @@ from trainer.prediction.stages import Panel
 
 @effect(
     stage="panel",
-    told_to="display",
+    acts_on="display",
     orders=(0, 2, 4),
     parameters=[
         Parameter(
@@ -63,7 +63,7 @@ def zero_order(
 
 @effect(
     stage="panel",
-    told_to="display",
+    acts_on="display",
     orders=(2, 4, 6, 8),
     parameters=[
         Parameter(
@@ -84,7 +84,7 @@ def illumination(panel: Panel, log_amplitude: Tensor) -> Panel:
 
 @effect(
     stage="panel",
-    told_to="display",
+    acts_on="display",
     orders=(2, 4, 6, 8, 10),
     starts=wavefront_starts,
     parameters=[

@@ -15,9 +15,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from trainer.effects.starts import Evidence
+from trainer.effects.evidence import Evidence
 from trainer.prediction.predict import light_on_camera, trace
-from trainer.prediction.scene import stages_for
+from trainer.prediction.scene import bare_stages
 
 MOST_CAPTURES = 3
 FINER = 8  # samples of the spectrum a whole cycle over the map: a peak is placed to a fraction of a cycle
@@ -36,10 +36,10 @@ def pull(
     one = evidence[0]
     total = np.zeros(shape)
     with torch.enable_grad():
-        map_ = torch.zeros(shape, dtype=one.scene.dtype, requires_grad=True)
-        bare = stages_for(one.scene, ())
+        surface = torch.zeros(shape, dtype=one.scene.dtype, requires_grad=True)
+        bare = bare_stages(one.scene)
         for k in range(min(MOST_CAPTURES, one.batch.gray.shape[0])):
-            stages = replace(bare, **{stage: change(getattr(bare, stage), map_)})
+            stages = replace(bare, **{stage: change(getattr(bare, stage), surface)})
             light = light_on_camera(
                 one.scene, stages, trace(one.scene, stages, one.batch.gray[k : k + 1]).image
             )[0]
@@ -47,8 +47,8 @@ def pull(
                 light = light * stages.sensor.gain
             seen = light.detach()
             gain = (seen * one.prediction[k]).sum() / (seen**2).sum()
-            residual = (one.batch.signal[k] - one.prediction[k]) * one.batch.weight[k]
-            (slope,) = torch.autograd.grad((residual * light * gain).sum(), map_)
+            residual = (one.batch.signal[k] - one.prediction[k]) * one.batch.mask[k]
+            (slope,) = torch.autograd.grad((residual * light * gain).sum(), surface)
             total += slope.double().numpy()
     return total
 

@@ -19,7 +19,7 @@ FWHM = 2 * math.sqrt(2 * math.log(2))
 
 @effect(
     stage="pupil",
-    told_to="display",
+    acts_on="display",
     parameters=[
         Parameter(
             "offset",
@@ -39,7 +39,7 @@ def distance(pupil: Pupil, offset: Tensor) -> Pupil:
 
 @effect(
     stage="pupil",
-    told_to="display",
+    acts_on="display",
     orders=(4, 6),
     parameters=[
         Parameter(
@@ -53,16 +53,15 @@ def distance(pupil: Pupil, offset: Tensor) -> Pupil:
         )
     ],
 )
-def pupil_aberration(pupil: Pupil, zernike: Tensor) -> Pupil:
+def pupil_aberration(pupil: Pupil, zernike: Tensor, *, order: int) -> Pupil:
     """The relay aberrates (without piston, tilt or defocus, which other effects hold)."""
-    order = next(n for n in range(2, 40) if zernike_count(n, True) == zernike.shape[0])
     maps = zernike_maps(pupil.v, pupil.u, order, without_defocus=True)
     return pupil.delayed(torch.tensordot(zernike, maps, dims=1) * pupil.reference_wavelength)
 
 
 @effect(
     stage="pupil",
-    told_to="display",
+    acts_on="display",
     touches_iris=True,
     rugged=True,
     parameters=[
@@ -87,7 +86,7 @@ def iris(pupil: Pupil, half_width: Tensor, centre_y: Tensor, centre_x: Tensor) -
 
 @effect(
     stage="pupil",
-    told_to="display",
+    acts_on="display",
     parameters=[Parameter("line_width", "nm", scale=0.3, low=0, high=40, even=True, starts=(0.5, 2.0))],
 )
 def temporal_coherence(pupil: Pupil, line_width: Tensor) -> Pupil:
@@ -101,7 +100,7 @@ def temporal_coherence(pupil: Pupil, line_width: Tensor) -> Pupil:
 
 @effect(
     stage="pupil",
-    told_to="display",
+    acts_on="display",
     parameters=[
         Parameter(
             "extent_y",

@@ -17,7 +17,7 @@ from trainer.prediction.stages import Sensor
 
 @effect(
     stage="sensor",
-    told_to="camera",
+    acts_on="camera",
     parameters=[
         Parameter(
             "width_y", "pixels", scale=0.15, low=0, high=20, even=True, starts=(0.3, 0.6, 1.2), about="rms"
@@ -42,7 +42,7 @@ def sensor_blur(
 
 @effect(
     stage="sensor",
-    told_to="camera",
+    acts_on="camera",
     orders=(1, 3),
     starts=registration_starts,
     parameters=[
@@ -64,6 +64,7 @@ def sensor_blur(
             low=-30,
             high=30,
             count=lambda order: 2 * (legendre_count(order, 1) - 1),
+            blocks=2,
             about="Legendre terms of the displacement that shift, rotation and size do not hold; rows, then columns",
         ),
     ],
@@ -92,7 +93,7 @@ def misregistration(
 
 @effect(
     stage="sensor",
-    told_to="camera",
+    acts_on="camera",
     orders=(2, 4, 6),
     parameters=[
         Parameter(
@@ -113,7 +114,7 @@ def vignetting(sensor: Sensor, log_gain: Tensor) -> Sensor:
 
 @effect(
     stage="sensor",
-    told_to="camera",
+    acts_on="camera",
     orders=(1, 2, 4, 6, 8),
     parameters=[
         Parameter(
@@ -134,7 +135,7 @@ def stray_light(sensor: Sensor, counts: Tensor) -> Sensor:
 
 @effect(
     stage="sensor",
-    told_to="camera",
+    acts_on="camera",
     orders=(2, 4, 6),
     parameters=[
         Parameter(
@@ -163,7 +164,7 @@ def sensor_response(sensor: Sensor, bend: Tensor) -> Sensor:
 
 @effect(
     stage="sensor",
-    told_to="camera",
+    acts_on="camera",
     measure=gain_spread,
     parameters=[
         Parameter("spread", "%", scale=1.0, low=0, high=100, about="rms of the gain from capture to capture")
@@ -176,7 +177,7 @@ def laser_drift(sensor: Sensor, spread: Tensor) -> Sensor:
 
 @effect(
     stage="sensor",
-    told_to="display",
+    acts_on="display",
     starts=ghost_starts,
     parameters=[
         Parameter(

@@ -8,29 +8,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
-if TYPE_CHECKING:  # effects name these starts, and the light path's trainer side names effects
-    from trainer.captures.batches import Batch
-    from trainer.captures.bench_file import Bench
-    from trainer.prediction.scene import Scene
+from trainer.captures.bench_file import Bench
+from trainer.effects.evidence import Evidence
 
 Starts = list[dict[str, Any]]
 TILE = 64
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """One colour and plane: its scene, the captures, and what the model predicts for them [B, h, w], counts."""
-
-    scene: Scene
-    batch: Batch
-    prediction: Tensor
 
 
 def displacements(evidence: Evidence) -> tuple[NDArray, NDArray, NDArray]:
@@ -38,8 +25,8 @@ def displacements(evidence: Evidence) -> tuple[NDArray, NDArray, NDArray]:
     weights [n]. Rows first; centres from the picture's; a positive shift moves the picture's content down or right.
     """
     batch = evidence.batch
-    seen = (batch.signal * batch.weight).double().numpy()
-    expected = (evidence.prediction * batch.weight).double().numpy()
+    seen = (batch.signal * batch.mask).double().numpy()
+    expected = (evidence.prediction * batch.mask).double().numpy()
     height, width = seen.shape[-2:]
     size = min(TILE, height // 2, width // 2)
     taper = np.outer(np.hanning(size + 2)[1:-1], np.hanning(size + 2)[1:-1])
@@ -99,7 +86,7 @@ def ghost_starts(evidence: Sequence[Evidence], most: int = 3) -> Starts:
     """Displacements, panel pixels, at which the residual looks most like the prediction."""
     one = evidence[0]
     batch = one.batch
-    residual = ((batch.signal - one.prediction) * batch.weight).double().numpy()
+    residual = ((batch.signal - one.prediction) * batch.mask).double().numpy()
     expected = one.prediction.double().numpy()
     height, width = expected.shape[-2:]
     taper = np.outer(np.hanning(height + 2)[1:-1], np.hanning(width + 2)[1:-1])
@@ -121,7 +108,7 @@ def gain_spread(evidence: Sequence[Evidence]) -> dict[str, Any]:
     """Standard deviation (%) of the gain from capture to capture, about each colour's mean."""
     own: dict[str, list[float]] = {}
     for one in evidence:
-        seen, expected, weight = (t.double() for t in (one.batch.signal, one.prediction, one.batch.weight))
+        seen, expected, weight = (t.double() for t in (one.batch.signal, one.prediction, one.batch.mask))
         gains = (weight * seen * expected).sum((-2, -1)) / (weight * expected**2).sum((-2, -1))
         own.setdefault(one.batch.channel, []).extend(gains.tolist())
     deviations = np.concatenate([np.array(g) / np.mean(g) - 1 for g in own.values()])

@@ -15,9 +15,9 @@ from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.capture_writer import CaptureWriter
 from trainer.captures.patterns import choose_patterns
 from trainer.effects.definition import Effect
-from trainer.model.model import Model, Present, absent
+from trainer.model.model import EffectInstance, Model, absent
+from trainer.model.model_stages import scene_for, stages_for
 from trainer.prediction.predict import counts, light_on_camera, trace
-from trainer.prediction.scene import scene_for, stages_for
 
 BRIGHTNESS = 0.13  # mean signal, share of full scale
 
@@ -30,7 +30,7 @@ def small_bench(rows: int = 72, columns: int = 96) -> Bench:
     return Bench("small", Panel(columns, rows, 8.0), (Channel("green", 520.0),), 6.0, Iris(), camera)
 
 
-def placed(effect: Effect, bench: Bench, values: Given, order: int | None = None) -> Present:
+def placed(effect: Effect, bench: Bench, values: Given, order: int | None = None) -> EffectInstance:
     """The effect with these values, at its lowest order or a stated one; parameters not named stay absent."""
     base = absent(effect, bench, order)
     given = {
@@ -88,7 +88,7 @@ def captures_with(
 
 def _predict(
     model: Model,
-    present: tuple[Present, ...],
+    present: tuple[EffectInstance, ...],
     tensors: Mapping[str, Mapping[str, torch.Tensor]] | None = None,
     gray: np.ndarray | None = None,
 ) -> torch.Tensor:

@@ -15,11 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from runtime.lightpath.light_path import mode_irradiance, panel_phase, panel_spectrum
 from trainer.captures.batches import Batch
-from trainer.fitting.gauss_newton import Predictor
+from trainer.fitting.predictor import Predictor
 from trainer.model.model import Model
-from trainer.prediction.predict import Trace, counts, light_on_camera, light_path, trace
+from trainer.prediction.predict import Trace, counts, light_on_camera, trace
 from trainer.prediction.scene import Scene, Stages
 
 Picture = tuple[str, np.ndarray, str]
@@ -30,10 +29,12 @@ PATIENCE = 3  # rounds without progress on the captures that say when to stop
 
 
 @dataclass(frozen=True)
-class Kind:
+class FreeFormStage:
     """What is free at a stage. shapes: {name: (shape, physical units a unit of the optimiser's variable)}.
 
     prior : {name: standard deviation expected, physical units}, where squared errors are in units of their variance
+    irradiance : optional `(scene, stages, gray [1, H, W], tensors) -> irradiance`, where the stages alone do not say
+        what light there is; None for the light path's own
     """
 
     stage: str
@@ -41,50 +42,50 @@ class Kind:
     apply: Callable[[Stages, Tensors], Stages]
     pictures: Callable[[Tensors], list[Picture]]
     prior: Mapping[str, float] = field(default_factory=dict)
+    irradiance: Callable[[Scene, Stages, Tensor, Tensors], Tensor] | None = None
 
 
-class Working:
-    """One batch under a model, ready to be predicted with free maps on top."""
+class FreeFormBatch:
+    """One batch under a model, ready to be predicted with free maps on top.
 
-    def __init__(self, model: Model, batch: Batch) -> None:
+    Parameters
+    ----------
+    inverse_variance : tensor [B, h, w], optional
+        What squared errors are multiplied by; without it, they count alike wherever the batch's mask is 1.
+    """
+
+    def __init__(self, model: Model, batch: Batch, inverse_variance: Tensor | None = None) -> None:
         self.predictor = Predictor(model, batch)
         self.batch = batch
+        self.weight = batch.mask if inverse_variance is None else batch.mask * inverse_variance
         self.stages = self.predictor.stages(model)
         self.gain = model.gain[batch.channel] * batch.exposure[:, None, None]
         with torch.no_grad():
             self.base = self.predictor.trace(model)
 
-    def predict(self, kind: Kind, tensors: Tensors, k: int) -> Tensor:
+    def predict(self, kind: FreeFormStage, tensors: Tensors, k: int) -> Tensor:
         """Counts [1, h, w] of capture k."""
         scene, gray = self.predictor.scene, self.batch.gray[k : k + 1]
         stages = kind.apply(self.stages, tensors)
         before = Trace(self.base.spectrum[k : k + 1], self.base.image[k : k + 1])
-        if "spread" in tensors:
-            image = _spread_in_time(scene, stages, gray, tensors["spread"])
-        else:
+        if kind.irradiance is None:
             image = trace(scene, stages, gray, kind.stage, before).image
+        else:
+            image = kind.irradiance(scene, stages, gray, tensors)
         light = light_on_camera(scene, stages, image)
-        measured = (self.batch.signal[k : k + 1], self.batch.weight[k : k + 1])
+        measured = (self.batch.signal[k : k + 1], self.batch.mask[k : k + 1])
         return counts(scene, stages, light, self.gain[k : k + 1], measured)
 
-    def squared_error(self, kind: Kind, tensors: Tensors, k: int) -> Tensor:
+    def squared_error(self, kind: FreeFormStage, tensors: Tensors, k: int) -> Tensor:
         """Weighted squared error of capture k."""
         error = self.batch.signal[k : k + 1] - self.predict(kind, tensors, k)
-        return (self.batch.weight[k : k + 1] * error**2).sum()
-
-
-def _spread_in_time(scene: Scene, stages: Stages, gray: Tensor, spread: Tensor) -> Tensor:
-    """Mean irradiance over a phase whose gain swings by +-spread while the camera looks."""
-    path = light_path(scene, stages)
-    phase = panel_phase(path, gray)
-    both = [mode_irradiance(path, panel_spectrum(path, phase * (1 + s * spread))) for s in (-1, 1)]
-    return 0.5 * (both[0] + both[1])
+        return (self.weight[k : k + 1] * error**2).sum()
 
 
 def descend(
-    kind: Kind,
-    seen: Sequence[Working],
-    unseen: Sequence[Working],
+    kind: FreeFormStage,
+    seen: Sequence[FreeFormBatch],
+    unseen: Sequence[FreeFormBatch],
     scale: float,
     iterations: int,
     rounds: int,

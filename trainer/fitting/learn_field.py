@@ -13,15 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from trainer.captures.batches import Batch, load, sample, split
+from runtime.excess import PredictionErrors
+from trainer.captures.batches import Batch, load
 from trainer.captures.capture_set import Capture, CaptureSet
-from trainer.diagnosis.candidates import evaluate_captures
-from trainer.diagnosis.compare import with_gains
-from trainer.diagnosis.diagnose import FIT_CAPTURES, heldout_json
-from trainer.diagnosis.explain import recorded
-from trainer.fitting.excess import Errors
-from trainer.fitting.free_form_maps import Kind, Tensors, Working, descend
+from trainer.captures.held_out import FIT_CAPTURES, sample, split
+from trainer.fitting.free_form_maps import FreeFormBatch, FreeFormStage, Tensors, descend
+from trainer.fitting.gains import with_gains
 from trainer.fitting.gauss_newton import fit
+from trainer.fitting.predictor import evaluate_captures
+from trainer.model.history import recorded
 from trainer.model.model import Model
 from trainer.prediction.panel_field import NAME, UNITS, combined, with_field
 from trainer.prediction.scene import Stages
@@ -39,12 +39,12 @@ REFINED, REFINED_ROUNDS = 0.1, 10  # share of the prior's spread, and rounds, fo
 
 
 @dataclass(frozen=True)
-class Learned:
+class LearnedField:
     """A model with its learned field, and held-out errors without and with it."""
 
     model: Model
-    before: Errors
-    after: Errors
+    before: PredictionErrors
+    after: PredictionErrors
 
     def as_json(self) -> dict[str, Any]:
         """For `--json`: both errors, and the range of each map over the panel's pixels."""
@@ -56,12 +56,12 @@ class Learned:
             }
             for name, unit in UNITS.items()
         }
-        return {"before": heldout_json(self.before), "after": heldout_json(self.after), "maps": maps}
+        return {"before": self.before.as_json(), "after": self.after.as_json(), "maps": maps}
 
 
 def learn_field(
     captures: CaptureSet, model: Model, progress: Callable[[float], None] | None = None
-) -> Learned:
+) -> LearnedField:
     """The model with a field learned from the captures that fits may see, judged on the others.
 
     A field that is there already is learned anew. Raises InputError as the capture set's reader does.
@@ -71,7 +71,7 @@ def learn_field(
     before = evaluate_captures(captures, parts.held_out, model)
     learned = with_learned_field(captures, parts.fitted, model, progress)
     after = evaluate_captures(captures, parts.held_out, learned)
-    return Learned(recorded(learned, NAME, after), before, after)
+    return LearnedField(recorded(learned, NAME, after), before, after)
 
 
 def with_learned_field(
@@ -122,8 +122,8 @@ def with_refined_field(model: Model, sets: Sequence[tuple[CaptureSet, Sequence[C
 def _descend(
     model: Model,
     spread: Mapping[str, float],
-    seen: Sequence[Working],
-    unseen: Sequence[Working],
+    seen: Sequence[FreeFormBatch],
+    unseen: Sequence[FreeFormBatch],
     rounds: int,
     progress: Callable[[float], None] | None = None,
 ) -> dict[str, np.ndarray]:
@@ -135,16 +135,16 @@ def _descend(
     def apply(stages: Stages, maps: Tensors) -> Stages:
         return replace(stages, panel=with_field(stages.panel, maps))
 
-    kind = Kind("panel", shapes, apply, lambda maps: [], spread)
-    pixels = sum(float((w.batch.weight > 0).sum()) for w in seen)
+    kind = FreeFormStage("panel", shapes, apply, lambda maps: [], spread)
+    pixels = sum(float((w.batch.mask > 0).sum()) for w in seen)
     found = descend(kind, seen, unseen, max(pixels, 1.0), ITERATIONS, rounds, progress)
-    return {name: map_.numpy() for name, map_ in found.items()}
+    return {name: surface.numpy() for name, surface in found.items()}
 
 
-def _working(model: Model, batches: Sequence[Batch]) -> list[Working]:
+def _working(model: Model, batches: Sequence[Batch]) -> list[FreeFormBatch]:
     """Batches whose squared errors are multiples of the noise's variance."""
     found = []
     for batch in batches:
         noise = batch.noise + FLOOR * batch.noise.mean()
-        found.append(Working(model, replace(batch, weight=batch.weight / noise)))
+        found.append(FreeFormBatch(model, batch, 1 / noise))
     return found

@@ -30,9 +30,10 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+TASKS = "trainer.diagnosis.candidates"  # what workers run
 ANSWER_S = 5.0  # a Dask scheduler that has not answered by then is not there
 LOST = (
-    "a process that was fitting has gone, as when memory runs out: "
+    "a process that was fitting has removed, as when memory runs out: "
     "use fewer --workers or smaller captures, and try again"
 )
 
@@ -167,11 +168,10 @@ def _prepare(client: Client, address: str) -> None:
 
 
 def _forget() -> None:
-    """Drops the effect files that an earlier run has left in a worker: they may have changed since."""
-    import trainer.diagnosis.candidates  # noqa: F401 - says early what a worker lacks
-    from trainer.effects import definition
-
-    definition._loaded.clear()
+    """Reads all that a worker needs, to say early what it lacks, and drops effect files of an earlier run."""
+    for name in (TASKS, "trainer.effects.effect_catalogue"):
+        import_module(name)
+    import_module("trainer.effects.effect_catalogue").forget_effect_files()
 
 
 class _Here(Executor):

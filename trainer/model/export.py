@@ -19,13 +19,13 @@ from firmware_iface.errors import InputError
 from runtime.bundle.bundle_folder import write_bundle
 from runtime.bundle.light_path_arrays import pack_light_paths
 from runtime.lightpath.light_path import Grid, LightPath
-from trainer.captures.batches import scenes
 from trainer.captures.capture_set import CaptureSet
+from trainer.captures.held_out import scenes
 from trainer.effects.definition import Effect
 from trainer.model.model import Model
+from trainer.model.model_stages import scene_for, stages_of
 from trainer.model.parameters import json_values
 from trainer.prediction.predict import light_path
-from trainer.prediction.scene import scene_for, stages_of
 
 
 def export_bundle(
@@ -49,8 +49,8 @@ def export_bundle(
             "method under [propagation] in the model file"
         )
     shown, left_out = (
-        told_to_display(model),
-        [p.effect for p in model.present if p.effect.told_to != "display"],
+        acting_on_display(model),
+        [p.effect for p in model.present if p.effect.acts_on != "display"],
     )
     wanted = _colours_and_planes(model, captures)
     baked = [
@@ -137,9 +137,9 @@ def _network_files(path: Path, model: Model, channels: list[str]) -> tuple[dict[
     return onnx_files(network), about
 
 
-def told_to_display(model: Model) -> Model:
+def acting_on_display(model: Model) -> Model:
     """The model with the effects that the eye sees too, and no others."""
-    return replace(model, present=tuple(p for p in model.present if p.effect.told_to == "display"))
+    return replace(model, present=tuple(p for p in model.present if p.effect.acts_on == "display"))
 
 
 def baked_path(model: Model, channel: str, plane_mm: float) -> LightPath:
@@ -183,4 +183,4 @@ def _last_errors(model: Model) -> dict[str, float] | None:
 
 
 def _named(effect: Effect) -> dict[str, str]:
-    return {"effect": effect.name, "stage": effect.stage, "told_to": effect.told_to}
+    return {"effect": effect.name, "stage": effect.stage, "acts_on": effect.acts_on}

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from trainer.captures.bench_file import Bench
-from trainer.effects.definition import Effect, Parameter
+from trainer.effects.definition import Effect
 from trainer.prediction.panel_field import NAME
 
 Values = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
-class Present:
+class EffectInstance:
     """An effect in a model: its order, and its parameters' values and standard errors."""
 
     effect: Effect
@@ -24,7 +24,7 @@ class Present:
     values: Values
     errors: Values | None = None
 
-    def with_values(self, values: Mapping[str, np.ndarray]) -> Present:
+    def with_values(self, values: Mapping[str, np.ndarray]) -> EffectInstance:
         """The same with other values; errors are forgotten."""
         return replace(self, values=dict(values), errors=None)
 
@@ -41,7 +41,7 @@ class Model:
     """
 
     bench: Bench
-    present: tuple[Present, ...] = ()
+    present: tuple[EffectInstance, ...] = ()
     gain: Mapping[str, float] = field(default_factory=dict)
     method: str = "angular_spectrum"
     history: tuple[dict[str, Any], ...] = ()
@@ -57,7 +57,15 @@ class Model:
         """Names of all that a network learns beyond: the effects, and the learned field."""
         return self.names if self.panel_field is None else (*self.names, NAME)
 
-    def having(self, added: Present) -> Model:
+    def instance(self, name: str) -> EffectInstance:
+        """The effect of that name, as it is in the model."""
+        return next(p for p in self.present if p.effect.name == name)
+
+    def without(self, name: str) -> Model:
+        """The model with one effect left out; the others keep their values."""
+        return replace(self, present=tuple(p for p in self.present if p.effect.name != name))
+
+    def having(self, added: EffectInstance) -> Model:
         """The model with an effect added, or put in the place of one of the same name."""
         others = tuple(p for p in self.present if p.effect.name != added.effect.name)
         if len(others) == len(self.present):
@@ -67,7 +75,7 @@ class Model:
         )
 
 
-def absent(effect: Effect, bench: Bench, order: int | None = None) -> Present:
+def absent(effect: Effect, bench: Bench, order: int | None = None) -> EffectInstance:
     """The effect at the values at which it is not there, at its lowest order unless another is given."""
     order = effect.orders[0] if order is None else order
     channels = len(bench.channels)
@@ -75,22 +83,20 @@ def absent(effect: Effect, bench: Bench, order: int | None = None) -> Present:
         p.name: np.full(p.shape(order, channels), p.absent_value(bench), dtype=np.float64)
         for p in effect.parameters
     }
-    return Present(effect, order, values)
+    return EffectInstance(effect, order, values)
 
 
-def raised(present: Present, bench: Bench, order: int) -> Present:
+def raised(present: EffectInstance, bench: Bench, order: int) -> EffectInstance:
     """The same effect at a higher order: known terms kept, new ones absent.
 
-    Terms are ordered lowest first within each row; a parameter whose rows change length (rows of displacement, say)
-    must say so by having its own layout: each leading block of equal parts keeps its first terms.
+    Terms are ordered lowest first within each colour's row and within each of the parameter's blocks.
     """
     higher = absent(present.effect, bench, order)
     values = {}
     for p in present.effect.parameters:
         old, new = present.values[p.name], higher.values[p.name].copy()
-        blocks = _blocks(p, present.effect)
         source, target = old.reshape(-1), new.reshape(-1)
-        rows = (len(bench.channels) if p.per_channel else 1) * blocks
+        rows = (len(bench.channels) if p.per_channel else 1) * p.blocks
         if new.ndim == 0:
             new = old.copy()
         elif source.size:
@@ -99,8 +105,3 @@ def raised(present: Present, bench: Bench, order: int) -> Present:
                 target[k * longer : k * longer + length] = source[k * length : (k + 1) * length]
         values[p.name] = new
     return replace(higher, values=values)
-
-
-def _blocks(parameter: Parameter, effect: Effect) -> int:
-    """Equal parts that a parameter's numbers fall into: two for a field of displacements."""
-    return 2 if (effect.name, parameter.name) == ("misregistration", "distortion") else 1

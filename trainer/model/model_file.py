@@ -24,9 +24,9 @@ from firmware_iface.errors import InputError, nearest
 from runtime.bundle.whole_files import whole_file
 from runtime.lightpath.propagation import METHODS
 from trainer.captures.bench_file import Bench, bench_tables, read_bench
-from trainer.effects.catalogue import Catalogue, find_effect
 from trainer.effects.definition import Parameter
-from trainer.model.model import Model, Present
+from trainer.effects.effect_catalogue import Catalogue, find_effect
+from trainer.model.model import EffectInstance, Model
 from trainer.model.model_text import allowed, model_text, table_text
 from trainer.prediction.panel_field import NAME, UNITS
 
@@ -107,7 +107,7 @@ def _model(tables: Mapping[str, Any], known: Catalogue, path: Path) -> Model:
     bench = _bench(tables.get("bench"))
     arrays = _arrays(path, tables["arrays"]) if "arrays" in tables else {}
     _plain(_table(tables.get("about", {}), "about"), "about")
-    present: list[Present] = []
+    present: list[EffectInstance] = []
     for number, row in enumerate(_rows(tables, "effect"), 1):
         one = _effect(row, number, known, bench, arrays)
         if any(p.effect.name == one.effect.name for p in present):
@@ -184,7 +184,9 @@ def _gain(given: Any, bench: Bench) -> dict[str, float]:
     return gain
 
 
-def _effect(row: Mapping[str, Any], number: int, known: Catalogue, bench: Bench, arrays: Arrays) -> Present:
+def _effect(
+    row: Mapping[str, Any], number: int, known: Catalogue, bench: Bench, arrays: Arrays
+) -> EffectInstance:
     name = row.get("name")
     if not isinstance(name, str):
         raise InputError(f"effect {number} has name {_shown(name)}: write the name of an effect, as text")
@@ -212,7 +214,7 @@ def _effect(row: Mapping[str, Any], number: int, known: Catalogue, bench: Bench,
         values[p.name] = _numbers(table.get("value"), f"{where}.value", p, order, bench, arrays)
         if "error" in table:
             errors[p.name] = _numbers(table["error"], f"{where}.error", p, order, bench, arrays)
-    return Present(effect, order, values, errors or None)
+    return EffectInstance(effect, order, values, errors or None)
 
 
 def _numbers(

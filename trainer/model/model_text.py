@@ -17,9 +17,9 @@ import numpy as np
 
 from firmware_iface.errors import InputError
 from trainer.captures.bench_file import Bench, bench_tables
-from trainer.effects.catalogue import BUILT_IN
 from trainer.effects.definition import Effect, Parameter
-from trainer.model.model import Model, Present
+from trainer.effects.effect_catalogue import BUILT_IN
+from trainer.model.model import EffectInstance, Model
 from trainer.prediction.panel_field import NAME
 
 LONGEST = 128  # numbers of an array that stay in the text: every built-in map and curve does
@@ -148,7 +148,7 @@ def _bench(bench: Bench) -> str:
     return "\n\n".join(parts)
 
 
-def _effect(present: Present, bench: Bench, store: Store) -> str:
+def _effect(present: EffectInstance, bench: Bench, store: Store) -> str:
     effect = present.effect
     lines = comment(f"{effect.about} [{effect.stage}]")
     if effect not in BUILT_IN:
@@ -169,11 +169,11 @@ def _panel_field(model: Model, store: Store) -> str:
         "What the captures say of the wave at the panel beyond the effects, a number a pixel. Take the table "
     )
     assert model.panel_field is not None
-    named = {name: {"array": store(f"{NAME}.{name}", map_)} for name, map_ in model.panel_field.items()}
+    named = {name: {"array": store(f"{NAME}.{name}", surface)} for name, surface in model.panel_field.items()}
     return "\n".join([*comment(about + "out to be without it."), table_text(f"[{NAME}]", named)])
 
 
-def _parameter(present: Present, parameter: Parameter, bench: Bench, store: Store) -> list[str]:
+def _parameter(present: EffectInstance, parameter: Parameter, bench: Bench, store: Store) -> list[str]:
     effect, value = present.effect, present.values[parameter.name]
     _check(effect, parameter, value, present.order, bench)
     about = f"{parameter.about}; " if parameter.about else ""

@@ -9,15 +9,10 @@ import numpy as np
 from trainer.captures.bench_file import Bench
 from trainer.effects.definition import Parameter
 from trainer.formatting import measured
-from trainer.model.model import Model, Present
+from trainer.model.model import EffectInstance
 
 
-def present_named(model: Model, name: str) -> Present:
-    """The effect of that name in a model."""
-    return next(p for p in model.present if p.effect.name == name)
-
-
-def json_values(present: Present, bench: Bench) -> dict[str, dict[str, Any]]:
+def json_values(present: EffectInstance, bench: Bench) -> dict[str, dict[str, Any]]:
     """{name with unit: {"value", "error", "unit"}}; per-channel values by channel name."""
     result = {}
     for p in present.effect.parameters:
@@ -36,7 +31,7 @@ def _plain(parameter: Parameter, values: np.ndarray, bench: Bench) -> Any:
     return values.tolist()
 
 
-def describe(present: Present, bench: Bench) -> str:
+def describe(present: EffectInstance, bench: Bench) -> str:
     """The effect's size in physical units with an error, in a few words: what differs from "absent"."""
     words = []
     for p in present.effect.parameters:

@@ -10,7 +10,6 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -28,9 +27,7 @@ from runtime.lightpath.propagation import (
     far_field_matrix,
     transfer_function,
 )
-from trainer.captures.bench_file import Bench
-from trainer.model.model import Model
-from trainer.prediction.scene import Scene, Stages, bare_stages, scene_for, stages_for
+from trainer.prediction.scene import Scene, Stages, bare_stages
 from trainer.prediction.stages import Pupil, Sensor
 
 FINER = (
@@ -270,13 +267,3 @@ def _spline_taps(position: Tensor, count: int) -> tuple[list[Tensor], list[Tenso
         t**3 / 6,
     ]
     return [first + k - 1 for k in range(4)], weights
-
-
-def ideal_irradiance(bench: Bench, gray: np.ndarray, channel: str, plane_mm: float) -> np.ndarray:
-    """What the bench file alone predicts for one pattern: float32 [h, w] in camera pixels, of arbitrary scale."""
-    model = Model(bench)
-    scene = scene_for(model, channel, plane_mm)
-    stages = stages_for(scene, ())
-    with torch.no_grad():
-        patterns = torch.as_tensor(gray.astype(np.int64))[None]
-        return light_on_camera(scene, stages, trace(scene, stages, patterns).image)[0].numpy()

@@ -1,15 +1,14 @@
-"""Scenes and their stages: one colour and one plane of a bench, before and after a model's effects.
+"""Scenes: one colour and one plane of a bench, and its four stages as the bench file has them.
 
-A `Scene` holds what is fixed for one colour and one plane; `Stages` are its drive, panel, pupil and sensor as the
-effects see them, with the effects of a model applied in their order.
+A `Scene` holds what is fixed for one colour and one plane; `Stages` are its drive, panel, pupil and sensor as effects
+see them. `trainer.model.model_stages` applies the effects of a model to them.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,11 +16,7 @@ from torch import Tensor
 from runtime.lightpath.light_path import Grid, band_frequencies, grid_for, image_frequencies
 from runtime.lightpath.propagation import Aperture, check_sampling
 from trainer.captures.bench_file import Bench
-from trainer.model.model import Model, Present
-from trainer.prediction.panel_field import with_field
 from trainer.prediction.stages import Drive, Panel, Pupil, Sensor
-
-IRIS_ROOM = 1.25  # how far an effect may open or move the iris, in units of what the bench says
 
 
 @dataclass(frozen=True)
@@ -45,16 +40,22 @@ class Scene:
         return [c.name for c in self.bench.channels].index(self.channel)
 
 
-def scene_for(model: Model, channel: str, plane_mm: float, dtype: torch.dtype = torch.float32) -> Scene:
-    """The scene of a model. Raises InputError where the propagation method's sampling does not hold."""
-    opened = IRIS_ROOM if any(p.effect.touches_iris for p in model.present) else 1.0
-    return _scene(model.bench, channel, plane_mm, model.method, opened, dtype)
-
-
 @lru_cache(maxsize=64)
-def _scene(
+def scene_at(
     bench: Bench, channel: str, plane_mm: float, method: str, opened: float, dtype: torch.dtype
 ) -> Scene:
+    """The scene of a bench at one colour and plane.
+
+    Parameters
+    ----------
+    opened : float
+        Room for effects that open or move the iris, in units of what the bench says.
+
+    Raises
+    ------
+    InputError
+        Where the propagation method's sampling does not hold.
+    """
     wavelength = bench.channel(channel).wavelength
     panel = bench.panel
     half_width = min(bench.iris.half_width * opened, 1.95)
@@ -74,7 +75,7 @@ def _scene(
 
 @dataclass(frozen=True)
 class Stages:
-    """The four stages of a scene with a model's effects applied."""
+    """The four stages of a scene."""
 
     drive: Drive
     panel: Panel
@@ -144,33 +145,3 @@ def _coordinates(height: int, width: int, dtype: torch.dtype) -> tuple[Tensor, T
     y = (torch.arange(height, dtype=dtype) - (height - 1) / 2) / (height / 2)
     x = (torch.arange(width, dtype=dtype) - (width - 1) / 2) / (width / 2)
     return torch.broadcast_tensors(y[:, None], x[None, :])
-
-
-def stages_for(scene: Scene, present: tuple[Present, ...], tensors: Any = None) -> Stages:
-    """The scene's stages with effects applied in the order of `present`.
-
-    `tensors` gives {effect name: {parameter: tensor}} where values are to be differentiated; others are taken from
-    `present`. Per-channel parameters are cut to the scene's own colour.
-    """
-    stages = bare_stages(scene)
-    row = scene.channel_row()
-    for one in present:
-        given = (tensors or {}).get(one.effect.name, {})
-        arguments = {}
-        for p in one.effect.parameters:
-            value = given.get(p.name)
-            if value is None:
-                value = torch.as_tensor(one.values[p.name], dtype=scene.dtype)
-            arguments[p.name] = value[row] if p.per_channel else value
-        stage = one.effect.stage
-        stages = replace(stages, **{stage: one.effect.apply(getattr(stages, stage), **arguments)})
-    return stages
-
-
-def stages_of(scene: Scene, model: Model) -> Stages:
-    """The scene's stages under a model: its effects, and the field learned at the panel after them."""
-    stages = stages_for(scene, model.present)
-    if model.panel_field is None:
-        return stages
-    maps = {name: torch.as_tensor(map_, dtype=scene.dtype) for name, map_ in model.panel_field.items()}
-    return replace(stages, panel=with_field(stages.panel, maps))

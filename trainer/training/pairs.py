@@ -22,11 +22,12 @@ from firmware_iface.errors import InputError
 from runtime.lightpath.light_path import irradiance, panel_phase, pixel_irradiance
 from trainer.captures.batches import Batch, load_batch
 from trainer.captures.capture_set import Capture, CaptureSet
-from trainer.fitting.gauss_newton import Predictor
-from trainer.model.export import told_to_display
+from trainer.fitting.predictor import Predictor
+from trainer.model.export import acting_on_display
 from trainer.model.model import Model
+from trainer.model.model_stages import scene_for, stages_of
 from trainer.prediction.predict import counts, light_path
-from trainer.prediction.scene import Scene, Stages, scene_for, stages_of
+from trainer.prediction.scene import Scene, Stages
 
 MOST_COLOURS = 3
 WHITE = 0.999  # quantile of measured irradiance that is called white
@@ -126,7 +127,7 @@ def measured_on_panel(model: Model, batch: Batch) -> Measured:
     sharp = sensitivity > DULL * sensitivity.max()
     safe = torch.where(sharp, sensitivity, 1.0)
     change = torch.where(sharp, (batch.signal - expected) / safe, 0.0)
-    weight = batch.weight * sharp
+    weight = batch.mask * sharp
     noise = batch.noise / safe**2
     shown = display_irradiance(model, batch)
     change, weight, noise = (onto_panel(scene, stages, one[0]) for one in (change, weight, noise))
@@ -157,13 +158,13 @@ def _own_gain(scene: Scene, stages: Stages, light: Tensor, model: Model, batch: 
     linear = replace(stages, sensor=replace(sensor, offset=None, response=None, free_capture_gain=False))
     one = counts(scene, linear, light, model.gain[batch.channel] * batch.exposure[:, None, None], None)
     seen = batch.signal if sensor.offset is None else batch.signal - sensor.offset
-    total = (seen * one * batch.weight).sum((-2, -1)) / (one**2 * batch.weight).sum((-2, -1))
+    total = (seen * one * batch.mask).sum((-2, -1)) / (one**2 * batch.mask).sum((-2, -1))
     return total[:, None, None]
 
 
 def display_irradiance(model: Model, batch: Batch) -> Tensor:
     """What the display shows of the first pattern of a batch, as its model says, on the panel's pixels [H, W]."""
-    shown = told_to_display(model)
+    shown = acting_on_display(model)
     scene = scene_for(shown, batch.channel, batch.plane_mm)
     with torch.no_grad():
         path = light_path(scene, stages_of(scene, shown))

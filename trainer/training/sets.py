@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-from trainer.captures.batches import split
 from trainer.captures.capture_set import CaptureSet
-from trainer.diagnosis.compare import with_gains
+from trainer.captures.held_out import split
+from trainer.fitting.gains import with_gains
 from trainer.model.model import Model
 from trainer.training.pairs import Pairs, pairs_of
 
@@ -35,7 +35,7 @@ def training_sets(
     parts = split(captures)
     if ideal:
         model = Model(captures.bench, method=model.method)
-    model = with_gains(captures, model, parts.fitted)
+    model = with_gains(captures, replace(model, gain={}), parts.fitted)
     share = len(parts.fitted) / max(1, len(captures))
 
     def told(begin: float, part: float) -> Progress | None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from trainer.diagnosis.explain import add
 from trainer.effects import testing
-from trainer.effects.catalogue import load_effects
+from trainer.effects.effect_catalogue import load_effects
 from trainer.model.model import Model
 
 EFFECT = load_effects(Path(__file__).with_name("my_effect.py"))[0]

@@ -30,7 +30,7 @@ def _starts(evidence: Sequence[Any]) -> list[dict[str, float]]:
 @effect(
     stage="panel",
     # "display": the eye sees it too, so the headset makes up for it; "camera": only the camera does.
-    told_to="display",
+    acts_on="display",
     # One Parameter for each argument, in the same order. `scale` is a small but visible change.
     parameters=[
         Parameter(

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from trainer.effects import Parameter, effect
 from trainer.effects.pull import pull
-from trainer.prediction.scene import stages_for
+from trainer.model.model_stages import stages_for
 from trainer.prediction.stages import Pupil
 
 
@@ -44,7 +44,7 @@ def _starts(evidence: Sequence[Any]) -> list[dict[str, float]]:
 @effect(
     stage="pupil",
     # "display": the eye sees it too, so the headset makes up for it; "camera": only the camera does.
-    told_to="display",
+    acts_on="display",
     # One Parameter for each argument, in the same order. `scale` is a small but visible change.
     parameters=[
         Parameter(

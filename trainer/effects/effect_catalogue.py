@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copyreg
 import difflib
 import hashlib
 import importlib.util
@@ -40,6 +41,28 @@ BUILT_IN: tuple[Effect, ...] = (
 )
 
 Catalogue = dict[str, Effect]
+
+_files: dict[
+    str, Catalogue
+] = {}  # effect files that this process has read for effects that came from another one
+
+
+def _named(name: str, source: str) -> Effect:
+    for one in BUILT_IN:
+        if one.name == name:
+            return one
+    if source not in _files:
+        _files[source] = {e.name: e for e in load_effects(Path(source))}
+    return _files[source].get(name) or catalogue()[name]
+
+
+# An effect travels to other processes by name: the function of a decorated effect cannot be pickled.
+copyreg.pickle(Effect, lambda one: (_named, (one.name, one.source)))
+
+
+def forget_effect_files() -> None:
+    """Drop the effect files that an earlier run has left in this process: they may have changed since."""
+    _files.clear()
 
 
 def catalogue(files: Iterable[Path] = ()) -> Catalogue:

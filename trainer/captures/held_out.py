@@ -1,0 +1,113 @@
+"""Which captures a fit may see, and which are held out to judge it.
+
+A fit sees some patterns; every number that is reported comes from others. Repeats of one pattern never stand on both
+sides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from trainer.captures.capture_set import Capture, CaptureSet
+
+FIT_PIXELS = 4 * 240 * 320  # about four small pictures hold a few dozen parameters to far below the noise
+
+
+@dataclass(frozen=True)
+class CaptureSplit:
+    """Captures for fitting and captures held out, as a partition of the set."""
+
+    fitted: tuple[Capture, ...]
+    held_out: tuple[Capture, ...]
+
+
+def split(captures: CaptureSet) -> CaptureSplit:
+    """Every third pattern of each colour and plane is held out, from the second on (at least one).
+
+    The choice depends on the order of the captures alone, so every command holds out the same ones. A colour and
+    plane with a single pattern is held out only if all of them are like that, with its fit on the same capture's
+    repeats; otherwise it is fitted.
+    """
+    fitted: list[Capture] = []
+    held: list[Capture] = []
+    for channel, plane in scenes(captures.captures):
+        rows = [c for c in captures.captures if (c.channel, c.plane_mm) == (channel, plane)]
+        patterns = list(dict.fromkeys(c.pattern for c in rows))
+        out = set(patterns[1::3])
+        for c in rows:
+            (held if c.pattern in out else fitted).append(c)
+    if not held:
+        held = fitted[-1:]
+    return CaptureSplit(tuple(fitted), tuple(held))
+
+
+def scenes(captures: Iterable[Capture]) -> list[tuple[str, float]]:
+    """(channel, plane) pairs in order of appearance."""
+    return list(dict.fromkeys((c.channel, c.plane_mm) for c in captures))
+
+
+def sample(captures: Iterable[Capture], pixels: int, most: int) -> list[Capture]:
+    """Different patterns for a fit, spread over colours and planes: at most `most`, at least one a scene."""
+    by_scene: dict[tuple[str, float], dict[str, Capture]] = {}
+    for c in captures:
+        by_scene.setdefault((c.channel, c.plane_mm), {}).setdefault(c.pattern, c)
+    columns = [list(patterns.values()) for patterns in by_scene.values()]
+    # Patterns of one kind often follow each other: spread the choice over the whole list.
+    columns = [[column[i] for i in _spread(len(column))] for column in columns]
+    wanted = max(len(columns), min(most, FIT_PIXELS * max(1, len(columns)) // max(1, pixels)))
+    chosen: list[Capture] = []
+    depth = 0
+    while len(chosen) < wanted and any(depth < len(column) for column in columns):
+        chosen += [column[depth] for column in columns if depth < len(column)][: wanted - len(chosen)]
+        depth += 1
+    return chosen
+
+
+def _spread(count: int) -> list[int]:
+    """0 .. count-1 in an order whose every beginning is spread over the range (bit-reversed)."""
+    bits = max(1, (count - 1).bit_length())
+    order = [int(format(k, f"0{bits}b")[::-1], 2) for k in range(2**bits)]
+    return [k for k in order if k < count]
+
+
+FIT_CAPTURES = 4
+
+
+PROBE_CAPTURES = 9
+
+
+HELD_PIXELS = 24 * 480 * 640  # held-out pixels a candidate is judged on
+
+
+@dataclass(frozen=True)
+class CaptureRoles:
+    """Which captures a diagnosis uses for what."""
+
+    captures: CaptureSet
+    fitted: tuple[Capture, ...]
+    screened: tuple[Capture, ...]
+    probed: tuple[Capture, ...]
+    held_out: tuple[Capture, ...]
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the capture set."""
+        return self.captures.folder
+
+
+def capture_roles(captures: CaptureSet) -> CaptureRoles:
+    """Choose captures for fits, the screen, the probes and the judgement."""
+    divided = split(captures)
+    height, width = captures.bench.panel.shape
+    pixels = height * width
+    count = len(scenes(divided.fitted))
+    fitted = sample(divided.fitted, pixels, max(FIT_CAPTURES, count))
+    screened = sample(divided.fitted, pixels, count)
+    probed = sample(divided.fitted, pixels // 2, max(PROBE_CAPTURES, count))
+    most = max(2 * count, HELD_PIXELS // pixels)
+    held_out = list(divided.held_out)
+    if len(held_out) > most:
+        held_out = held_out[:: -(-len(held_out) // most)]
+    return CaptureRoles(captures, tuple(fitted), tuple(screened), tuple(probed), tuple(held_out))

@@ -1,0 +1,139 @@
+"""The screen: how much each effect could explain, from its derivative alone.
+
+A score test: how much of the residual lies in the span of the effect's derivative at "absent" (or at the best of its
+starting points, where the derivative at absent does not reach), with the gains and the parameters of all present
+effects projected out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from runtime.excess import joined
+from trainer.captures.batches import Batch, load
+from trainer.captures.bench_file import Bench
+from trainer.captures.capture_set import chosen, opened
+from trainer.effects.definition import Effect
+from trainer.effects.evidence import Evidence
+from trainer.fitting.jacobian import keys_of, slopes_of, weighted_residuals
+from trainer.fitting.least_squares_gain import with_gain
+from trainer.fitting.predictor import Predictor
+from trainer.fitting.start_points import start_cost, start_points
+from trainer.model.model import EffectInstance, Model, absent
+from trainer.prediction.predict import Trace
+
+
+@dataclass(frozen=True)
+class ScreenResult:
+    """What the screen expects of an effect: the excess that would remain, and where a fit should start."""
+
+    effect: str
+    start: EffectInstance
+    before: float
+    after: float
+
+    @property
+    def removed_excess(self) -> float:
+        """Excess expected to go, on the captures that the screen saw."""
+        return self.before - self.after
+
+
+def screen(
+    folder: Path, ids: tuple[str, ...], model: Model, effects: tuple[Effect, ...]
+) -> list[ScreenResult]:
+    """Screen effects on some captures, for a model with fitted gains."""
+    captures = opened(folder)
+    batches = load(captures, chosen(captures, ids))
+    with torch.no_grad():
+        return screen_batches(batches, model, effects)
+
+
+def screen_batches(batches: list[Batch], model: Model, effects: tuple[Effect, ...]) -> list[ScreenResult]:
+    results = []
+    known: dict[bool, tuple[list[Predictor], list[Trace], Tensor, Tensor]] = {}
+    for effect in effects:
+        wide = effect.touches_iris
+        if wide not in known:
+            reach = model if not wide else model.having(absent(effect, model.bench))
+            predictors = [Predictor(reach, b) for b in batches]
+            points = [p.trace(model) for p in predictors]
+            nuisance = _stacked(model, keys_of(model, model.names), predictors, points)
+            known[wide] = (predictors, points, *nuisance)
+        predictors, points, residual, present = known[wide]
+        noise = sum(float((b.mask * b.noise).sum()) for b in batches)
+        scale = float(joined([b.errors(torch.zeros_like(b.signal)) for b in batches]).variance.sum())
+        before = (_remaining(residual, present) - noise) / scale
+        start = _start(effect, model, predictors, points)
+        trial = model.having(start)
+        moved = [p.trace(trial, effect.stage, t) for p, t in zip(predictors, points, strict=True)]
+        trial = with_gain(trial, predictors, moved)
+        residual_there, slopes = _stacked(trial, keys_of(trial, [effect.name]), predictors, moved)
+        after = (_remaining(residual_there, torch.cat([slopes, present])) - noise) / scale
+        results.append(ScreenResult(effect.name, start, before, after))
+    return results
+
+
+def _start(effect: Effect, model: Model, predictors: list[Predictor], points: list[Trace]) -> EffectInstance:
+    starts = start_points(effect, model)
+    if effect.starts is not None:
+        evidence = []
+        for predictor, point in zip(predictors, points, strict=True):
+            prediction = predictor.counts(model, predictor.light(model, point))
+            evidence.append(Evidence(predictor.scene, predictor.batch, prediction))
+        starts += [placed(effect, model.bench, values) for values in effect.starts(evidence)]
+    if len(starts) == 1:
+        return starts[0]
+    # A start need only be near: one colour and plane tell.
+    few, there = predictors[:1], points[:1]
+    costs = [start_cost(model, few, there, start) for start in starts]
+    if max(costs) - min(costs) < 1e-9 * max(costs):
+        # A period or a place says nothing while the amplitude is zero: look one step ahead.
+        costs = [_one_step_ahead(model, few, there, start) for start in starts]
+    return starts[costs.index(min(costs))]
+
+
+def placed(effect: Effect, bench: Bench, values: dict[str, Any]) -> EffectInstance:
+    """The effect with some values given, held within their physical range, and the others absent."""
+    base = absent(effect, bench)
+    full = dict(base.values)
+    for name, value in values.items():
+        p = effect.parameter(name)
+        full[name] = np.array(np.clip(value, p.low, p.high), dtype=float).reshape(base.values[name].shape)
+    return base.with_values(full)
+
+
+def _one_step_ahead(
+    model: Model, predictors: list[Predictor], points: list[Trace], start: EffectInstance
+) -> float:
+    """Squared error that a straight-line step from a start would leave."""
+    trial = model.having(start)
+    return _remaining(*_stacked(trial, keys_of(trial, [start.effect.name]), predictors, points))
+
+
+def _stacked(
+    model: Model, keys: tuple[tuple[str, str, int], ...], predictors: list[Predictor], points: list[Trace]
+) -> tuple[Tensor, Tensor]:
+    """Weighted residual [pixels] and derivatives [keys + colours, pixels] over all batches."""
+    channels = list(dict.fromkeys(p.batch.channel for p in predictors))
+    residuals, _ = weighted_residuals(model, predictors, points)
+    return torch.cat(residuals), torch.cat(slopes_of(model, keys, channels, predictors, points), dim=1)
+
+
+def _remaining(residual: Tensor, slopes: Tensor) -> float:
+    """Sum of squares of the residual outside the span of the columns."""
+    norms = torch.linalg.vector_norm(slopes, dim=1, dtype=torch.float64)
+    slopes = slopes[norms > 1e-9 * float(norms.max() + 1e-30)]
+    norms = norms[norms > 1e-9 * float(norms.max() + 1e-30)]
+    total = float((residual.double() ** 2).sum())
+    if not len(norms):
+        return total
+    normal = (slopes @ slopes.T).double() / torch.outer(norms, norms)
+    along = (slopes @ residual).double() / norms
+    normal += 1e-6 * torch.eye(len(norms), dtype=torch.float64)
+    return total - float(along @ torch.linalg.solve(normal, along))

@@ -1,0 +1,96 @@
+"""Derivatives of predictions with respect to the numbers of effects, as secants one small physical step wide."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from runtime.excess import PredictionErrors, joined
+from trainer.fitting.predictor import Predictor
+from trainer.model.model import Model
+from trainer.prediction.predict import Trace
+
+STEP = 0.1  # of a parameter's scale: large against single precision's rounding, small against curvature
+
+
+def keys_of(model: Model, free: Sequence[str]) -> tuple[tuple[str, str, int], ...]:
+    keys = []
+    for name in free:
+        present = model.instance(name)
+        for p in present.effect.parameters:
+            keys += [(name, p.name, i) for i in range(present.values[p.name].size)]
+    return tuple(keys)
+
+
+def stepped(model: Model, key: tuple[str, str, int], change: float) -> Model:
+    """The model with one number of one effect changed, held within its physical range."""
+    name, parameter, index = key
+    present = model.instance(name)
+    p = present.effect.parameter(parameter)
+    values = np.array(present.values[parameter], dtype=float)
+    flat = values.reshape(-1)
+    flat[index] = min(max(flat[index] + change, p.low), p.high)
+    return model.having(replace(present, values={**present.values, parameter: values}))
+
+
+def column_step(model: Model, key: tuple[str, str, int]) -> float:
+    """Width of the secant that stands for a derivative: towards the inside of the range."""
+    present = model.instance(key[0])
+    p = present.effect.parameter(key[1])
+    value = float(present.values[key[1]].reshape(-1)[key[2]])
+    step = p.scale * (1.0 if p.even and value < p.scale else STEP)
+    return -step if value + step > p.high else step
+
+
+def columns(
+    model: Model, keys: Sequence[tuple[str, str, int]], predictor: Predictor, point: Trace
+) -> tuple[Tensor, list[Tensor]]:
+    """Prediction [B, h, w] and its change a unit of each parameter, then of the logarithm of the gain."""
+    light = predictor.light(model, point)
+    base = predictor.counts(model, light)
+    result = []
+    for key in keys:
+        step = column_step(model, key)
+        stage = model.instance(key[0]).effect.stage
+        moved = predictor.predict(stepped(model, key, step), stage, point)
+        result.append((moved - base) / step)
+    louder = replace(model, gain={c: g * 1.01 for c, g in model.gain.items()})
+    result.append((predictor.counts(louder, light) - base) / 0.01)
+    return base, result
+
+
+def slopes_of(
+    model: Model,
+    keys: tuple[tuple[str, str, int], ...],
+    channels: list[str],
+    predictors: Sequence[Predictor],
+    points: Sequence[Trace],
+) -> list[Tensor]:
+    """Weighted derivatives of each batch's prediction: [keys + channels, pixels]."""
+    blocks = []
+    for predictor, point in zip(predictors, points, strict=True):
+        weight = predictor.batch.mask
+        block = torch.zeros((len(keys) + len(channels), weight.numel()), dtype=weight.dtype)
+        _, slopes = columns(model, keys, predictor, point)
+        which = [*range(len(keys)), len(keys) + channels.index(predictor.batch.channel)]
+        for row, slope in zip(which, slopes, strict=True):
+            block[row] = (weight * slope).reshape(-1)
+        blocks.append(block)
+    return blocks
+
+
+def weighted_residuals(
+    model: Model, predictors: Sequence[Predictor], points: Sequence[Trace]
+) -> tuple[list[Tensor], PredictionErrors]:
+    """Weighted residuals of each batch [pixels], and the errors they make."""
+    residuals, errors = [], []
+    for predictor, point in zip(predictors, points, strict=True):
+        batch = predictor.batch
+        prediction = predictor.counts(model, predictor.light(model, point))
+        residuals.append((batch.mask * (batch.signal - prediction)).reshape(-1))
+        errors.append(batch.errors(prediction))
+    return residuals, joined(errors)

@@ -1,0 +1,33 @@
+"""The gain of each colour: camera counts a unit of irradiance and millisecond, by least squares."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+
+from trainer.fitting.predictor import Predictor
+from trainer.model.model import Model
+from trainer.prediction.predict import Trace, counts, light_on_camera
+
+
+def with_gain(model: Model, predictors: Sequence[Predictor], points: Sequence[Trace] | None = None) -> Model:
+    """The model with each colour's gain by least squares, other parameters as they are."""
+    sums: dict[str, list[float]] = {}
+    for k, predictor in enumerate(predictors):
+        batch = predictor.batch
+        unit = replace(model, gain={batch.channel: 1.0})
+        stages = predictor.stages(unit)
+        linear = replace(stages.sensor, offset=None, response=None, free_capture_gain=False)
+        point = predictor.trace(unit) if points is None else points[k]
+        light = light_on_camera(predictor.scene, stages, point.image)
+        one = counts(
+            predictor.scene, replace(stages, sensor=linear), light, batch.exposure[:, None, None], None
+        )
+        seen = batch.signal if stages.sensor.offset is None else batch.signal - stages.sensor.offset
+        total = sums.setdefault(batch.channel, [0.0, 0.0])
+        total[0] += float((batch.mask * seen * one).sum(dtype=torch.float64))
+        total[1] += float((batch.mask * one**2).sum(dtype=torch.float64))
+    gain = {**model.gain, **{c: max(a, 1e-12) / max(b, 1e-30) for c, (a, b) in sums.items()}}
+    return replace(model, gain=gain)

@@ -1,0 +1,69 @@
+"""Predictions of captures under changing models, each from the first stage that changed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from runtime.excess import PredictionErrors, joined
+from trainer.captures.batches import Batch, load_batch
+from trainer.captures.capture_set import Capture, CaptureSet
+from trainer.model.model import Model
+from trainer.model.model_stages import scene_for, stages_of
+from trainer.prediction.predict import Trace, counts, light_on_camera, trace
+from trainer.prediction.scene import Scene, Stages
+
+
+class Predictor:
+    """Predictions of one batch under changing models, each from the first stage that changed."""
+
+    def __init__(self, model: Model, batch: Batch) -> None:
+        self.scene: Scene = scene_for(model, batch.channel, batch.plane_mm, batch.signal.dtype)
+        self.batch = batch
+
+    def stages(self, model: Model) -> Stages:
+        """The scene's stages under a model."""
+        return stages_of(self.scene, model)
+
+    def trace(self, model: Model, start: str = "drive", before: Trace | None = None) -> Trace:
+        """Spectrum and irradiance from stage `start` on, a capture at a time to stay in the processor's cache."""
+        if before is not None and start == "sensor":
+            return before
+        stages = self.stages(model)
+        parts = []
+        for k in range(self.batch.gray.shape[0]):
+            one = None if before is None else Trace(before.spectrum[k : k + 1], before.image[k : k + 1])
+            parts.append(trace(self.scene, stages, self.batch.gray[k : k + 1], start, one))
+        return Trace(torch.cat([p.spectrum for p in parts]), torch.cat([p.image for p in parts]))
+
+    def light(self, model: Model, point: Trace) -> Tensor:
+        """Irradiance on the camera [B, h, w]."""
+        return light_on_camera(self.scene, self.stages(model), point.image)
+
+    def counts(self, model: Model, light: Tensor) -> Tensor:
+        """Counts above black [B, h, w]."""
+        gain = model.gain[self.batch.channel] * self.batch.exposure[:, None, None]
+        measured = (self.batch.signal, self.batch.mask)
+        return counts(self.scene, self.stages(model), light, gain, measured)
+
+    def predict(self, model: Model, start: str = "drive", before: Trace | None = None) -> Tensor:
+        """Counts above black [B, h, w], from stage `start` on."""
+        return self.counts(model, self.light(model, self.trace(model, start, before)))
+
+
+def evaluate(model: Model, batches: Sequence[Batch]) -> PredictionErrors:
+    """PredictionErrors of a model, with the gains it has, on batches."""
+    with torch.no_grad():
+        return joined([b.errors(Predictor(model, b).predict(model)) for b in batches])
+
+
+def evaluate_captures(captures: CaptureSet, rows: Sequence[Capture], model: Model) -> PredictionErrors:
+    """PredictionErrors of a model on captures, one in memory at a time."""
+    with torch.no_grad():
+        parts = []
+        for row in rows:
+            batch = load_batch(captures, [row])
+            parts.append(batch.errors(Predictor(model, batch).predict(model)))
+        return joined(parts)

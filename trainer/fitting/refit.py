@@ -1,0 +1,62 @@
+"""Fits of whole models: one effect from its start, all effects together, and orders raised as far as that helps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+
+from trainer.captures.batches import Batch
+from trainer.fitting.gauss_newton import FitResult, fit
+from trainer.fitting.predictor import Predictor
+from trainer.fitting.start_points import pattern_search
+from trainer.model.model import EffectInstance, Model, raised
+
+
+def settled(model: Model, batches: Sequence[Batch]) -> FitResult:
+    """The model with all of its effects fitted together, and their orders raised as far as that helps."""
+    fitted = fit(model, model.names, batches)
+    for name in model.names:
+        fitted = raise_order(fitted, name, batches, least_for_order, model.names)
+    return fitted
+
+
+def fit_from(
+    model: Model, start: EffectInstance, batches: Sequence[Batch], iterations: int = 12
+) -> FitResult:
+    """Fit one effect from a start; where derivatives do not reach far, after a pattern search."""
+    if start.effect.rugged:
+        with torch.no_grad():
+            predictors = [Predictor(model.having(start), b) for b in batches[:3]]
+            points = [p.trace(model) for p in predictors]
+            start = pattern_search(model, predictors, points, start)
+    return fit(model.having(start), [start.effect.name], batches, iterations)
+
+
+def least_for_order(excess: float) -> float:
+    """Excess that a higher order must remove: a twentieth of what is left, and more than what noise can."""
+    return max(0.05 * excess, 1e-5)
+
+
+def raise_order(
+    fitted: FitResult,
+    name: str,
+    batches: Sequence[Batch],
+    gain_needed: Callable[[float], float],
+    free: Sequence[str] | None = None,
+) -> FitResult:
+    """Raise the order of an effect's map or curve while the error keeps falling.
+
+    `gain_needed(excess)` is how much excess a higher order must remove to be kept; `free` are the effects that are
+    refitted along, the effect alone by default.
+    """
+    while True:
+        present = fitted.model.instance(name)
+        higher = [o for o in present.effect.orders if o > present.order]
+        if not higher:
+            return fitted
+        trial = fitted.model.having(raised(present, fitted.model.bench, higher[0]))
+        better = fit(trial, free or [name], batches, iterations=8)
+        if fitted.errors.excess - better.errors.excess < gain_needed(fitted.errors.excess):
+            return fitted
+        fitted = better

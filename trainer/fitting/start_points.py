@@ -1,0 +1,67 @@
+"""Where a fit of an effect starts: its declared starting points, and a search by steps of shrinking size."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from trainer.effects.definition import Effect
+from trainer.fitting.jacobian import keys_of, stepped
+from trainer.fitting.least_squares_gain import with_gain
+from trainer.fitting.predictor import Predictor
+from trainer.model.model import EffectInstance, Model, absent
+from trainer.prediction.predict import Trace
+
+
+def start_points(effect: Effect, model: Model) -> list[EffectInstance]:
+    """Where a fit of an effect starts: absent, and every combination of its parameters' own starting values."""
+    base = absent(effect, model.bench)
+    choices = [
+        [(p.name, s) for s in (p.starts or ((p.scale,) if p.even else (p.absent_value(model.bench),)))]
+        for p in effect.parameters
+    ]
+    return [
+        base.with_values({n: np.full_like(base.values[n], s) for n, s in combination})
+        for combination in itertools.product(*choices)
+    ]
+
+
+def pattern_search(
+    model: Model, predictors: Sequence[Predictor], points: Sequence[Trace], start: EffectInstance
+) -> EffectInstance:
+    """A better start by coordinate steps of shrinking size: for effects whose derivatives do not reach far.
+
+    The edge of an iris is one: its derivative sees one frequency sample, and the next one is unrelated.
+    """
+    best, least = start, start_cost(model, predictors, points, start)
+    for factor in (6.0, 3.0, 1.5, 0.75, 0.35, 0.15):
+        improved = True
+        while improved:
+            improved = False
+            for key in keys_of(model.having(best), [best.effect.name]):
+                for sign in (-1, 1):
+                    step = sign * factor * best.effect.parameter(key[1]).scale
+                    trial = stepped(model.having(best), key, step).instance(best.effect.name)
+                    cost = start_cost(model, predictors, points, trial)
+                    if cost < 0.9999 * least:
+                        best, least, improved = trial, cost, True
+    return best
+
+
+def start_cost(
+    model: Model, predictors: Sequence[Predictor], points: Sequence[Trace], start: EffectInstance
+) -> float:
+    """Squared error of a model with an effect at a start, gains fitted."""
+    trial = model.having(start)
+    moved = [p.trace(trial, start.effect.stage, t) for p, t in zip(predictors, points, strict=True)]
+    trial = with_gain(trial, predictors, moved)
+    return sum(_cost(p, p.counts(trial, p.light(trial, t))) for p, t in zip(predictors, moved, strict=True))
+
+
+def _cost(predictor: Predictor, prediction: Tensor) -> float:
+    batch = predictor.batch
+    return float((batch.mask * (batch.signal - prediction) ** 2).sum(dtype=torch.float64))

@@ -1,0 +1,22 @@
+"""The history of a model: one record a step, with the held-out errors after it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Any
+
+from runtime.excess import PredictionErrors
+from trainer.model.model import Model
+
+
+def recorded(model: Model, name: str | None, errors: PredictionErrors, dropped: str | None = None) -> Model:
+    """The model with one more record in its history."""
+    record: dict[str, Any] = {
+        "added": name or "",
+        **errors.as_json(),
+        "date": datetime.now(UTC).date().isoformat(),
+    }
+    if dropped:
+        record["removed"] = dropped
+    return replace(model, history=(*model.history, record))

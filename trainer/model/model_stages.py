@@ -1,0 +1,65 @@
+"""The scenes of a model, and its stages: the bench's own with the model's effects and its learned field applied."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from trainer.captures.bench_file import Bench
+from trainer.model.model import EffectInstance, Model
+from trainer.prediction.panel_field import with_field
+from trainer.prediction.predict import light_on_camera, trace
+from trainer.prediction.scene import Scene, Stages, bare_stages, scene_at
+
+IRIS_ROOM = 1.25  # how far an effect may open or move the iris, in units of what the bench says
+
+
+def scene_for(model: Model, channel: str, plane_mm: float, dtype: torch.dtype = torch.float32) -> Scene:
+    """The scene of a model. Raises InputError where the propagation method's sampling does not hold."""
+    opened = IRIS_ROOM if any(p.effect.touches_iris for p in model.present) else 1.0
+    return scene_at(model.bench, channel, plane_mm, model.method, opened, dtype)
+
+
+def stages_for(scene: Scene, present: tuple[EffectInstance, ...], tensors: Any = None) -> Stages:
+    """The scene's stages with effects applied in the order of `present`.
+
+    `tensors` gives {effect name: {parameter: tensor}} where values are to be differentiated; others are taken from
+    `present`. Per-channel parameters are cut to the scene's own colour.
+    """
+    stages = bare_stages(scene)
+    row = scene.channel_row()
+    for one in present:
+        given = (tensors or {}).get(one.effect.name, {})
+        arguments: dict[str, Any] = {}
+        for p in one.effect.parameters:
+            value = given.get(p.name)
+            if value is None:
+                value = torch.as_tensor(one.values[p.name], dtype=scene.dtype)
+            arguments[p.name] = value[row] if p.per_channel else value
+        if one.effect.takes_order:
+            arguments["order"] = one.order
+        stage = one.effect.stage
+        stages = replace(stages, **{stage: one.effect.apply(getattr(stages, stage), **arguments)})
+    return stages
+
+
+def stages_of(scene: Scene, model: Model) -> Stages:
+    """The scene's stages under a model: its effects, and the field learned at the panel after them."""
+    stages = stages_for(scene, model.present)
+    if model.panel_field is None:
+        return stages
+    maps = {name: torch.as_tensor(surface, dtype=scene.dtype) for name, surface in model.panel_field.items()}
+    return replace(stages, panel=with_field(stages.panel, maps))
+
+
+def ideal_irradiance(bench: Bench, gray: np.ndarray, channel: str, plane_mm: float) -> np.ndarray:
+    """What the bench file alone predicts for one pattern: float32 [h, w] in camera pixels, of arbitrary scale."""
+    model = Model(bench)
+    scene = scene_for(model, channel, plane_mm)
+    stages = stages_for(scene, ())
+    with torch.no_grad():
+        patterns = torch.as_tensor(gray.astype(np.int64))[None]
+        return light_on_camera(scene, stages, trace(scene, stages, patterns).image)[0].numpy()
