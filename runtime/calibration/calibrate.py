@@ -20,20 +20,14 @@ from runtime.bundle.light_path_arrays import bundle_channels, bundle_paths, load
 from runtime.calibration.drift import Drift, drifted
 from runtime.calibration.drift_fit import Base, Estimate, Fitted, Shot, chi_squared, fit, gain_of, predicted
 from runtime.calibration.free_form_fit import fit_freeform
-from runtime.calibration.held_out_errors import (
-    LEAST,
-    SURE,
-    Heldout,
-    complete,
-    heldout_errors,
-    removed,
-    verdict,
-)
+from runtime.calibration.held_out_errors import HeldOutErrors, held_out_errors
+from runtime.calibration.replacement_rule import LEAST_EXCESS, is_certain, replacement_verdict
 from runtime.calibration.response import SWEEP, Sweep, best_period, fitted_response, measured_sweep
 from runtime.calibration.shown_patterns import GRAINS, HELD_OUT, grains, grating, proof_picture
 from runtime.calibration.taking import Noise, Taker
 from runtime.camera.registration import dot_pattern, dots_of, find_homography, panel_points
 from runtime.camera.view import View, on_panel, sampler, view_of
+from runtime.excess import is_complete, removed_excess
 from runtime.headset.open_devices import Devices
 from runtime.solver import quality, solve
 
@@ -65,7 +59,7 @@ class Taken:
 class Calibration:
     """A finished self-calibration; nothing has been written yet.
 
-    verdict: see `check.verdict`. estimate: what was fitted, and errors: its standard errors. sweeps: the measured
+    verdict: see `replacement_rule`. estimate: what was fitted, and errors: its standard errors. sweeps: the measured
     responses. shots: captures a colour. before, after: errors on held-out captures. pictures: for each colour the
     picture as the camera saw it before and after, on the panel's pixels, float32 [H, W], with amplitude PSNR in dB.
     counts_per_ms: of each colour, and the relative spread over captures; known_counts_per_ms: what it was at the last
@@ -79,8 +73,8 @@ class Calibration:
     errors: Drift
     sweeps: Mapping[str, Sweep]
     shots: Mapping[str, Taken]
-    before: Heldout
-    after: Heldout
+    before: HeldOutErrors
+    after: HeldOutErrors
     pictures: Mapping[str, Mapping[str, tuple[np.ndarray, float]]]
     counts_per_ms: Mapping[str, tuple[float, float]]
     bases: Mapping[str, Base]
@@ -130,7 +124,7 @@ def calibrate(
     say(0.86, "checking against held-out patterns")
     heldout = [shot for t in taken.values() for shot in t.heldout]
     before, scale = _as_it_was(bases, heldout, found.estimate.view)
-    after = heldout_errors(bases, heldout, found.estimate)
+    after = held_out_errors(bases, heldout, found.estimate)
     say(0.92, "solving the picture again")
     better = {c: _solved(bases[c], c, found.estimate.drift) for c in channels}
     with open_devices() as devices, _dark_after(devices):
@@ -138,10 +132,10 @@ def calibrate(
         taker = Taker(devices, lambda what: say(0.96, f"showing: {what}"), taker.taken)
         pictures = {c: _pictures(taker, c, better[c], taken[c], found.estimate.view) for c in channels}
     done = time.perf_counter()
-    said = verdict(before, after, _excess_before(bundle))
+    verdict = replacement_verdict(before.errors, after.errors, _excess_before(bundle))
     return Calibration(
-        said,
-        complete(before, after),
+        verdict,
+        is_complete(after.errors.excess, before.errors.excess),
         found.estimate,
         found.errors,
         sweeps,
@@ -155,11 +149,13 @@ def calibrate(
         taker.taken,
         {"capturing": captured - started, "fitting": done - captured},
         (bundle.description.get("camera") or {}).get("counts_per_ms") or {},
-        scale if said == "unchanged" else None,
+        scale if verdict == "unchanged" else None,
     )
 
 
-def _as_it_was(bases: Mapping[str, Base], heldout: list[Shot], view: View) -> tuple[Heldout, float | None]:
+def _as_it_was(
+    bases: Mapping[str, Base], heldout: list[Shot], view: View
+) -> tuple[HeldOutErrors, float | None]:
     """How well the light path predicts as it was, and the camera's scale if that matters to it.
 
     At one plane defocus and distance together do what a camera of another scale does: not one pattern tells them
@@ -168,9 +164,9 @@ def _as_it_was(bases: Mapping[str, Base], heldout: list[Shot], view: View) -> tu
     """
     start = Estimate(Drift(), view)
     rigid, scaled = (fit(bases, heldout, start, (0, 0), new_view=new).estimate for new in (False, True))
-    errors = heldout_errors(bases, heldout, scaled)
-    gone, error = removed(heldout_errors(bases, heldout, rigid), errors)
-    matters = gone - SURE * error > 0 and gone > LEAST
+    errors = held_out_errors(bases, heldout, scaled)
+    removed = removed_excess(held_out_errors(bases, heldout, rigid).errors, errors.errors)
+    matters = is_certain(removed) and removed.value > LEAST_EXCESS
     return errors, scaled.view.magnification if matters else None
 
 
@@ -313,12 +309,12 @@ def _with_maps(
     """A fit with free-form maps and all else in turn, where held-out patterns surely say that maps pay."""
     shots = [shot for t in taken.values() for shot in t.fitted]
     heldout = [shot for t in taken.values() for shot in t.heldout]
-    before = heldout_errors(bases, heldout, found.estimate)
+    before = held_out_errors(bases, heldout, found.estimate)
     for turn in range(TURNS):
         told = _part(say, len(ORDERS) + turn, len(ORDERS) + TURNS, "wavefront and beam, free-form")
         estimate = fit_freeform(bases, shots, found.estimate, told)
-        gone, error = removed(before, heldout_errors(bases, heldout, estimate))
-        if turn == 0 and gone - SURE * error <= 0:
+        removed = removed_excess(before.errors, held_out_errors(bases, heldout, estimate).errors)
+        if turn == 0 and not is_certain(removed):
             break
         found = fit(bases, shots, estimate, ORDERS[-1], iterations=2, new_view=new)
         estimate, sweeps = _with_response(bases, taken, found.estimate)

@@ -46,9 +46,9 @@ def arguments(parser: ArgumentParser) -> None:
 def run(args: Namespace) -> dict[str, Any]:
     """Calibrate, report, and replace the bundle where that is right; returns what `--json` prints."""
     from runtime.bundle.bundle_folder import read_bundle
+    from runtime.calibration.bundle_replacement import previous, replace_bundle, restore_bundle
     from runtime.calibration.calibrate import calibrate
     from runtime.calibration.calibration_report import write_report
-    from runtime.calibration.replacing import previous, replace_bundle, restore_bundle
     from runtime.calibration.summary import numbers
     from runtime.headset.open_devices import open_devices
 

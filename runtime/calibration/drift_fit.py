@@ -141,17 +141,17 @@ def fit(
         normal, gradient = _normal_equations(bases, shots, estimate, layout, told)
         normal += np.diag(layout.precision)
         gradient -= layout.precision * layout.numbers(estimate)
-        gone = 0.0
+        decrease = 0.0
         for _ in range(6):
             step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
             trial = layout.moved(estimate, step)
             trial_cost = chi_squared(bases, shots, trial) + layout.prior(trial)
             if trial_cost < cost:
-                estimate, gone, cost = trial, cost - trial_cost, trial_cost
+                estimate, decrease, cost = trial, cost - trial_cost, trial_cost
                 damping = max(damping / 10, 1e-8)
                 break
             damping = max(10 * damping, 1e-3)
-        if gone < SETTLED * len(step):
+        if decrease < SETTLED * len(step):
             break
     pixels = sum(int(np.count_nonzero(s.weight)) for s in shots)
     chi2 = cost / max(pixels, 1)

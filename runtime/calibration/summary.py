@@ -10,9 +10,9 @@ import numpy as np
 
 from runtime.calibration.calibrate import Calibration
 from runtime.calibration.drift import LOWEST_AMPLITUDE, LOWEST_WAVEFRONT
-from runtime.calibration.held_out_errors import SURE, removed
 from runtime.calibration.response import SWEEP
 from runtime.calibration.shown_patterns import GRAINS, HELD_OUT
+from runtime.excess import removed_excess
 from runtime.lightpath.legendre import edge_to_edge, legendre_maps, legendre_order
 
 
@@ -22,7 +22,7 @@ def numbers(found: Calibration) -> dict[str, Any]:
     shape = next(iter(found.bases.values())).path.grid.shape
     wavefront = drift.wavefront(shape)
     shortest = min(b.wavelength_nm for b in found.bases.values())
-    gone, error = removed(found.before, found.after)
+    removed = removed_excess(found.before.errors, found.after.errors)
     colours = {}
     for channel, base in found.bases.items():
         sweep, was, now = found.sweeps[channel], base.path.response, drift.response[channel]
@@ -49,10 +49,10 @@ def numbers(found: Calibration) -> dict[str, Any]:
         "verdict": found.verdict,
         "complete": found.complete,
         "heldout": {
-            "before": found.before.as_json(),
-            "after": found.after.as_json(),
-            "excess_removed": gone,
-            "ci95": [gone - SURE * error, gone + SURE * error],
+            "before": found.before.errors.as_json(),
+            "after": found.after.errors.as_json(),
+            "excess_removed": removed.value,
+            "ci95": list(removed.interval()),
         },
         "wavefront": {
             "rms_nm": float(wavefront.std()),

@@ -109,18 +109,6 @@ def panel_points(homography: np.ndarray, camera_xy: np.ndarray) -> np.ndarray:
     return points[:, :2] / points[:, 2:]
 
 
-def resample(image: np.ndarray, homography: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """A camera picture [h, w] on the panel's pixels, float32 [H, W]; 0 where the camera did not look.
-
-    Interpolates with cubic splines: to look at, and to make registered sets of finely sampled pictures.
-    """
-    y, x = np.mgrid[: shape[0], : shape[1]]
-    panel = np.stack([x.ravel(), y.ravel()], 1)
-    there = panel_points(np.linalg.inv(np.asarray(homography, np.float64)), panel)
-    seen = ndimage.map_coordinates(np.asarray(image, np.float32), (there[:, 1], there[:, 0]), order=3)
-    return seen.reshape(shape)
-
-
 def _spots(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Centres (x, y), float [n, 2], of a picture's bright dots, and their light against neighbours', [n]."""
     image = np.asarray(image)

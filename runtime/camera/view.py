@@ -10,15 +10,23 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
-from scipy import ndimage
-from scipy.sparse import csr_matrix
 
 from firmware_iface.errors import InputError
 from runtime.bundle.bundle_folder import Bundle
 from runtime.camera.registration import panel_points
+from runtime.camera.sampling import (
+    camera_places,
+    finer_picture,
+    finer_picture_adjoint,
+    pixel_area,
+    rectified,
+    sample_places,
+    spline_filter,
+    spline_matrix,
+)
 from runtime.lightpath.fft import irfft2, rfft2
 from runtime.lightpath.legendre import edge_to_edge, legendre_maps
-from runtime.lightpath.light_path import FINE, Grid, image_frequencies
+from runtime.lightpath.light_path import Grid, image_frequencies
 
 SENSITIVITY_ORDER = 4  # of the camera's own fall-off, so that none of it is taken for the beam's
 TERMS = 14  # of that order
@@ -121,9 +129,8 @@ def on_panel(signal: np.ndarray, view: View, shape: tuple[int, int]) -> np.ndarr
     stray = view.stray / (1 + view.stray) * float(signal.mean())
     rows, columns = np.mgrid[: shape[0], : shape[1]]
     y, x = _bent(rows, columns, shape, -view.distortion)
-    there = panel_points(np.linalg.inv(view.matrix(shape)), np.stack([x.ravel(), y.ravel()], 1))
     light = ((signal - stray) / view.evenness()).astype(np.float32)
-    return np.asarray(ndimage.map_coordinates(light, (there[:, 1], there[:, 0]), order=3)).reshape(shape)
+    return rectified(light, *camera_places(view.matrix(shape), y, x))
 
 
 def sampler(view: View, grid: Grid, finer: int = 2) -> Sampler:
@@ -139,28 +146,16 @@ def sampler(view: View, grid: Grid, finer: int = 2) -> Sampler:
 def sampler_and_adjoint(view: View, grid: Grid, finer: int = 2) -> tuple[Sampler, Sampler]:
     """`sampler`, and its adjoint."""
     y, x = view.positions(grid.shape)
-    like = np.zeros((), np.float64)
-    fy, fx = image_frequencies(grid, like)
+    fy, fx = image_frequencies(grid, np.zeros((), np.float64))
     fy, fx = fy[:, None] * grid.pitch, fx[None, :] * grid.pitch  # cycles a panel pixel
-    i, j = view.shape[0] // 2, view.shape[1] // 2
-    down = (y[i, j] - y[i - 1, j], x[i, j] - x[i - 1, j])
-    right = (y[i, j] - y[i, j - 1], x[i, j] - x[i, j - 1])
-    transfer = np.sinc(fy * down[0] + fx * down[1]) * np.sinc(fy * right[0] + fx * right[1])
-    transfer *= np.exp(-2 * np.pi**2 * (view.blur_y_px2 * fy**2 + view.blur_x_px2 * fx**2))
-    samples = FINE * finer
-    # a cubic B-spline's own transfer, divided out, so that the spline runs through the samples
-    for f in (fy, fx):
-        transfer = transfer * (3 / (2 + np.cos(2 * np.pi * f / samples)))
-    transfer[grid.image_shape[0] // 2], transfer[:, -1] = 0, 0  # the highest frequency has no sign of its own
+    transfer = pixel_area(fy, fx, y, x) / spline_filter(fy, fx, finer)
+    transfer = transfer * np.exp(-2 * np.pi**2 * (view.blur_y_px2 * fy**2 + view.blur_x_px2 * fx**2))
     transfer = transfer.astype(np.float32)
     height, width = (finer * n for n in grid.image_shape)
-    weights = _spline(samples * (y + grid.margin), samples * (x + grid.margin), (height, width))
+    weights = spline_matrix(*sample_places(grid, y, x, finer), (height, width))
 
     def sampled(image: np.ndarray) -> np.ndarray:
-        spectrum = rfft2(image) * transfer
-        if finer > 1:
-            spectrum = _widened(spectrum, image.shape[-2], (height, width)) * finer**2
-        fine = irfft2(spectrum, (height, width))
+        fine = finer_picture(rfft2(image) * transfer, grid.image_shape, finer)
         flat = fine.reshape(-1, height * width)
         seen = np.stack([weights @ one for one in flat])
         return seen.reshape(*image.shape[:-2], *view.shape)
@@ -168,46 +163,7 @@ def sampler_and_adjoint(view: View, grid: Grid, finer: int = 2) -> tuple[Sampler
     def back(light: np.ndarray) -> np.ndarray:
         flat = light.reshape(-1, weights.shape[0])
         fine = np.stack([weights.T @ one for one in flat]).reshape(*light.shape[:-2], height, width)
-        return irfft2(_narrowed(rfft2(fine), grid.image_shape) * transfer, grid.image_shape)
+        spectrum = finer_picture_adjoint(rfft2(fine), grid.image_shape)
+        return irfft2(spectrum * transfer, grid.image_shape)
 
     return sampled, back
-
-
-def _widened(spectrum: np.ndarray, rows: int, shape: tuple[int, int]) -> np.ndarray:
-    """A spectrum as from `rfft2` with zeros for the frequencies of a finer grid."""
-    half = rows // 2
-    wide = np.zeros((*spectrum.shape[:-2], shape[0], shape[1] // 2 + 1), spectrum.dtype)
-    wide[..., :half, : spectrum.shape[-1]] = spectrum[..., :half, :]
-    wide[..., half - rows :, : spectrum.shape[-1]] = spectrum[..., half:, :]
-    return wide
-
-
-def _narrowed(spectrum: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """The frequencies that a coarser grid has, of a spectrum as from `rfft2`: adjoint of `_widened`."""
-    rows, columns = shape[0], shape[1] // 2 + 1
-    half = rows // 2
-    return np.concatenate([spectrum[..., :half, :columns], spectrum[..., half - rows :, :columns]], axis=-2)
-
-
-def _spline(y: np.ndarray, x: np.ndarray, shape: tuple[int, int]) -> csr_matrix:
-    """Cubic B-spline weights of samples [shape] at positions y, x [h, w]: sparse [h w, samples]."""
-    (rows, wy), (columns, wx) = _taps(y.ravel()), _taps(x.ravel())
-    inside = (rows[0] >= 0) & (rows[3] < shape[0]) & (columns[0] >= 0) & (columns[3] < shape[1])
-    index = np.clip(rows, 0, shape[0] - 1)[:, None] * shape[1] + np.clip(columns, 0, shape[1] - 1)[None, :]
-    weight = wy[:, None] * wx[None, :] * inside
-    count = y.size
-    starts = 16 * np.arange(count + 1)
-    flat = (
-        weight.reshape(16, count).T.ravel().astype(np.float32),
-        index.reshape(16, count).T.ravel(),
-        starts,
-    )
-    return csr_matrix(flat, shape=(count, shape[0] * shape[1]))
-
-
-def _taps(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Indices [4, n] and weights [4, n] of the cubic B-splines that reach a position."""
-    whole = np.floor(position)
-    t = position - whole
-    weights = [(1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3]
-    return whole.astype(np.int64) + np.arange(-1, 3)[:, None], np.stack(weights) / 6

@@ -14,8 +14,8 @@ from runtime.camera.registration import (
     dots_of,
     find_homography,
     panel_points,
-    resample,
 )
+from runtime.camera.sampling import panel_on_camera, rectified
 
 SHAPE = (200, 280)
 
@@ -129,7 +129,7 @@ def test_pictures_without_the_pattern_are_refused() -> None:
 def test_resampling_puts_the_dots_where_the_panel_has_them() -> None:
     dots = dots_of(SHAPE, 30)
     truth, shape = camera_to_panel(1.5, 5, True, 1e-4)
-    straight = resample(picture(dots, truth, shape, noise=0), truth, SHAPE)
+    straight = rectified(picture(dots, truth, shape, noise=0), *panel_on_camera(truth, SHAPE))
     assert straight.shape == SHAPE and straight.dtype == np.float32
     centre = straight[20:-20, 20:-20].ravel()
     assert np.corrcoef(centre, dot_pattern(SHAPE, 30)[20:-20, 20:-20].ravel())[0, 1] > 0.97

@@ -193,7 +193,9 @@ Run = Callable[..., dict[str, Any]]
 def diagnosed(captures: CaptureSet, own: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> Run:
     """`diagnose --json` of the set with a user's effects; only a few of the others are tried, to be quick."""
     monkeypatch.setattr("trainer.fitting.pool.cores", lambda: 1)
-    monkeypatch.setattr("trainer.effects.effect_catalogue.catalogue", lambda files=(): few(catalogue(files), own))
+    monkeypatch.setattr(
+        "trainer.effects.effect_catalogue.catalogue", lambda files=(): few(catalogue(files), own)
+    )
 
     def run(*options: str) -> dict[str, Any]:
         capsys.readouterr()

@@ -13,6 +13,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from runtime.camera.sampling import finer_picture, pixel_area, sample_places, spline_filter, spline_samples
 from runtime.lightpath.fft import irfft2, rfft2
 from runtime.lightpath.light_path import (
     FINE,
@@ -30,9 +31,7 @@ from runtime.lightpath.propagation import (
 from trainer.prediction.scene import Scene, Stages, bare_stages
 from trainer.prediction.stages import Pupil, Sensor
 
-FINER = (
-    2  # times as many samples for a spline to run through: it is exact up to half of the band that they hold
-)
+FINER = 2  # times as many samples for splines to pass through: exact up to half of the band that they hold
 
 
 def light_path(scene: Scene, stages: Stages) -> LightPath:
@@ -171,10 +170,9 @@ def light_on_camera(scene: Scene, stages: Stages, image: Tensor) -> Tensor:
         dy, dx = sensor.displacement
         rows = torch.arange(dy.shape[-2], dtype=dy.dtype)[:, None]
         y, x = camera.on_panel(rows + dy, torch.arange(dy.shape[-1], dtype=dy.dtype) + dx)
-    samples = FINER * FINE
-    transfer = transfer / (_spline_transfer(sensor.iy / samples) * _spline_transfer(sensor.ix / samples))
-    finer = _finer(rfft2(image) * transfer, grid.image_shape)
-    return _spline_samples(finer, samples * (y + grid.margin), samples * (x + grid.margin))
+    transfer = transfer / spline_filter(sensor.iy, sensor.ix, FINER)
+    fine = finer_picture(rfft2(image) * transfer, grid.image_shape, FINER)
+    return spline_samples(fine, *sample_places(grid, y, x, FINER))
 
 
 def counts(
@@ -211,59 +209,7 @@ def camera_positions(scene: Scene) -> tuple[Tensor, Tensor]:
 def _pixel_area(scene: Scene, sensor: Sensor) -> Tensor:
     """Transfer function of the camera pixel's area."""
     camera = scene.bench.camera
-    side = camera.pixel_um / scene.bench.panel.pitch_um
     if camera.homography is None:
-        rows, columns = sensor.iy * side, sensor.ix * side
-    else:
-        # The pixel's two sides as the homography puts them on the panel, at the picture's centre.
-        y, x = camera_positions(scene)
-        i, j = camera.height // 2, camera.width // 2
-        rows = sensor.iy * (y[i + 1, j] - y[i, j]) + sensor.ix * (x[i + 1, j] - x[i, j])
-        columns = sensor.iy * (y[i, j + 1] - y[i, j]) + sensor.ix * (x[i, j + 1] - x[i, j])
-    return torch.sinc(rows) * torch.sinc(columns)
-
-
-def _finer(spectrum: Tensor, shape: tuple[int, int]) -> Tensor:
-    """The picture of a spectrum as from `rfft2` of `shape`, on a grid that is FINER times as fine."""
-    height, width = (FINER * n for n in shape)
-    half = shape[0] // 2
-    between = spectrum.new_zeros((*spectrum.shape[:-2], height - shape[0], spectrum.shape[-1]))
-    rows = torch.cat((spectrum[..., :half, :], between, spectrum[..., half:, :]), dim=-2)
-    return FINER**2 * irfft2(
-        torch.nn.functional.pad(rows, (0, width // 2 + 1 - rows.shape[-1])), (height, width)
-    )
-
-
-def _spline_transfer(cycles_per_sample: Tensor) -> Tensor:
-    """Sum of cubic B-splines at whole samples: dividing by it makes spline samples pass through the data."""
-    return (2 + torch.cos(2 * math.pi * cycles_per_sample)) / 3
-
-
-def _spline_samples(coefficients: Tensor, y: Tensor, x: Tensor) -> Tensor:
-    """Cubic B-spline sum at positions y, x [h, w] (samples) of coefficients [B, m, n]: [B, h, w]."""
-    height, width = coefficients.shape[-2:]
-    flat = coefficients.reshape(coefficients.shape[0], -1)
-    rows, row_weights = _spline_taps(y, height)
-    columns, column_weights = _spline_taps(x, width)
-    total = torch.zeros(1, dtype=coefficients.dtype)
-    for i in range(4):
-        inner = torch.zeros(1, dtype=coefficients.dtype)
-        for j in range(4):
-            index = (rows[i] * width + columns[j]).reshape(-1)
-            inner = inner + flat[:, index].reshape(-1, *y.shape) * column_weights[j]
-        total = total + inner * row_weights[i]
-    return total
-
-
-def _spline_taps(position: Tensor, count: int) -> tuple[list[Tensor], list[Tensor]]:
-    position = torch.clamp(position, 1, count - 3)
-    whole = torch.floor(position.detach())
-    t = position - whole
-    first = whole.long()
-    weights = [
-        (1 - t) ** 3 / 6,
-        (3 * t**3 - 6 * t**2 + 4) / 6,
-        (-3 * t**3 + 3 * t**2 + 3 * t + 1) / 6,
-        t**3 / 6,
-    ]
-    return [first + k - 1 for k in range(4)], weights
+        side = camera.pixel_um / scene.bench.panel.pitch_um
+        return torch.sinc(sensor.iy * side) * torch.sinc(sensor.ix * side)
+    return pixel_area(sensor.iy, sensor.ix, *camera_positions(scene))

@@ -12,7 +12,7 @@ from firmware_iface.errors import InputError
 from firmware_iface.virtual.simulated_panel import Drive
 from runtime.calibration.drift import Drift, drifted, wavefront_maps
 from runtime.calibration.drift_fit import Base, Estimate, Shot, _columns, _Layout, _stepped_views, predicted
-from runtime.calibration.held_out_errors import Heldout, complete, verdict
+from runtime.calibration.replacement_rule import replacement_verdict
 from runtime.calibration.response import (
     SWEEP,
     Sweep,
@@ -24,6 +24,7 @@ from runtime.calibration.response import (
 from runtime.calibration.shown_patterns import grains, grating
 from runtime.calibration.taking import Taker
 from runtime.camera.view import View, sampler
+from runtime.excess import PredictionErrors, is_complete
 from runtime.lightpath.light_path import irradiance, panel_phase, pixel_irradiance
 from tests.runtime.benches import PITCH, ideal_path, random_path
 from tests.runtime.calibration.drifting import WAVELENGTH_NM, base, devices, drifted_bench, headset
@@ -208,12 +209,11 @@ def test_a_real_panels_correction_is_seen_to_peak_too_early(shared: Path) -> Non
     assert (np.diff(found) >= 0).all()
 
 
-def _heldout(excess: float, rng: np.random.Generator, count: int = 400) -> Heldout:
+def _heldout(excess: float, rng: np.random.Generator, count: int = 400) -> PredictionErrors:
     """A held-out error whose tiles scatter by a tenth about their mean."""
     noise = 0.001
     tiles = (excess + noise) * (1 + 0.1 * rng.normal(size=count)) / count
-    total = float(tiles.sum())
-    return Heldout(total**0.5, noise**0.5, total - noise, tiles, 1.0, ())
+    return PredictionErrors(("0",), tiles[None], np.array([noise]), np.ones(1), np.full(1, float(count)))
 
 
 @pytest.mark.parametrize(
@@ -234,16 +234,17 @@ def test_the_verdict_asks_whether_it_is_real_and_whether_it_matters(
 ) -> None:
     rng = np.random.default_rng(3)
     one, other = _heldout(before, rng), _heldout(after, rng)
-    assert verdict(one, other, known) == said and complete(one, other) == whole
+    assert replacement_verdict(one, other, known) == said
+    assert is_complete(other.excess, one.excess) == whole
 
 
 def test_a_gain_that_few_tiles_make_is_not_believed() -> None:
     rng = np.random.default_rng(4)
     before = _heldout(0.2, rng, 16)
-    lucky = before.tiles.copy()
-    lucky[0] *= 0.05
-    after = replace(before, tiles=lucky, excess=float(lucky.sum()) - 0.001)
-    assert verdict(before, after) == "not_explained"
+    lucky = before.squared.copy()
+    lucky[0, 0] *= 0.05
+    after = replace(before, squared=lucky)
+    assert replacement_verdict(before, after) == "not_explained"
 
 
 def test_grains_use_every_gray_level_and_differ_with_the_seed() -> None:

@@ -1,0 +1,193 @@
+"""What camera pixels integrate of irradiance on a fine grid: pixel area, band extension and cubic splines.
+
+One camera for the trainer and the headset, against the array API. A picture of irradiance is filtered by the pixel's
+area, put on a finer grid by zero-padding its spectrum, and read where each pixel looks by cubic B-splines that pass
+through the samples. Places are (y, x), in panel pixels or in samples of the fine grid, as said.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from array_api_compat import array_namespace
+from scipy import ndimage
+from scipy.sparse import csr_matrix
+
+from runtime.camera.registration import panel_points
+from runtime.lightpath.fft import irfft2
+from runtime.lightpath.light_path import FINE, Grid
+
+Array = Any
+
+
+def pixel_area(iy: Array, ix: Array, y: Array, x: Array) -> Array:
+    """Transfer function of the camera pixel's area, a parallelogram.
+
+    Parameters
+    ----------
+    iy, ix : arrays [n, 1] and [1, m], cycles a panel pixel
+        Frequencies of the irradiance.
+    y, x : arrays [h, w], panel pixels
+        Where each camera pixel's centre looks. The pixel's sides are taken at the picture's centre.
+    """
+    xp = array_namespace(iy)
+    i, j = y.shape[0] // 2, y.shape[1] // 2
+    down = (y[i, j] - y[i - 1, j], x[i, j] - x[i - 1, j])
+    right = (y[i, j] - y[i, j - 1], x[i, j] - x[i, j - 1])
+    return xp.sinc(iy * down[0] + ix * down[1]) * xp.sinc(iy * right[0] + ix * right[1])
+
+
+def spline_filter(iy: Array, ix: Array, finer: int) -> Array:
+    """Transfer function to divide by, so that `spline_samples` passes through the samples.
+
+    Parameters
+    ----------
+    iy, ix : arrays [n, 1] and [1, m], cycles a panel pixel
+    finer : int
+        How many times as fine as the light path's own fine grid the splines' samples are.
+    """
+    xp = array_namespace(iy)
+    rows, columns = ((2 + xp.cos(2 * math.pi * f / (FINE * finer))) / 3 for f in (iy, ix))
+    return rows * columns
+
+
+def finer_picture(spectrum: Array, shape: tuple[int, int], finer: int) -> Array:
+    """The picture of a spectrum on a grid that is finer.
+
+    Parameters
+    ----------
+    spectrum : complex array [..., n, m // 2 + 1]
+        As from `rfft2` of a picture of `shape`. The highest frequency of an even axis has no sign of its own and is
+        left out.
+    finer : int
+
+    Returns
+    -------
+    real array [..., finer n, finer m]
+    """
+    height, width = (finer * n for n in shape)
+    return finer**2 * irfft2(_widened(spectrum, shape, finer), (height, width))
+
+
+def finer_picture_adjoint(spectrum: Array, shape: tuple[int, int]) -> Array:
+    """The frequencies of a picture of `shape`, of a finer one's spectrum as from `rfft2`."""
+    xp = array_namespace(spectrum)
+    half, columns = shape[0] // 2, shape[1] // 2 + 1
+    kept = xp.concat([spectrum[..., :half, :columns], spectrum[..., half - shape[0] :, :columns]], axis=-2)
+    return kept * _below_highest(shape, kept)
+
+
+def _widened(spectrum: Array, shape: tuple[int, int], finer: int) -> Array:
+    xp = array_namespace(spectrum)
+    spectrum = spectrum * _below_highest(shape, spectrum)
+    half, leading = shape[0] // 2, tuple(spectrum.shape[:-2])
+    device = spectrum.device
+
+    def zeros(rows: int, columns: int) -> Array:
+        return xp.zeros((*leading, rows, columns), dtype=spectrum.dtype, device=device)
+
+    more = (finer - 1) * shape[0]
+    tall = xp.concat(
+        [spectrum[..., :half, :], zeros(more, spectrum.shape[-1]), spectrum[..., half:, :]], axis=-2
+    )
+    wide = finer * shape[1] // 2 + 1 - spectrum.shape[-1]
+    return xp.concat([tall, zeros(finer * shape[0], wide)], axis=-1)
+
+
+def _below_highest(shape: tuple[int, int], like: Array) -> Array:
+    """1 for every frequency of `rfft2` but an even axis's highest, which is 0: [n, m // 2 + 1]."""
+    xp = array_namespace(like)
+    kept = np.ones((shape[0], shape[1] // 2 + 1))
+    if shape[0] % 2 == 0:
+        kept[shape[0] // 2] = 0
+    if shape[1] % 2 == 0:
+        kept[:, -1] = 0
+    return xp.asarray(kept, dtype=xp.real(like).dtype, device=like.device)
+
+
+def sample_places(grid: Grid, y: Array, x: Array, finer: int) -> tuple[Array, Array]:
+    """Places in panel pixels as places in samples of a picture that is `finer` than the light path's fine grid."""
+    samples = FINE * finer
+    return samples * (y + grid.margin), samples * (x + grid.margin)
+
+
+def spline_samples(coefficients: Array, y: Array, x: Array) -> Array:
+    """Cubic B-spline sum at places; 0 where a place is outside the samples.
+
+    Parameters
+    ----------
+    coefficients : real array [..., n, m]
+    y, x : arrays [h, w], samples
+        They may carry gradients.
+
+    Returns
+    -------
+    real array [..., h, w]
+    """
+    height, width = coefficients.shape[-2:]
+    leading, places = tuple(coefficients.shape[:-2]), tuple(y.shape)
+    flat = coefficients.reshape(-1, height * width)
+    rows, row_weights = _taps(y.reshape(-1), height)
+    columns, column_weights = _taps(x.reshape(-1), width)
+    total: Array = 0
+    for i in range(4):
+        inner: Array = 0
+        for j in range(4):
+            inner = inner + flat[:, rows[i] * width + columns[j]] * column_weights[j]
+        total = total + inner * row_weights[i]
+    return total.reshape(*leading, *places)
+
+
+def spline_matrix(y: np.ndarray, x: np.ndarray, shape: tuple[int, int]) -> csr_matrix:
+    """`spline_samples` of a picture of `shape` at fixed places [h, w], as a sparse matrix [h w, n m] in float32."""
+    (rows, wy), (columns, wx) = _taps(y.ravel(), shape[0]), _taps(x.ravel(), shape[1])
+    index = np.stack(rows)[:, None] * shape[1] + np.stack(columns)[None, :]
+    weight = np.stack(wy)[:, None] * np.stack(wx)[None, :]
+    count = y.size
+    values, places = (a.reshape(16, count).T.ravel() for a in (weight.astype(np.float32), index))
+    return csr_matrix((values, places, 16 * np.arange(count + 1)), shape=(count, shape[0] * shape[1]))
+
+
+def _taps(place: Array, count: int) -> tuple[list[Array], list[Array]]:
+    """Four samples and their weights for each place along an axis of `count` samples; weight 0 outside."""
+    xp = array_namespace(place)
+    whole = xp.floor(place)
+    t = place - whole
+    first = xp.astype(whole, xp.int64) - 1
+    inside = xp.astype((first >= 0) & (first + 3 < count), place.dtype)
+    weights = (
+        (1 - t) ** 3 / 6,
+        (3 * t**3 - 6 * t**2 + 4) / 6,
+        (-3 * t**3 + 3 * t**2 + 3 * t + 1) / 6,
+        t**3 / 6,
+    )
+    return [xp.clip(first + k, 0, count - 1) for k in range(4)], [w * inside for w in weights]
+
+
+def panel_on_camera(homography: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Where on the camera the pixels of a panel of `shape` fall.
+
+    Parameters
+    ----------
+    homography : float array [3, 3]
+        From camera pixels (x, y, 1) to panel pixels.
+
+    Returns
+    -------
+    (y, x), float64 arrays [H, W], camera pixels
+    """
+    y, x = np.indices(shape, dtype=float)
+    return camera_places(homography, y, x)
+
+
+def camera_places(homography: np.ndarray, y: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where on the camera places (y, x) [H, W] of the panel fall, by a homography from the camera to the panel."""
+    there = panel_points(np.linalg.inv(np.asarray(homography, float)), np.stack([x.ravel(), y.ravel()], 1))
+    return there[:, 1].reshape(y.shape), there[:, 0].reshape(y.shape)
+
+
+def rectified(picture: np.ndarray, y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """A picture [h, w] at places (y, x) [H, W] in its pixels, by cubic splines; 0 outside."""
+    return np.asarray(ndimage.map_coordinates(picture, (y, x), order=3)).reshape(y.shape)
