@@ -21,8 +21,8 @@ from runtime.camera.view import View
 from runtime.cli import main
 from runtime.lightpath.light_path import LightPath
 from runtime.networks.onnx_approximator import Approximator
-from runtime.refinement.refine import HOLD_OUT, Refinement, _to_step, refine
-from runtime.refinement.viewer import Eye
+from runtime.refinement.panel_and_camera import PanelAndCamera
+from runtime.refinement.picture_refinement import HOLD_OUT, Refinement, _to_step, refine
 from runtime.solver import solve
 from tests.runtime.benches import converted, ideal_path, scene
 
@@ -66,8 +66,8 @@ def lit_headset(*defects: str) -> VirtualHeadset:
     return headset
 
 
-def eye(headset: VirtualHeadset) -> Eye:
-    return Eye(headset.panel, headset.camera, View(SHAPE), 64.0)
+def eye(headset: VirtualHeadset) -> PanelAndCamera:
+    return PanelAndCamera(headset.panel, headset.camera, View(SHAPE), 64.0)
 
 
 @pytest.mark.parametrize(
@@ -170,7 +170,7 @@ def test_where_camera_and_model_agree_the_gradient_is_the_models(
 ) -> None:
     """The captured picture takes the place of the simulated one: given the simulated one, it is plain descent."""
     from runtime.lightpath.light_path import irradiance, irradiance_and_pullback, pixel_irradiance
-    from runtime.refinement.refine import STEP, _amplitude, _matched
+    from runtime.refinement.picture_refinement import STEP, _amplitude, _matched
 
     target = scene(SHAPE)[None]
     start = start + np.random.default_rng(0).normal(0, 0.5, start.shape).astype(np.float32)

@@ -21,11 +21,11 @@ import pytest
 from firmware_iface.virtual.served import Remote
 from runtime.cli import main
 from runtime.service import protocol
-from runtime.service.client import Client, Lost, RefusedError
+from runtime.service.client import Client, LostFrame, RefusedError
 from runtime.service.configuration import read_configuration
-from runtime.service.link import Link, Peer
-from runtime.service.messages import HEADER
-from runtime.service.protocol import Code, Lasers, Part, Shown
+from runtime.service.message_format import HEADER
+from runtime.service.protocol import Code, LaserState, PartState, Shown
+from runtime.service.socket_link import MessageLink, PeerCredentials
 from runtime.service.supervisor import Supervisor
 from tests.campaigns.headset import ENVIRONMENT, connected, hardware, picture, served, write_configuration
 
@@ -46,7 +46,7 @@ def headset(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Headset]:
 @pytest.fixture
 def client(headset: Headset) -> Iterator[Client]:
     with connected(headset.file) as client:
-        until(lambda: {client.status().panel, client.status().camera} == {Part.FRESH})
+        until(lambda: {client.status().panel, client.status().camera} == {PartState.FRESH})
         yield client
         client.dark()
 
@@ -66,9 +66,9 @@ def patiently(once: Callable[[], None]) -> None:
     return once()
 
 
-def show(client: Client, frames: int) -> list[Shown | Lost]:
+def show(client: Client, frames: int) -> list[Shown | LostFrame]:
     """What became of so many frames."""
-    outcomes: list[Shown | Lost] = []
+    outcomes: list[Shown | LostFrame] = []
     for k in range(frames):
         client.show(picture(client, k))
         outcomes += client.outcomes()
@@ -82,7 +82,7 @@ def light_up(client: Client, remote: Remote) -> None:
     end = time.monotonic() + 30
     while emitted_uw(remote) == 0:
         assert time.monotonic() < end, client.status()
-        if client.status().lasers in (Lasers.OFF, Lasers.FAULT):
+        if client.status().lasers in (LaserState.OFF, LaserState.FAULT):
             with suppress(RefusedError):
                 client.clear()
                 client.arm()
@@ -105,7 +105,7 @@ def test_every_frame_is_shown_and_what_the_panel_displays_is_what_was_solved(
 
 def test_light_needs_clear_and_arm_and_a_fresh_picture(headset: Headset, client: Client) -> None:
     show(client, 3)
-    assert emitted_uw(headset.remote) == 0 and client.status().lasers in (Lasers.OFF, Lasers.FAULT)
+    assert emitted_uw(headset.remote) == 0 and client.status().lasers in (LaserState.OFF, LaserState.FAULT)
     with pytest.raises(RefusedError, match="Clear first"):
         client.arm()
 
@@ -113,7 +113,7 @@ def test_light_needs_clear_and_arm_and_a_fresh_picture(headset: Headset, client:
         light_up(client, headset.remote)
         until(lambda: show(client, 1) and emitted_uw(headset.remote) == pytest.approx(50, rel=0.02), 5)
         until(lambda: emitted_uw(headset.remote) == 0, 3)  # nothing new is shown
-        until(lambda: client.status().lasers == Lasers.ARMED, 1)
+        until(lambda: client.status().lasers == LaserState.ARMED, 1)
         # nothing was wrong, so nobody has to clear and arm
         until(lambda: show(client, 2) and emitted_uw(headset.remote) > 0, 3)
 
@@ -137,7 +137,7 @@ def test_an_open_interlock_is_dark_and_latches(headset: Headset, client: Client)
     opened = headset.remote.set_to("interlock", False)
     assert emitted_uw(headset.remote) == 0
     assert all(at < opened + 0.02 for at, power in headset.remote.light(opened) if power)
-    until(lambda: client.status().lasers == Lasers.FAULT)
+    until(lambda: client.status().lasers == LaserState.FAULT)
     with pytest.raises(RefusedError, match="interlock"):
         client.clear()
     headset.remote.set_to("interlock", True)
@@ -153,10 +153,10 @@ def test_a_panel_that_is_unplugged_is_dark_and_comes_back_without_a_restart(
     headset.remote.break_part("panel", "unplug")
     until(lambda: emitted_uw(headset.remote) == 0, 3)
     lost = show(client, 3)
-    assert lost and all(isinstance(o, Lost) and o.code == Code.PANEL for o in lost)
-    until(lambda: client.status().panel == Part.LOST)
+    assert lost and all(isinstance(o, LostFrame) and o.code == Code.PANEL for o in lost)
+    until(lambda: client.status().panel == PartState.LOST)
     headset.remote.mend("panel")
-    until(lambda: client.status().panel == Part.FRESH)
+    until(lambda: client.status().panel == PartState.FRESH)
     light_up(client, headset.remote)
 
 
@@ -165,7 +165,7 @@ def test_a_killed_process_is_dark_and_is_started_again(headset: Headset, client:
     light_up(client, headset.remote)
     os.kill(child(client, name), signal.SIGKILL)
     until(lambda: emitted_uw(headset.remote) == 0, 3)
-    until(lambda: getattr(client.status(), name) == Part.FRESH)
+    until(lambda: getattr(client.status(), name) == PartState.FRESH)
     light_up(client, headset.remote)
 
 
@@ -187,7 +187,7 @@ def test_a_slot_that_is_written_after_end_is_not_shown(client: Client) -> None:
     client._taken[timing.frame] = 0
     client._ask(right, protocol.Done)
     [outcome] = client.outcomes(5)
-    assert isinstance(outcome, Lost) and outcome.code == Code.TORN
+    assert isinstance(outcome, LostFrame) and outcome.code == Code.TORN
 
 
 def test_one_program_has_the_display_and_others_may_look_and_darken(headset: Headset, client: Client) -> None:
@@ -311,7 +311,7 @@ def test_a_black_picture_is_dark_at_once_and_light_comes_back_without_arming(
         light_up(client, headset.remote)
         client.show(np.zeros(client.shape, np.uint16))
         until(lambda: list(client.outcomes(0.5)) is not None and emitted_uw(headset.remote) == 0, 0.4)
-        assert client.status().lasers == Lasers.ARMED
+        assert client.status().lasers == LaserState.ARMED
         until(lambda: show(client, 2) and emitted_uw(headset.remote) > 0, 5)
 
     patiently(once)
@@ -323,7 +323,7 @@ def test_frames_are_lit_by_all_lasers_when_the_light_of_each_pattern_is_predicte
     power = "power = { red = 1.0, green = 1.0, blue = 1.0 }\nmrad_per_pixel = 5.0"
     file.write_text(file.read_text().replace("power = { green = 0.5 }", power))
     with hardware(tmp_path) as remote, served(file), connected(file) as client:
-        until(lambda: client.status().panel == Part.FRESH and client.status().camera == Part.FRESH)
+        until(lambda: client.status().panel == PartState.FRESH and client.status().camera == PartState.FRESH)
 
         def once() -> None:
             light_up(client, remote)
@@ -335,7 +335,7 @@ def test_frames_are_lit_by_all_lasers_when_the_light_of_each_pattern_is_predicte
 def test_a_user_who_is_not_listed_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By the credentials that the kernel gives, before anything is read."""
     supervisor = Supervisor(read_configuration(write_configuration(tmp_path)))
-    monkeypatch.setattr(Link, "peer", lambda link: Peer(1, 12345, 12345))
+    monkeypatch.setattr(MessageLink, "peer", lambda link: PeerCredentials(1, 12345, 12345))
     with (
         socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener,
         socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as program,
@@ -343,10 +343,10 @@ def test_a_user_who_is_not_listed_is_refused(tmp_path: Path, monkeypatch: pytest
         listener.bind(str(tmp_path / "here"))
         listener.listen(1)
         program.connect(str(tmp_path / "here"))
-        supervisor._accept(listener)
+        supervisor.programs.accept(listener)
         _, error = protocol.PROTOCOL.unpack(program.recv(512))
         assert error.code == Code.REFUSED and "12345" in error.text
-        assert program.recv(512) == b"" and not supervisor.sessions
+        assert program.recv(512) == b"" and not supervisor.programs.sessions
 
 
 def test_the_lasers_are_switched_off_by_a_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -393,7 +393,11 @@ def test_sigterm_is_dark_first_and_tells_programs(tmp_path: Path) -> None:
             assert notify.recv(500).startswith(b"READY=1")
             assert notify.recv(500) == b"WATCHDOG=1"
             with connected(file) as client:
-                until(lambda: client.status().panel == Part.FRESH and client.status().camera == Part.FRESH)
+                until(
+                    lambda: (
+                        client.status().panel == PartState.FRESH and client.status().camera == PartState.FRESH
+                    )
+                )
                 light_up(client, remote)
                 client.show(picture(client))
                 process.send_signal(signal.SIGTERM)
@@ -407,7 +411,9 @@ def test_a_service_that_is_killed_is_dark_by_the_dead_man_and_can_be_started_aga
     file = write_configuration(tmp_path)
     with hardware(tmp_path) as remote:
         with served(file) as process, connected(file) as client:
-            until(lambda: client.status().panel == Part.FRESH and client.status().camera == Part.FRESH)
+            until(
+                lambda: client.status().panel == PartState.FRESH and client.status().camera == PartState.FRESH
+            )
             light_up(client, remote)
             killed = time.monotonic()
             process.kill()
@@ -415,7 +421,9 @@ def test_a_service_that_is_killed_is_dark_by_the_dead_man_and_can_be_started_aga
             until(lambda: emitted_uw(remote) == 0, 1)
             assert max(at for at, _ in remote.light(killed)) < killed + 0.15
         with served(file), connected(file) as client:
-            until(lambda: client.status().panel == Part.FRESH and client.status().camera == Part.FRESH)
+            until(
+                lambda: client.status().panel == PartState.FRESH and client.status().camera == PartState.FRESH
+            )
             light_up(client, remote)
 
 

@@ -13,7 +13,7 @@ import pytest
 from firmware_iface.errors import InputError
 from runtime.service.configuration import read_configuration
 from runtime.service.systemd import Notifier, passed_socket
-from runtime.service.units import write_units
+from runtime.service.systemd_units import write_units
 from tests.campaigns.headset import write_configuration
 
 

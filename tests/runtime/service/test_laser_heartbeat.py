@@ -11,8 +11,8 @@ import pytest
 
 from firmware_iface.errors import DeviceError, InputError
 from firmware_iface.lasers.eye_safety import SIZES_MRAD
-from runtime.service.lighting import Lighting
-from runtime.service.protocol import Lasers
+from runtime.service.laser_heartbeat import LaserHeartbeat
+from runtime.service.protocol import LaserState
 
 SHARES = tuple(0.02 + 0.001 * (k + 1) for k in range(len(SIZES_MRAD)))
 
@@ -88,7 +88,7 @@ class Bench:
     def __init__(self) -> None:
         self.board, self.faults = Board(), []
         self.solver_until = self.lit_until = time.monotonic_ns() + 10**12
-        self.lighting = Lighting(
+        self.lasers = LaserHeartbeat(
             self.board.open,
             {"green": 0.5},
             lambda: {"solver": self.solver_until},
@@ -98,7 +98,7 @@ class Bench:
 
     def ask(self, what: str) -> str | None:
         answers: list[str | None] = []
-        self.lighting.ask(what, answers.append)
+        self.lasers.ask(what, answers.append)
         until(lambda: answers)
         return answers[0]
 
@@ -110,9 +110,9 @@ class Bench:
 @pytest.fixture
 def bench() -> Iterator[Bench]:
     bench = Bench()
-    bench.lighting.start()
+    bench.lasers.start()
     yield bench
-    bench.lighting.stop()
+    bench.lasers.stop()
 
 
 def until(condition, within_s: float = 5.0) -> None:
@@ -132,7 +132,7 @@ def test_nothing_is_armed_without_clear_and_what_was_cleared_is_armed_once(bench
 def test_a_loop_without_a_sign_of_life_latches(bench: Bench) -> None:
     bench.light_up()
     bench.solver_until = 0
-    until(lambda: bench.lighting.state == Lasers.FAULT)
+    until(lambda: bench.lasers.state == LaserState.FAULT)
     assert bench.board.told[-1] == "trip" and bench.faults == ["silent"]
     assert bench.ask("clear") is None and "solver" in (bench.ask("arm") or "")
     bench.solver_until = time.monotonic_ns() + 10**12
@@ -143,7 +143,7 @@ def test_what_is_stale_is_not_lit_and_nothing_latches(bench: Bench) -> None:
     bench.light_up()
     bench.lit_until = 0
     until(lambda: bench.board.level == 0)
-    assert bench.lighting.state == Lasers.ARMED and bench.faults == []
+    assert bench.lasers.state == LaserState.ARMED and bench.faults == []
     bench.lit_until = time.monotonic_ns() + 10**12
     until(lambda: bench.board.level == 0.5)
 
@@ -153,7 +153,7 @@ def test_a_board_that_fails_is_not_lit_again_by_itself(bench: Bench, what: str) 
     bench.light_up()
     bench.board.fails = what
     bench.lit_until = 0
-    until(lambda: bench.lighting.state == Lasers.FAULT)
+    until(lambda: bench.lasers.state == LaserState.FAULT)
     bench.board.fails, bench.lit_until = "", time.monotonic_ns() + 10**12
     time.sleep(0.1)
     assert bench.board.level == 0 and bench.faults == ["lasers"]
@@ -164,36 +164,36 @@ def test_a_board_that_says_nothing_is_opened_again(bench: Bench) -> None:
     bench.light_up()
     bench.board.fails = "status"
     assert bench.ask("dark") is None  # it was told to go dark; that nothing is known of it then comes after
-    until(lambda: bench.lighting.state == Lasers.LOST)
+    until(lambda: bench.lasers.state == LaserState.LOST)
     bench.board.fails = ""
-    until(lambda: bench.lighting.state == Lasers.OFF)
+    until(lambda: bench.lasers.state == LaserState.OFF)
     bench.light_up()
 
 
 def test_a_pattern_waits_for_the_power_that_its_bright_spots_allow(bench: Bench) -> None:
     bench.light_up()
     shown: list[str] = []
-    bench.lighting.expect(struct.pack("<13f", *SHARES), lambda: shown.append("pattern"))
+    bench.lasers.expect(struct.pack("<13f", *SHARES), lambda: shown.append("pattern"))
     until(lambda: shown)
     assert bench.board.told[-1] == {"green": pytest.approx(SHARES)}
     told = len(bench.board.told)
-    bench.lighting.expect(bytes(52), lambda: shown.append("unpredicted"))
+    bench.lasers.expect(bytes(52), lambda: shown.append("unpredicted"))
     assert shown[-1] == "unpredicted" and len(bench.board.told) == told
 
 
 def test_power_that_a_bright_spot_lowered_comes_back_when_a_pattern_allows_it(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("runtime.service.lighting.RISE_AGAIN_S", 0.05)
+    monkeypatch.setattr("runtime.service.laser_heartbeat.RISE_AGAIN_S", 0.05)
     bench.light_up()
-    bench.lighting.expect(struct.pack("<13f", *(10 * s for s in SHARES)), lambda: None)
+    bench.lasers.expect(struct.pack("<13f", *(10 * s for s in SHARES)), lambda: None)
     until(lambda: "budget" in bench.faults)
-    assert bench.board.level == pytest.approx(0.2) and bench.lighting.state == Lasers.EMITTING
-    bench.lighting.expect(struct.pack("<13f", *SHARES), lambda: None)
+    assert bench.board.level == pytest.approx(0.2) and bench.lasers.state == LaserState.EMITTING
+    bench.lasers.expect(struct.pack("<13f", *SHARES), lambda: None)
     until(lambda: bench.board.level == 0.5)
 
 
 def test_the_end_is_dark(bench: Bench) -> None:
     bench.light_up()
-    bench.lighting.stop()
+    bench.lasers.stop()
     assert bench.board.told[-1] == "close" and bench.board.level == 0

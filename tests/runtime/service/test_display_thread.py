@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from firmware_iface.errors import DeviceError, DeviceGoneError
-from runtime.service.display import Clock, Display, Ready
+from runtime.service.display_thread import DisplayClock, DisplayPattern, DisplayThread
 
 PERIOD_NS = 5_000_000
 STALE_NS = 100_000_000
@@ -54,10 +54,10 @@ class Events:
         self.dropped_jobs: list[int] = []
         self.faults: list[str] = []
 
-    def shown(self, pattern: Ready, at_ns: int, transfer_s: float) -> None:
+    def shown(self, pattern: DisplayPattern, at_ns: int, transfer_s: float) -> None:
         self.shown_jobs.append(pattern.job)
 
-    def dropped(self, pattern: Ready, reason: str) -> None:
+    def dropped(self, pattern: DisplayPattern, reason: str) -> None:
         self.dropped_jobs.append(pattern.job)
 
     def panel_fault(self, error: Exception) -> None:
@@ -65,17 +65,17 @@ class Events:
 
 
 @pytest.fixture
-def running() -> Iterator[tuple[Panel, Display, Events]]:
+def running() -> Iterator[tuple[Panel, DisplayThread, Events]]:
     panel, events = Panel(), Events()
-    display = Display(panel.open, Clock(PERIOD_NS), STALE_NS, events)
+    display = DisplayThread(panel.open, DisplayClock(PERIOD_NS), STALE_NS, events)
     display.start()
     yield panel, display, events
     display.stop()
 
 
-def ready(job: int, in_ns: int, value: int | None = None, final: bool = True) -> Ready:
+def ready(job: int, in_ns: int, value: int | None = None, final: bool = True) -> DisplayPattern:
     gray = np.full((1, 2, 2), job if value is None else value, np.uint8)
-    return Ready(job, time.monotonic_ns() + in_ns, gray, 0, 30.0, final)
+    return DisplayPattern(job, time.monotonic_ns() + in_ns, gray, 0, 30.0, final)
 
 
 def until(condition, within_s: float = 5.0) -> None:
@@ -148,7 +148,7 @@ def test_light_is_allowed_for_the_stale_limit_only(running) -> None:
 
 @pytest.mark.parametrize("offset", [-3, 0, 1, 4_999_999, 5_000_000, 123_456_789])
 def test_the_clock_gives_the_first_display_time_that_is_not_before(offset: int) -> None:
-    clock = Clock(PERIOD_NS)
+    clock = DisplayClock(PERIOD_NS)
     tick = clock.after(clock.origin_ns + offset)
     assert (tick - clock.origin_ns) % PERIOD_NS == 0
     assert 0 <= tick - (clock.origin_ns + offset) < PERIOD_NS

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from firmware_iface.errors import InputError
-from runtime.service.ring import crc32, make_ring, open_ring, read_sealed, sealed_copy
+from runtime.service.shared_memory import crc32, make_ring, open_ring, read_sealed, sealed_copy
 
 SHAPE = (2, 3, 4)
 

@@ -1,12 +1,17 @@
 """Refinement of one picture while it is displayed: pattern and approximator follow what the camera captures.
 
-Every capture does two things. The captured picture y takes the place of the simulated one D(I) in the gradient of the
-pattern: the residual is the camera's, the derivatives are the model's (seed eq. 18 with D(|z|^2) measured). And D is
-drawn towards y through the exported gradients over its adapters, by Adam (Kingma and Ba 2015) in NumPy.
+Every capture does two things. The captured picture y replaces the simulated picture D(I) in the gradient of the
+pattern: the residual is the camera's, the derivatives are the model's (Chakravarthula et al. 2020, eq. 18, with
+D(|z|^2) measured). And D learns y through the exported gradients over its adapters, by Adam in NumPy.
 
-Every third capture is held out: the adapters never learn from it. When they predict the last of these worse than they
-did before, they are put back to where they predicted best, and the refinement stops. Of each colour the pattern that
-the camera liked best is the one that stays. The inputs are patterns and pictures; lasers are out of reach.
+Every third capture is held out: the adapters never learn from it. When they predict the latest held-out captures worse
+than before, they go back to the values that predicted best, and the refinement stops. For each colour, the pattern with
+the best capture is kept. The inputs are patterns and pictures; nothing here can change the lasers.
+
+References
+----------
+Chakravarthula et al. 2020, eq. 18: camera in the loop.
+Kingma and Ba 2015: Adam.
 """
 
 from __future__ import annotations
@@ -31,27 +36,43 @@ from runtime.networks.onnx_approximator import EPSILON, Approximator
 from runtime.solver import DriveRange, quality
 
 HOLD_OUT = 3  # every third capture, the first included
-KEPT = 3  # held-out captures that are judged by: the pattern moves on, and old ones with it
-LEARNING = 4  # steps of the adapters a capture
-RATE, FORGET, FORGET_SQUARES = 1e-3, 0.8, 0.95  # of Adam; short memories, since what is learned from changes
+KEPT = 3  # latest held-out captures that count: the pattern changes, and older captures no longer describe it
+LEARNING = 4  # steps of the adapters for each capture
+RATE, FORGET, FORGET_SQUARES = (
+    1e-3,
+    0.8,
+    0.95,
+)  # of Adam; with short memories, since the captures to learn from change
 STEP = 1.0  # of the Gauss-Newton step of the pattern
-WORSE_DB = 0.3  # below the best pattern: that one again, and half the step from there
-PATIENCE = 2  # held-out captures in a row that the adapters may predict worse than the best ones do
-RISE = 1e-3  # relative: less is no rise
+WORSE_DB = 0.3  # a pattern so far below the best: go back to the best, with half the step
+PATIENCE = 2  # held-out captures in succession that the adapters may predict worse than the best adapters do
+RISE = 1e-3  # relative; a smaller rise of the error does not count
 
-See = Callable[[np.ndarray], np.ndarray]
+ShowAndCapture = Callable[[np.ndarray], np.ndarray]
 Pullback = Callable[[np.ndarray], np.ndarray]
 Weights = Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True)
-class Step:
-    """What one capture came to; a line of the drift log.
+class RefinementStep:
+    """The result of one capture: a line of the drift log.
 
-    number: from 1 on. held_out: whether the adapters were kept from it. psnr_db: amplitude PSNR of the captured picture
-    against the target, mean over colours. predicted: error of D on this capture before it was learned from; heldout: on
-    the last held-out captures, when the newest of them was taken; both are mean squared differences of amplitude.
-    drift: change of the adapters since the export, over their size. stopped: why the refinement has ended, or none.
+    Attributes
+    ----------
+    number : int
+        From 1 on.
+    held_out : bool
+        The adapters did not learn from this capture.
+    psnr_db : float, dB
+        Amplitude PSNR of the captured picture against the target, mean over colours.
+    predicted : float
+        Error of D on this capture before it learned from it: mean squared difference of amplitude.
+    heldout : float
+        The same error on the latest held-out captures, when the newest of them was taken.
+    drift : float
+        Change of the adapters since the export, over their size.
+    stopped : str or None
+        Why the refinement has ended.
     """
 
     number: int
@@ -66,11 +87,31 @@ class Step:
 class Refinement:
     """The state of one picture's refinement.
 
-    paths: a light path a colour. target: irradiance to show, [C, H, W], any scale. phase: of the pattern to begin
-    with, rad, [C, H, W]. log: a text stream for one line of JSON a capture, or none. Raises InputError where the
-    approximator cannot be refined or sizes differ.
+    Parameters
+    ----------
+    paths : sequence of LightPath
+        A light path for each colour.
+    approximator : Approximator
+        The network D with adapters; its adapters are changed in place.
+    target : array [C, H, W]
+        Irradiance to show, of any scale.
+    phase : array [C, H, W], rad
+        Phase of the first pattern.
+    log : text stream or None
+        Gets one line of JSON for each capture.
 
-    Attributes: phase (of the pattern that is to be shown next), steps, stopped.
+    Attributes
+    ----------
+    phase : float32 array [C, H, W], rad
+        Phase of the pattern that is to be shown next.
+    steps : list of RefinementStep
+    stopped : str or None
+        Why the refinement has ended.
+
+    Raises
+    ------
+    InputError
+        Where the approximator cannot be refined or sizes differ.
     """
 
     def __init__(
@@ -94,7 +135,7 @@ class Refinement:
         self.paths, self.approximator, self.log = paths, approximator, log
         self.target = np.asarray(target, np.float32)
         self.drives = [DriveRange(path) for path in paths]
-        self.steps: list[Step] = []
+        self.steps: list[RefinementStep] = []
         self.stopped: str | None = None
         self._exported = _copied(approximator.adapters)
         self._first_phase = np.array(phase, np.float32)
@@ -102,7 +143,7 @@ class Refinement:
         self.rollback()
 
     def rollback(self) -> None:
-        """Back to the exported adapters and the first pattern, as if nothing had been captured; the log stays."""
+        """Go back to the exported adapters and the first pattern, as without any capture; keeps the log."""
         self._put(self._exported)
         self._best = _copied(self._exported)
         self._adam = _Adam(self._exported)
@@ -116,19 +157,27 @@ class Refinement:
 
     @property
     def gray(self) -> np.ndarray:
-        """The pattern to show: the next one to be tried, or after the end the best; uint8 [C, H, W]."""
+        """The pattern to show next, or after the end the best; uint8 [C, H, W]."""
         phase = self.best_phase if self.stopped else self.phase
         return np.stack([d.gray(p) for d, p in zip(self.drives, phase, strict=True)])
 
     @property
     def best_psnr_db(self) -> float:
-        """What the camera saw of the best pattern of each colour, mean over colours."""
+        """Amplitude PSNR of the best capture of each colour, dB, mean over colours."""
         return float(self._best_psnr.mean())
 
-    def take(self, captured: np.ndarray) -> Step:
-        """Learn from what the camera saw of `gray`, irradiance [C, H, W] of any scale, and choose the next pattern.
+    def take(self, captured: np.ndarray) -> RefinementStep:
+        """Learn from a capture of `gray` and choose the next pattern.
 
-        Raises InputError after the end, or for a picture of another size.
+        Parameters
+        ----------
+        captured : array [C, H, W]
+            Irradiance of the captured picture, of any scale.
+
+        Raises
+        ------
+        InputError
+            After the end, or for a picture of another size.
         """
         if self.stopped:
             raise InputError(f"the refinement has ended ({self.stopped}): roll it back to begin again")
@@ -138,22 +187,24 @@ class Refinement:
             )
         number, held = len(self.steps) + 1, len(self.steps) % HOLD_OUT == 0
         simulated, pullbacks = self._simulated(self.phase)
-        seen = self._scaled(simulated, np.maximum(captured, 0))
-        predicted = self._error(simulated, seen)
+        scaled = self._scaled(simulated, np.maximum(captured, 0))
+        predicted = self._error(simulated, scaled)
         if held:
-            self._held.append((simulated, seen))
-            self._heldout = self._watch()
+            self._held.append((simulated, scaled))
+            self._heldout = self._judge_adapters()
         else:
-            self._learn(simulated, seen)
+            self._learn(simulated, scaled)
         psnr = np.array(
             [quality(np.maximum(y, 0), t).psnr_db for y, t in zip(captured, self.target, strict=True)]
         )
         better, worse = psnr > self._best_psnr, psnr < self._best_psnr - WORSE_DB
         self.best_phase[better], self._best_psnr[better] = self.phase[better], psnr[better]
         self._step[worse] /= 2
-        moved = self._moved(simulated, seen, pullbacks)
+        moved = self._moved(simulated, scaled, pullbacks)
         self.phase = np.where(worse[:, None, None], self.best_phase, moved).astype(np.float32)
-        step = Step(number, held, float(psnr.mean()), predicted, self._heldout, self._drift(), self.stopped)
+        step = RefinementStep(
+            number, held, float(psnr.mean()), predicted, self._heldout, self._drift(), self.stopped
+        )
         self.steps.append(step)
         if self.log:
             self.log.write(json.dumps(asdict(step)) + "\n")
@@ -161,7 +212,7 @@ class Refinement:
         return step
 
     def _simulated(self, phase: np.ndarray) -> tuple[np.ndarray, list[Pullback]]:
-        """Irradiance of mean 1 on the panel's pixels, and the way from a gradient over it to a Gauss-Newton step."""
+        """Irradiance of mean 1 on the panel's pixels, and functions from a gradient over it to a Gauss-Newton step."""
         light, back = np.zeros_like(self.target), []
         for c, path in enumerate(self.paths):
             image, pullback = irradiance_and_pullback(path, phase[c])
@@ -171,26 +222,27 @@ class Refinement:
         return light, back
 
     def _scaled(self, simulated: np.ndarray, captured: np.ndarray) -> np.ndarray:
-        """A captured picture, each colour scaled to what D makes of the simulated one."""
-        self._look(simulated, captured)
+        """A captured picture, each colour scaled to D of the simulated picture."""
+        self._evaluate(simulated, captured)
         return np.stack([_matched(y, d) for y, d in zip(captured, self.approximator.corrected, strict=True)])
 
-    def _look(self, simulated: np.ndarray, target: np.ndarray) -> float:
+    def _evaluate(self, simulated: np.ndarray, target: np.ndarray) -> float:
+        """Run D and its gradients; returns the sum of squared differences of amplitude to a target."""
         self.approximator.irradiance[...] = simulated
         self.approximator.target[...] = target
         return self.approximator.look()
 
-    def _error(self, simulated: np.ndarray, seen: np.ndarray) -> float:
+    def _error(self, simulated: np.ndarray, scaled: np.ndarray) -> float:
         """Mean squared difference of amplitude between D of a simulated picture and the captured one."""
-        return self._look(simulated, seen) / seen.size
+        return self._evaluate(simulated, scaled) / scaled.size
 
-    def _learn(self, simulated: np.ndarray, seen: np.ndarray) -> None:
+    def _learn(self, simulated: np.ndarray, scaled: np.ndarray) -> None:
         for _ in range(LEARNING):
-            self._look(simulated, seen)
+            self._evaluate(simulated, scaled)
             self._adam.step(self.approximator.adapters, self.approximator.adapter_gradients())
 
-    def _watch(self) -> float:
-        """The held-out error; keeps the best adapters, and ends the refinement where it rises."""
+    def _judge_adapters(self) -> float:
+        """The held-out error; keeps the best adapters, and ends the refinement where the error rises."""
         now = self._held_error()
         current = _copied(self.approximator.adapters)
         self._put(self._best)
@@ -205,16 +257,16 @@ class Refinement:
         return now
 
     def _held_error(self) -> float:
-        return float(np.mean([self._error(simulated, seen) for simulated, seen in self._held]))
+        return float(np.mean([self._error(simulated, scaled) for simulated, scaled in self._held]))
 
-    def _moved(self, simulated: np.ndarray, seen: np.ndarray, pullbacks: list[Pullback]) -> np.ndarray:
-        """The next pattern: one step down the gradient with the captured picture in place of the simulated one."""
-        self._look(simulated, seen)
+    def _moved(self, simulated: np.ndarray, scaled: np.ndarray, pullbacks: list[Pullback]) -> np.ndarray:
+        """The next pattern: one step down the gradient, with the captured picture instead of the simulated one."""
+        self._evaluate(simulated, scaled)
         made = _amplitude(self.approximator.corrected)
-        wanted = np.stack([_matched(t, y) for t, y in zip(self.target, seen, strict=True)])
-        # The network subtracts a target from what it makes itself: this one leaves the camera's residual.
-        instead = np.maximum(made - _amplitude(seen) + _amplitude(wanted), 0) ** 2 - EPSILON
-        self._look(simulated, np.maximum(instead, 0))
+        wanted = np.stack([_matched(t, y) for t, y in zip(self.target, scaled, strict=True)])
+        # The network subtracts a target from its own output: with this target, the camera's residual remains.
+        instead = np.maximum(made - _amplitude(scaled) + _amplitude(wanted), 0) ** 2 - EPSILON
+        self._evaluate(simulated, np.maximum(instead, 0))
         moved = [
             drive.held(p - np.float32(length) * back(slope.copy()))
             for drive, p, length, back, slope in zip(
@@ -234,17 +286,23 @@ class Refinement:
         return math.sqrt(moved / size) if size > 0 else math.sqrt(moved)
 
 
-def refine(refinement: Refinement, see: See, captures: int) -> list[Step]:
-    """Show, capture and learn, at most so many times; ends with the best pattern shown. Returns the steps.
+def refine(refinement: Refinement, show_and_capture: ShowAndCapture, captures: int) -> list[RefinementStep]:
+    """Show, capture and learn; at the end the best pattern is shown.
 
-    see: shows gray levels [C, H, W] and returns what the camera saw of them, irradiance [C, H, W].
+    Parameters
+    ----------
+    refinement : Refinement
+    show_and_capture : callable
+        Shows gray levels [C, H, W] and returns the camera's picture of them, irradiance [C, H, W].
+    captures : int
+        Captures at most.
     """
     for _ in range(captures):
-        if refinement.take(see(refinement.gray)).stopped:
+        if refinement.take(show_and_capture(refinement.gray)).stopped:
             break
     else:
         refinement.stopped = "all captures are taken"
-    see(refinement.gray)
+    show_and_capture(refinement.gray)
     return refinement.steps
 
 
@@ -255,7 +313,7 @@ def _to_step(path: LightPath, pullback: Pullback) -> Pullback:
 
 
 class _Adam:
-    """Moments of gradients, and steps from them."""
+    """Adam's moments of the gradients, and its steps (Kingma and Ba 2015)."""
 
     def __init__(self, weights: Weights) -> None:
         self.mean = {n: np.zeros_like(w) for n, w in weights.items()}
@@ -284,6 +342,6 @@ def _amplitude(light: np.ndarray) -> np.ndarray:
 
 def _matched(light: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """Light [H, W] scaled so that its amplitude is nearest to that of a reference."""
-    root, wanted = np.sqrt(light), np.sqrt(np.maximum(reference, 0))
-    scale = float(np.vdot(root, wanted)) / max(float(np.vdot(root, root)), 1e-30)
+    root, reference_root = np.sqrt(light), np.sqrt(np.maximum(reference, 0))
+    scale = float(np.vdot(root, reference_root)) / max(float(np.vdot(root, root)), 1e-30)
     return light * np.float32(scale**2)

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from runtime.service import inside, protocol
-from runtime.service.messages import LARGEST, ProtocolError, Vocabulary, formats
+from runtime.service import process_messages, protocol
+from runtime.service.message_format import LARGEST, ProtocolError, Vocabulary, formats
 from runtime.service.protocol import PROTOCOL
 
 HEADER_FILE = Path(protocol.__file__).with_name("hololoop_service.h")
-VOCABULARIES = (PROTOCOL, inside.SOLVER, inside.CAMERA)
+VOCABULARIES = (PROTOCOL, process_messages.SOLVER, process_messages.CAMERA)
 VALUES = {
     "H": st.integers(0, 2**16 - 1),
     "I": st.integers(0, 2**32 - 1),
@@ -103,9 +103,9 @@ def test_the_c_header_has_the_same_bytes(tmp_path: Path) -> None:
         lines.append(
             f'_Static_assert(HOLOLOOP_{in_c.get(code.name, code.name)} == {code.value}, "{code.name}");'
         )
-    for state in protocol.Lasers:
+    for state in protocol.LaserState:
         lines.append(f'_Static_assert(HOLOLOOP_LASERS_{state.name} == {state.value}, "{state.name}");')
-    for part in protocol.Part:
+    for part in protocol.PartState:
         lines.append(f'_Static_assert(HOLOLOOP_{part.name} == {part.value}, "{part.name}");')
     source = tmp_path / "check.c"
     source.write_text(

@@ -16,7 +16,7 @@ import pytest
 from firmware_iface.virtual.served import Remote
 from runtime.bundle.bundle_folder import read_bundle, write_bundle
 from runtime.service.client import Client, RefusedError
-from runtime.service.protocol import Code, Lasers, Part, Shown
+from runtime.service.protocol import Code, LaserState, PartState, Shown
 from tests.campaigns.headset import SHAPE, connected, hardware, picture, served, write_configuration
 
 DEFECT = """
@@ -54,9 +54,9 @@ def headset(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Headset]:
 def client(headset: Headset) -> Iterator[Client]:
     with connected(headset.file) as client:
         end = time.monotonic() + 15
-        while {client.status().panel, client.status().camera} != {Part.FRESH}:
+        while {client.status().panel, client.status().camera} != {PartState.FRESH}:
             assert time.monotonic() < end
-        while client.status().lasers != Lasers.EMITTING:
+        while client.status().lasers != LaserState.EMITTING:
             assert time.monotonic() < end + 15
             keep_lit(client)
             display(client, 3)
@@ -66,7 +66,7 @@ def client(headset: Headset) -> Iterator[Client]:
 
 def keep_lit(client: Client) -> None:
     """Arm again where a busy machine has let something go stale."""
-    if client.status().lasers in (Lasers.OFF, Lasers.FAULT):
+    if client.status().lasers in (LaserState.OFF, LaserState.FAULT):
         with suppress(RefusedError):
             client.clear()
             client.arm()
@@ -136,7 +136,7 @@ def test_it_ends_with_the_solver_and_begins_again(headset: Headset, client: Clie
     wait_for_the_end(client)
     assert client.refined is not None and "the solver had it" in client.refined.text
     end = time.monotonic() + 15
-    while client.status().solver != Part.FRESH:
+    while client.status().solver != PartState.FRESH:
         assert time.monotonic() < end
     client.refine(1000)
     display(client, 10)
