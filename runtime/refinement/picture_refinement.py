@@ -2,24 +2,21 @@
 
 Every capture does two things. The captured picture y replaces the simulated picture D(I) in the gradient of the
 pattern: the residual is the camera's, the derivatives are the model's (Chakravarthula et al. 2020, eq. 18, with
-D(|z|^2) measured). And D learns y through the exported gradients over its adapters, by Adam in NumPy.
+D(|z|^2) measured). And D learns y (adapter_learning).
 
-Every third capture is held out: the adapters never learn from it. When they predict the latest held-out captures worse
-than before, they go back to the values that predicted best, and the refinement stops. For each colour, the pattern with
-the best capture is kept. The inputs are patterns and pictures; nothing here can change the lasers.
+Every third capture is held out: D never learns from it. When D predicts the latest held-out captures worse than before,
+the refinement stops. For each colour, the pattern with the best capture is kept. The inputs are
+patterns and pictures; nothing here can change the lasers.
 
 References
 ----------
-Chakravarthula et al. 2020, eq. 18: camera in the loop.
-Kingma and Ba 2015: Adam.
+Chakravarthula et al. 2020, eq. 18.
 """
 
 from __future__ import annotations
 
 import json
-import math
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import IO
 
@@ -33,24 +30,15 @@ from runtime.lightpath.light_path import (
     pixel_irradiance_adjoint,
 )
 from runtime.networks.onnx_approximator import EPSILON, Approximator
+from runtime.refinement.adapter_learning import AdapterLearning
 from runtime.solver import DriveRange, quality
 
 HOLD_OUT = 3  # every third capture, the first included
-KEPT = 3  # latest held-out captures that count: the pattern changes, and older captures no longer describe it
-LEARNING = 4  # steps of the adapters for each capture
-RATE, FORGET, FORGET_SQUARES = (
-    1e-3,
-    0.8,
-    0.95,
-)  # of Adam; with short memories, since the captures to learn from change
 STEP = 1.0  # of the Gauss-Newton step of the pattern
 WORSE_DB = 0.3  # a pattern so far below the best: go back to the best, with half the step
-PATIENCE = 2  # held-out captures in succession that the adapters may predict worse than the best adapters do
-RISE = 1e-3  # relative; a smaller rise of the error does not count
 
 ShowAndCapture = Callable[[np.ndarray], np.ndarray]
 Pullback = Callable[[np.ndarray], np.ndarray]
-Weights = Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -137,19 +125,13 @@ class Refinement:
         self.drives = [DriveRange(path) for path in paths]
         self.steps: list[RefinementStep] = []
         self.stopped: str | None = None
-        self._exported = _copied(approximator.adapters)
+        self._learning = AdapterLearning(approximator)
         self._first_phase = np.array(phase, np.float32)
-        self._held: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=KEPT)
         self.rollback()
 
     def rollback(self) -> None:
         """Go back to the exported adapters and the first pattern, as without any capture; keeps the log."""
-        self._put(self._exported)
-        self._best = _copied(self._exported)
-        self._adam = _Adam(self._exported)
-        self._held.clear()
-        self._heldout = math.inf
-        self._rises = 0
+        self._learning.reset()
         self.phase = self._first_phase.copy()
         self.best_phase = self.phase.copy()
         self._best_psnr, self._step = np.full(len(self.paths), -np.inf), np.full(len(self.paths), STEP)
@@ -188,12 +170,12 @@ class Refinement:
         number, held = len(self.steps) + 1, len(self.steps) % HOLD_OUT == 0
         simulated, pullbacks = self._simulated(self.phase)
         scaled = self._scaled(simulated, np.maximum(captured, 0))
-        predicted = self._error(simulated, scaled)
+        predicted = self._learning.error(simulated, scaled)
         if held:
-            self._held.append((simulated, scaled))
-            self._heldout = self._judge_adapters()
+            if self._learning.judge(simulated, scaled):
+                self.stopped = "the held-out error rises"
         else:
-            self._learn(simulated, scaled)
+            self._learning.learn(simulated, scaled)
         psnr = np.array(
             [quality(np.maximum(y, 0), t).psnr_db for y, t in zip(captured, self.target, strict=True)]
         )
@@ -202,9 +184,8 @@ class Refinement:
         self._step[worse] /= 2
         moved = self._moved(simulated, scaled, pullbacks)
         self.phase = np.where(worse[:, None, None], self.best_phase, moved).astype(np.float32)
-        step = RefinementStep(
-            number, held, float(psnr.mean()), predicted, self._heldout, self._drift(), self.stopped
-        )
+        heldout, drift = self._learning.heldout_error, self._learning.drift
+        step = RefinementStep(number, held, float(psnr.mean()), predicted, heldout, drift, self.stopped)
         self.steps.append(step)
         if self.log:
             self.log.write(json.dumps(asdict(step)) + "\n")
@@ -223,50 +204,17 @@ class Refinement:
 
     def _scaled(self, simulated: np.ndarray, captured: np.ndarray) -> np.ndarray:
         """A captured picture, each colour scaled to D of the simulated picture."""
-        self._evaluate(simulated, captured)
+        self._learning.evaluate(simulated, captured)
         return np.stack([_matched(y, d) for y, d in zip(captured, self.approximator.corrected, strict=True)])
-
-    def _evaluate(self, simulated: np.ndarray, target: np.ndarray) -> float:
-        """Run D and its gradients; returns the sum of squared differences of amplitude to a target."""
-        self.approximator.irradiance[...] = simulated
-        self.approximator.target[...] = target
-        return self.approximator.look()
-
-    def _error(self, simulated: np.ndarray, scaled: np.ndarray) -> float:
-        """Mean squared difference of amplitude between D of a simulated picture and the captured one."""
-        return self._evaluate(simulated, scaled) / scaled.size
-
-    def _learn(self, simulated: np.ndarray, scaled: np.ndarray) -> None:
-        for _ in range(LEARNING):
-            self._evaluate(simulated, scaled)
-            self._adam.step(self.approximator.adapters, self.approximator.adapter_gradients())
-
-    def _judge_adapters(self) -> float:
-        """The held-out error; keeps the best adapters, and ends the refinement where the error rises."""
-        now = self._held_error()
-        current = _copied(self.approximator.adapters)
-        self._put(self._best)
-        best = self._held_error()
-        if now <= best:
-            self._best = current
-        self._rises = self._rises + 1 if now > best * (1 + RISE) else 0
-        if self._rises >= PATIENCE:
-            self.stopped = "the held-out error rises"
-            return best
-        self._put(current)
-        return now
-
-    def _held_error(self) -> float:
-        return float(np.mean([self._error(simulated, scaled) for simulated, scaled in self._held]))
 
     def _moved(self, simulated: np.ndarray, scaled: np.ndarray, pullbacks: list[Pullback]) -> np.ndarray:
         """The next pattern: one step down the gradient, with the captured picture instead of the simulated one."""
-        self._evaluate(simulated, scaled)
+        self._learning.evaluate(simulated, scaled)
         made = _amplitude(self.approximator.corrected)
         wanted = np.stack([_matched(t, y) for t, y in zip(self.target, scaled, strict=True)])
         # The network subtracts a target from its own output: with this target, the camera's residual remains.
         instead = np.maximum(made - _amplitude(scaled) + _amplitude(wanted), 0) ** 2 - EPSILON
-        self._evaluate(simulated, np.maximum(instead, 0))
+        self._learning.evaluate(simulated, np.maximum(instead, 0))
         moved = [
             drive.held(p - np.float32(length) * back(slope.copy()))
             for drive, p, length, back, slope in zip(
@@ -274,16 +222,6 @@ class Refinement:
             )
         ]
         return np.stack(moved)
-
-    def _put(self, weights: Weights) -> None:
-        for name, weight in weights.items():
-            self.approximator.adapters[name][...] = weight
-
-    def _drift(self) -> float:
-        adapters = self.approximator.adapters
-        moved = sum(float(((adapters[n] - w) ** 2).sum()) for n, w in self._exported.items())
-        size = sum(float((w**2).sum()) for w in self._exported.values())
-        return math.sqrt(moved / size) if size > 0 else math.sqrt(moved)
 
 
 def refine(refinement: Refinement, show_and_capture: ShowAndCapture, captures: int) -> list[RefinementStep]:
@@ -310,30 +248,6 @@ def _to_step(path: LightPath, pullback: Pullback) -> Pullback:
     """From a gradient over pixels of mean irradiance 1 to the step over phase, for a path that loses no light."""
     power = float(np.mean(np.abs(path.source) ** 2))
     return lambda slope: pullback(pixel_irradiance_adjoint(path, slope)) / power
-
-
-class _Adam:
-    """Adam's moments of the gradients, and its steps (Kingma and Ba 2015)."""
-
-    def __init__(self, weights: Weights) -> None:
-        self.mean = {n: np.zeros_like(w) for n, w in weights.items()}
-        self.square = {n: np.zeros_like(w) for n, w in weights.items()}
-        self.count = 0
-
-    def step(self, weights: Weights, gradients: Weights) -> None:
-        """Change weights in place."""
-        self.count += 1
-        for name, weight in weights.items():
-            gradient = gradients[name]
-            self.mean[name] += (1 - FORGET) * (gradient - self.mean[name])
-            self.square[name] += (1 - FORGET_SQUARES) * (gradient**2 - self.square[name])
-            mean = self.mean[name] / (1 - FORGET**self.count)
-            square = self.square[name] / (1 - FORGET_SQUARES**self.count)
-            weight -= RATE * mean / (np.sqrt(square) + 1e-12)
-
-
-def _copied(weights: Weights) -> dict[str, np.ndarray]:
-    return {name: weight.copy() for name, weight in weights.items()}
 
 
 def _amplitude(light: np.ndarray) -> np.ndarray:

@@ -26,33 +26,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from firmware_iface.errors import InputError
-from runtime.service.protocol import (
-    HIGHEST,
-    LOWEST,
-    MAGIC,
-    PROTOCOL,
-    Arm,
-    Begin,
-    Capture,
-    Clear,
-    Code,
-    Dark,
-    Done,
-    End,
-    Error,
-    Hello,
-    Refine,
-    Refined,
-    Shown,
-    State,
-    Status,
-    Timing,
-    Wait,
-    Welcome,
-)
-from runtime.service.protocol import (
-    Ring as RingMessage,
-)
+from runtime.service import protocol
+from runtime.service.protocol import PROTOCOL, Code, Done, Error, Refined, Shown, State, Timing, Welcome
 from runtime.service.shared_memory import Ring, crc32, make_ring, read_sealed
 from runtime.service.socket_link import MessageLink
 
@@ -122,7 +97,7 @@ class Client:
 
     def status(self) -> State:
         """The state of the headset."""
-        return self._ask(Status(), State)[0]
+        return self._ask(protocol.Status(), State)[0]
 
     def clear(self) -> None:
         """First step to light: forget a latched fault.
@@ -132,7 +107,7 @@ class Client:
         RefusedError
             While the cause of the fault remains.
         """
-        self._ask(Clear(), Done)
+        self._ask(protocol.Clear(), Done)
 
     def arm(self) -> None:
         """Second step to light.
@@ -142,15 +117,15 @@ class Client:
         RefusedError
             Without `clear` before it.
         """
-        self._ask(Arm(), Done)
+        self._ask(protocol.Arm(), Done)
 
     def dark(self) -> None:
         """Switch the lasers off at once, until `clear` and `arm`."""
-        self._ask(Dark(), Done)
+        self._ask(protocol.Dark(), Done)
 
     def capture(self) -> np.ndarray:
         """A picture from the camera whose exposure began after this call: counts, uint16 [h, w]."""
-        picture, fd = self._ask(Capture(), None)
+        picture, fd = self._ask(protocol.Capture(), None)
         return read_sealed(fd, (picture.height, picture.width), np.uint16)
 
     def refine(self, captures: int = 24) -> None:
@@ -163,18 +138,18 @@ class Client:
         captures : int
             Captures at most; 0 ends a refinement and goes back to the solver's own pattern.
         """
-        self._ask(Refine(captures), Done)
+        self._ask(protocol.Refine(captures), Done)
         self.refined = None
 
     def wait(self) -> Timing:
         """The next frame, once it may begin."""
         if self._ring is None:
             self._open_ring()
-        return self._ask(Wait(), Timing)[0]
+        return self._ask(protocol.Wait(), Timing)[0]
 
     def begin(self, timing: Timing) -> None:
         """Drawing of the frame begins."""
-        self._ask(Begin(timing.frame), Done)
+        self._ask(protocol.Begin(timing.frame), Done)
 
     def slot(self) -> np.ndarray:
         """The array for the picture of the frame that was begun; waits for a free slot.
@@ -207,7 +182,7 @@ class Client:
         assert self._drawing is not None
         self._taken[timing.frame] = self._drawing
         try:
-            self._ask(End(timing.frame, self._drawing, crc32(slot)), Done)
+            self._ask(protocol.End(timing.frame, self._drawing, crc32(slot)), Done)
         except BaseException:
             self._taken.pop(timing.frame, None)
             raise
@@ -238,7 +213,7 @@ class Client:
 
     def _open_ring(self) -> None:
         ring = make_ring(self.slots, self.shape, np.uint16)
-        self._ask(RingMessage(self.slots, ring.slots[0].nbytes), Done, [ring.fd])
+        self._ask(protocol.Ring(self.slots, ring.slots[0].nbytes), Done, [ring.fd])
         self._ring = ring
 
     def _ask(self, message: NamedTuple, answer: type | None, fds: list[int] | None = None) -> tuple[Any, Any]:
@@ -310,7 +285,7 @@ def connect(path: str | os.PathLike[str], slots: int = 3, timeout_s: float = 5.0
                 f"there is no service at {path} ({error.strerror}): start hololoop-runtime serve"
             ) from None
         client = Client(MessageLink(connection, PROTOCOL), Welcome(0, 0, 0, 0, 0, 0, 0), slots, timeout_s)
-        welcome, _ = client._ask(Hello(MAGIC, LOWEST, HIGHEST), Welcome)
+        welcome, _ = client._ask(protocol.Hello(protocol.MAGIC, protocol.LOWEST, protocol.HIGHEST), Welcome)
         return Client(client._link, welcome, slots, timeout_s)
     except BaseException:
         connection.close()
