@@ -31,8 +31,8 @@ Weights = Mapping[str, np.ndarray]
 class AdapterLearning:
     """The state of the adapters while they learn.
 
-    In all methods, `simulated` is the irradiance [C, H, W] of the model without D, and `captured` is the camera's picture
-    of the same pattern, scaled to D of `simulated`.
+    In all methods, `simulated` is the irradiance [C, H, W] of the model without D, and `captured` is a picture of the
+    same pattern, scaled to D of `simulated`.
 
     Parameters
     ----------

@@ -150,7 +150,7 @@ class DisplayThread(threading.Thread):
         while not self._stopping.is_set():
             self.turned_ns = time.monotonic_ns()
             if self._panel is None and not self._opened():
-                self._drop_stale(time.monotonic_ns(), "the panel is gone")
+                self._drop_stale(time.monotonic_ns(), "the panel is disconnected")
                 self._stopping.wait(AGAIN_S)
                 continue
             tick = self._clock.after(time.monotonic_ns() + self.transfer_ns + WAKE_NS)

@@ -110,7 +110,7 @@ class Session:
         if self.version is None:
             raise RequestError(
                 Code.VERSION,
-                f"the program speaks versions {message.lowest} to {message.highest} and the service "
+                f"the program supports versions {message.lowest} to {message.highest} and the service "
                 f"{protocol.LOWEST} to {protocol.HIGHEST}: use a client library of the service's release",
             )
 

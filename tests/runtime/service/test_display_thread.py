@@ -1,4 +1,4 @@
-"""The panel's thread: order, tries again, staleness, a panel that goes and comes back."""
+"""The panel's thread: order, retries, staleness, a panel that is disconnected and connected again."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ STALE_NS = 100_000_000
 
 
 class Panel:
-    """Notes what it is shown; fails as it is told."""
+    """Records what it is shown; fails as the test sets it."""
 
     def __init__(self) -> None:
-        self.seen: list[int] = []
+        self.shown: list[int] = []
         self.failures: list[Exception] = []
-        self.there = True
+        self.connected = True
         self.opened = 0
 
     def open(self) -> Panel:
-        if not self.there:
+        if not self.connected:
             raise DeviceGoneError("unplugged")
         self.opened += 1
         return self
 
     def show(self, gray: np.ndarray) -> None:
         self._fail()
-        self.seen.append(int(gray[0, 0]))
+        self.shown.append(int(gray[0, 0]))
 
     def status(self) -> dict:
         self._fail()
@@ -42,7 +42,7 @@ class Panel:
         pass
 
     def _fail(self) -> None:
-        if not self.there:
+        if not self.connected:
             raise DeviceGoneError("unplugged")
         if self.failures:
             raise self.failures.pop()
@@ -92,7 +92,7 @@ def test_patterns_are_shown_in_order_and_not_before_their_time(running) -> None:
     display.put(ready(1, 3 * PERIOD_NS))
     until(lambda: events.shown_jobs == [1, 2])
     assert time.monotonic_ns() > late.display_ns - PERIOD_NS
-    assert panel.seen == [1, 2] and not events.dropped_jobs
+    assert panel.shown == [1, 2] and not events.dropped_jobs
 
 
 def test_the_best_pattern_by_the_display_time_is_shown(running) -> None:
@@ -100,10 +100,10 @@ def test_the_best_pattern_by_the_display_time_is_shown(running) -> None:
     display.put(ready(1, 4 * PERIOD_NS, value=7, final=False))
     display.put(ready(1, 4 * PERIOD_NS, value=9))
     until(lambda: events.shown_jobs == [1])
-    assert panel.seen == [9]
+    assert panel.shown == [9]
 
 
-def test_what_the_panel_did_not_take_is_tried_again(running) -> None:
+def test_a_pattern_that_the_panel_did_not_accept_is_tried_again(running) -> None:
     panel, display, events = running
     panel.failures = [DeviceError("short"), DeviceError("garbage")]
     display.put(ready(1, 0))
@@ -115,16 +115,16 @@ def test_a_stale_pattern_is_dropped_and_not_shown(running) -> None:
     panel, display, events = running
     display.put(ready(1, -2 * STALE_NS))
     until(lambda: events.dropped_jobs == [1])
-    assert panel.seen == [] and display.lit_until_ns == 0
+    assert panel.shown == [] and display.lit_until_ns == 0
 
 
 def test_a_panel_that_comes_back_shows_again_and_meanwhile_frames_are_dropped(running) -> None:
     panel, display, events = running
-    panel.there = False
+    panel.connected = False
     display.put(ready(1, PERIOD_NS))
     until(lambda: events.dropped_jobs == [1] and not display.open)
     answered = display.answered_ns
-    panel.there = True
+    panel.connected = True
     until(lambda: display.open)
     display.put(ready(2, PERIOD_NS))
     until(lambda: events.shown_jobs == [2])

@@ -1,4 +1,4 @@
-"""Metrics: every name that monitoring relies on is there from the start, and counts what happens."""
+"""Metrics: every name that monitoring relies on exists from the start, and counts the events."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_what_happened_is_read_over_http(capsys: pytest.CaptureFixture[str]) -> 
     found = scraped(metrics)
     assert found["hololoop_frames_shown_total",] == 1 and found["hololoop_frames_late_total",] == 0
     assert found["hololoop_faults_total", "panel"] == faults.count == 3
-    assert capsys.readouterr().err == "panel: unplugged\n"  # said once
+    assert capsys.readouterr().err == "panel: unplugged\n"  # written once
     states = {state: found["hololoop_laser_state", state.name.lower()] for state in LaserState}
     assert states == {state: float(state is LaserState.FAULT) for state in LaserState}
     assert found["hololoop_laser_power", "green"] == 0.5
@@ -51,7 +51,7 @@ def test_what_happened_is_read_over_http(capsys: pytest.CaptureFixture[str]) -> 
     assert found["hololoop_frame_stage_seconds_bucket", "0.004", "solve"] == 1
 
 
-def test_a_port_that_is_taken_is_a_sentence() -> None:
+def test_a_port_that_is_taken_is_an_error() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
