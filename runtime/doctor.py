@@ -155,25 +155,29 @@ def _camera_library() -> Finding:
 
 def _service(configuration: Configuration) -> Finding | None:
     from runtime.service.client import connect
-    from runtime.service.protocol import Lasers, Part
+    from runtime.service.protocol import LaserState, PartState
 
     try:
         with connect(configuration.socket, timeout_s=2.0) as client:
             state = client.status()
     except (InputError, OSError):
         return None
-    parts = {"panel": Part(state.panel), "solver": Part(state.solver), "camera": Part(state.camera)}
+    parts = {
+        "panel": PartState(state.panel),
+        "solver": PartState(state.solver),
+        "camera": PartState(state.camera),
+    }
     problems = [
         f"the service has no sign of life of the {name} ({part.name.lower()}): its log says why"
         for name, part in parts.items()
-        if part not in (Part.FRESH, Part.ABSENT)
+        if part not in (PartState.FRESH, PartState.ABSENT)
     ]
-    if state.lasers in (Lasers.FAULT, Lasers.LOST):
+    if state.lasers in (LaserState.FAULT, LaserState.LOST):
         problems.append(
-            f"lasers: {Lasers(state.lasers).name.lower()}; find the cause in the log, clear and arm"
+            f"lasers: {LaserState(state.lasers).name.lower()}; find the cause in the log, clear and arm"
         )
     status: dict[str, Any] = {name: part.name.lower() for name, part in parts.items()}
-    status |= {"lasers": Lasers(state.lasers).name.lower(), "shown": state.shown, "late": state.late}
+    status |= {"lasers": LaserState(state.lasers).name.lower(), "shown": state.shown, "late": state.late}
     status |= {"failed": state.failed, "faults": state.faults}
     return Finding("service", f"the service at {configuration.socket}", status=status, problems=problems)
 

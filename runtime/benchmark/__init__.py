@@ -1,1 +1,1 @@
-"""What the solver does on this machine: `hololoop-runtime benchmark`."""
+"""The measurement of the solver on this machine: `hololoop-runtime benchmark`."""

@@ -28,7 +28,7 @@ def run(args: Namespace) -> dict[str, Any]:
 
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("benchmark", total=1.0)
-        return measure(told=lambda done, what: bar.update(task, completed=done, description=what))
+        return measure(progress=lambda done, what: bar.update(task, completed=done, description=what))
 
 
 def show(result: dict[str, Any]) -> None:

@@ -1,8 +1,8 @@
-"""The solver measured in one run: convergence, time against the transforms alone, deadlines, video, memory.
+"""Measurement of the solver in one run: convergence, time against the transforms alone, deadlines, video, memory.
 
 Geometry: 520 nm, 8 um pitch, 200 mm, an iris of half the panel's band, so that irradiance needs no finer grid than
-the panel's. Pictures are scikit-image's. PSNR is of amplitude; by iteration and by time on the solver's own grid,
-and for what each solver ends with also through the whole light path on the fine grid, after rounding ("final").
+the panel's. Pictures are scikit-image's. PSNR is of amplitude, by iteration and by time on the solver's own grid. For
+the final pattern of each solver it is also through the whole light path on the fine grid, after rounding ("final").
 """
 
 from __future__ import annotations
@@ -41,32 +41,50 @@ SOLVERS: dict[str, tuple[str, dict[str, Any], int]] = {
 }
 LEVELS_DB = (25.0, 27.5, 30.0, 32.5, 35.0, 37.5, 40.0)
 ROUNDS = 15
-FRAMES, STEP = 8, (1, 3)  # of the video, and pixels a frame
+FRAMES, STEP = 8, (1, 3)  # of the video, and pixels that it moves from frame to frame
 BORDER = 100  # of the panel's height at 1080 rows: left out of the video's region
 
-Told = Callable[[float, str], None]
+Progress = Callable[
+    [float, str], None
+]  # takes the share that is done, 0 to 1, and the name of what is measured
 
 
 def measure(
-    shapes: Sequence[tuple[int, int]] = SHAPES, solves: int = 40, told: Told = lambda done, what: None
+    shapes: Sequence[tuple[int, int]] = SHAPES, solves: int = 40, progress: Progress = lambda done, what: None
 ) -> dict[str, Any]:
-    """Everything that `benchmark --json` prints; the first of the shapes is the one most is said of."""
-    told(0, "preparing")
+    """Everything that `benchmark --json` prints.
+
+    Parameters
+    ----------
+    shapes : sequence of (int, int)
+        Panel sizes; only the first is measured in full.
+    solves : int
+        Solves by a deadline.
+    progress : callable
+        Takes the share that is done, 0 to 1, and the name of what is measured.
+
+    Returns
+    -------
+    dict
+        Keys `machine`, `grid`, `fft_floor_ms`, `iteration_ms`, `psnr_by_iteration`, `latency_ms`, `video`, `scaling`
+        and more.
+    """
+    progress(0, "preparing")
     path = _path(shapes[0])
     pictures = {name: picture(name, shapes[0]) for name in PICTURES}
     first = next(iter(pictures.values()))
     solver = Solver(path)
     solver.rehearse(first)
-    floor, parts, iteration = _against_ffts(solver, first)
+    floor, pruned, iteration = _against_ffts(solver, first)
     cold = _median(lambda: solver.solve(first, 0))
-    told(0.1, "convergence")
-    curves, final, pace = _convergence(path, pictures, lambda done, what: told(0.1 + 0.6 * done, what))
-    told(0.7, "deadlines")
+    progress(0.1, "convergence")
+    curves, final, pace = _convergence(path, pictures, lambda done, what: progress(0.1 + 0.6 * done, what))
+    progress(0.7, "deadlines")
     deadline = solver.begin.usual + 5.5 * solver.step.usual + solver.finish.usual
     took = [solver.solve(first, deadline_ms=deadline).milliseconds for _ in range(solves)]
-    told(0.8, "video")
+    progress(0.8, "video")
     video = _video(path)
-    told(0.9, "sizes")
+    progress(0.9, "sizes")
     scaling = [{"pixels": int(np.prod(shapes[0])), "iteration_ms": _ms(iteration)}]
     for shape in shapes[1:]:
         smaller = Solver(_path(shape))
@@ -74,15 +92,15 @@ def measure(
         *_, each = _against_ffts(smaller, picture(PICTURES[0], shape))
         scaling.append({"pixels": int(np.prod(shape)), "iteration_ms": _ms(each)})
     by_ms = {name: _by_ms(curves[name], *pace[name]) for name in curves}
-    told(1, "done")
+    progress(1, "done")
     return {
         "machine": machine(),
         "grid": {"panel": list(shapes[0]), "padded": list(path.grid.padded), "iris": IRIS},
         "fft_floor_ms": _ms(floor),
         "iteration_ms": _ms(iteration),
         "iteration_over_floor": round(iteration / floor, 3),
-        "pruned_fft_ms": _ms(parts),
-        "iteration_over_pruned_fft": round(iteration / parts, 3),
+        "pruned_fft_ms": _ms(pruned),
+        "iteration_over_pruned_fft": round(iteration / pruned, 3),
         "cold_start_over_iteration": round(cold / iteration, 3),
         "psnr_by_iteration": {name: [round(v, 3) for v in curve] for name, curve in curves.items()},
         "psnr_by_ms": by_ms,
@@ -102,7 +120,7 @@ _RSS_UNIT = 1e6 / 1024 if sys.platform != "darwin" else 1e6
 
 
 def machine() -> dict[str, Any]:
-    """What it ran on."""
+    """The machine that the benchmark runs on: keys `processor`, `threads`, `load`, `python`, `numpy`, `fft`."""
     return {
         "processor": _processor(),
         "threads": fft.THREADS,
@@ -114,7 +132,13 @@ def machine() -> dict[str, Any]:
 
 
 def picture(name: str, shape: tuple[int, int]) -> np.ndarray:
-    """A photograph's green part as linear irradiance [H, W]. Raises InputError without scikit-image."""
+    """A photograph's green channel as linear irradiance [H, W].
+
+    Raises
+    ------
+    InputError
+        Without scikit-image.
+    """
     try:
         import skimage.data
     except ImportError as error:
@@ -129,10 +153,16 @@ def _path(shape: tuple[int, int]) -> LightPath:
 
 
 def _against_ffts(solver: Solver, target: np.ndarray) -> tuple[float, float, float]:
-    """Median ms, measured in turns, of an iteration's four transforms alone, of what it makes of them, and of itself.
+    """Median times, ms, of an iteration's transforms alone and of the iteration; measured in turns.
 
-    First as whole two-dimensional transforms of the padded grid, then as the rows and columns that the iteration
-    does not leave out.
+    Returns
+    -------
+    whole : float, ms
+        Four two-dimensional transforms of the whole padded grid.
+    pruned : float, ms
+        The same transforms of only those rows and columns that the iteration transforms.
+    iteration : float, ms
+        The iteration.
     """
     grid = solver.stacks[0][0].grid
     whole = np.zeros(grid.padded, np.complex64)
@@ -145,7 +175,7 @@ def _against_ffts(solver: Solver, target: np.ndarray) -> tuple[float, float, flo
         for forward in (True, False, True, False):
             fft.into(whole, whole, (0, 1), forward, fft.THREADS)
 
-    def part_transforms() -> None:
+    def pruned_transforms() -> None:
         for forward in (True, False, True, False):
             fft.into(rows, rows, 1, forward, fft.THREADS)
             fft.into(columns, columns, 0, forward, fft.THREADS)
@@ -155,7 +185,7 @@ def _against_ffts(solver: Solver, target: np.ndarray) -> tuple[float, float, flo
         assert solver.method is not None
         solver.method.step(phase, following)
 
-    runs = (whole_transforms, part_transforms, iteration)
+    runs = (whole_transforms, pruned_transforms, iteration)
     times: list[list[float]] = [[], [], []]
     for _ in range(ROUNDS):
         for kept, run in zip(times, runs, strict=True):
@@ -164,12 +194,12 @@ def _against_ffts(solver: Solver, target: np.ndarray) -> tuple[float, float, flo
 
 
 def _convergence(
-    path: LightPath, pictures: dict[str, np.ndarray], told: Told
+    path: LightPath, pictures: dict[str, np.ndarray], progress: Progress
 ) -> tuple[dict[str, list[float]], dict[str, float], dict[str, tuple[float, float]]]:
     """By solver: the best PSNR after each iteration, that of the final pattern, and (start, iteration) in ms."""
     curves, final, pace = {}, {}, {}
     for number, (name, (method, options, iterations)) in enumerate(SOLVERS.items()):
-        told(number / len(SOLVERS), name)
+        progress(number / len(SOLVERS), name)
         solver = Solver(path, method=method, **options)
         solver.rehearse()
         curve, ends, times = [], [], []
@@ -187,7 +217,7 @@ def _convergence(
 
 
 def _video(path: LightPath) -> dict[str, Any]:
-    """A pan: one warm iteration a frame against ten cold ones; over the whole frame and inside a border."""
+    """A moving picture: one warm iteration for each frame against ten cold ones, with and without a border."""
     height, width = path.grid.shape
     whole = picture(PICTURES[0], (height + FRAMES * STEP[0], width + FRAMES * STEP[1]))
     border = BORDER * height // SHAPES[0][0]
@@ -228,7 +258,7 @@ def _by_ms(curve: list[float], start: float, each: float) -> dict[str, float]:
 
 
 def _time_to(curve: list[float], start: float, each: float) -> dict[str, float | None]:
-    """Milliseconds until each of the round PSNRs; null: not within the iterations that were made."""
+    """Milliseconds until each of the round PSNRs; null: not reached within the iterations."""
     reached = {}
     for level in LEVELS_DB:
         done = next((k for k, psnr in enumerate(curve) if psnr >= level), None)

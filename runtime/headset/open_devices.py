@@ -1,4 +1,4 @@
-"""The devices of a headset, real or virtual, opened by one name: for captures, calibration and refinement."""
+"""Open the devices of a headset, real or virtual, by one name: for captures, calibration and refinement."""
 
 from __future__ import annotations
 
@@ -14,15 +14,21 @@ from typing import Any
 
 from firmware_iface.errors import InputError
 
-FULL = 1.0  # power where nothing else is said: all that the safety controller lets a laser give
+FULL = 1.0  # power where none is given: the most that the safety controller allows
 
 
 @dataclass(frozen=True)
 class Devices:
     """Panel, lasers and camera of a headset.
 
-    power: fraction of full of each colour while it is lit; FULL where it is not named. focus: puts the camera's focus
-    to a plane, mm from the panel; none: it stays where it is.
+    Attributes
+    ----------
+    panel, lasers, camera
+        The opened devices.
+    power : mapping of str to float
+        Fraction of full power of each colour while it is lit; FULL where it is not named.
+    focus : callable or None
+        Focuses the camera on a plane, mm from the panel; None: the focus is fixed.
     """
 
     panel: Any
@@ -32,12 +38,12 @@ class Devices:
     focus: Callable[[float], None] | None = None
 
     def move_to_plane(self, plane_mm: float) -> None:
-        """Focus the camera on a plane, mm from the panel, where it can."""
+        """Focus the camera on a plane, mm from the panel, where its focus can move."""
         if self.focus:
             self.focus(plane_mm)
 
     def light(self, channel: str) -> None:
-        """One laser on, all others off."""
+        """Switch one laser on and all others off."""
         self.lasers.off()
         self.lasers.set_power(channel, self.power.get(channel, FULL))
 
@@ -46,8 +52,26 @@ class Devices:
 def open_devices(spec: str, seed: int = 0) -> Iterator[Devices]:
     """The devices of `virtual:NAME`, of a virtual bench's TOML file, or of a service's configuration; dark at the end.
 
-    With a configuration, the lasers are armed, in a guard process that goes dark when this one ends in any way. Raises
-    InputError, and DeviceError where a device fails or a fault is latched (which a person has to clear).
+    With a configuration, the lasers are armed, in a guard process that switches them off when this process ends in any
+    way.
+
+    Parameters
+    ----------
+    spec : str
+        `virtual:NAME`, or the path of a file.
+    seed : int
+        Of a virtual bench's noise.
+
+    Yields
+    ------
+    Devices
+
+    Raises
+    ------
+    InputError
+        Where the devices cannot be opened as they are described.
+    DeviceError
+        Where a device fails or a fault is latched (which a person has to clear).
     """
     tables = configuration_of(spec)
     if tables is None:
@@ -59,13 +83,13 @@ def open_devices(spec: str, seed: int = 0) -> Iterator[Devices]:
     for name in ("panel", "lasers", "camera"):
         if name not in tables:
             raise InputError(f"{spec} has no [{name}]: the panel, the lasers and the camera are all needed")
-    with driven(tables) as devices:
+    with open_tables(tables) as devices:
         yield devices
 
 
 @contextmanager
-def driven(tables: Mapping[str, Any]) -> Iterator[Devices]:
-    """The devices of the tables [panel], [lasers] and [camera] of a configuration; as `open_devices`."""
+def open_tables(tables: Mapping[str, Any]) -> Iterator[Devices]:
+    """As `open_devices`, for the tables [panel], [lasers] and [camera] of a configuration."""
     from firmware_iface.assembled import laser_channels, laser_power, open_camera, open_panel
     from firmware_iface.lasers.guard import open_guarded_lasers
     from firmware_iface.virtual.served import i2c_bus
@@ -86,8 +110,23 @@ def driven(tables: Mapping[str, Any]) -> Iterator[Devices]:
 def emulated(bench: str, seed: int = 0) -> Iterator[Devices]:
     """A virtual bench inside hardware emulated down to the bytes of its buses, driven through a real headset's drivers.
 
-    bench: `virtual:NAME` or a virtual bench's TOML file. The camera is an emulated OAK where depthai is installed, and
-    without a link of its own elsewhere. Raises as `open_devices`.
+    The camera is an emulated OAK where depthai is installed, and one without a link of its own elsewhere.
+
+    Parameters
+    ----------
+    bench : str
+        `virtual:NAME`, or the path of a virtual bench's TOML file.
+    seed : int
+        Of the bench's noise.
+
+    Yields
+    ------
+    Devices
+
+    Raises
+    ------
+    InputError, DeviceError
+        As `open_devices`.
     """
     from firmware_iface.virtual import load_bench
     from firmware_iface.virtual.served import PREFIX, running
@@ -96,25 +135,25 @@ def emulated(bench: str, seed: int = 0) -> Iterator[Devices]:
     with TemporaryDirectory(prefix="hololoop-") as folder:
         socket = Path(folder) / "hardware.sock"
         bus = f"{PREFIX}{socket}"
-        # Addresses of this run's own: others may be running.
+        # An address of this run alone: other runs may be active.
         address = f"127.{os.getpid() >> 16 & 255}.{os.getpid() >> 8 & 255}.{os.getpid() % 254 + 1}"
         camera = (
             {"kind": "oak", "address": address} if find_spec("depthai") else {"kind": "virtual", "bus": bus}
         )
         with running(socket, bench, seed, address):
             lasers = {"bus": bus, "power": dict.fromkeys(colours, FULL)}
-            with driven({"panel": {"bus": bus}, "lasers": lasers, "camera": camera}) as devices:
+            with open_tables({"panel": {"bus": bus}, "lasers": lasers, "camera": camera}) as devices:
                 yield devices
 
 
 def configuration_of(spec: str) -> dict[str, Any] | None:
-    """The devices' tables of a service's configuration; None for a virtual bench."""
+    """The tables of the devices in a service's configuration; None for a virtual bench."""
     if spec.startswith("virtual:") or not Path(spec).is_file():
         return None
     try:
         tables = tomllib.loads(Path(spec).read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError):
-        return None  # which opening it as a bench will say
+        return None  # opening it as a bench then reports the error
     if "lasers" not in tables:
         return None
     from runtime.service.configuration import read_configuration

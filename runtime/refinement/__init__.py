@@ -1,1 +1,6 @@
-"""Online refinement: a picture gets better while it is displayed, with a camera that looks on (seed section 7)."""
+"""Online refinement: a picture gets better while it is displayed, with a camera that captures it.
+
+References
+----------
+Chakravarthula et al. 2020, section 7.
+"""

@@ -50,8 +50,8 @@ def run(args: Namespace) -> dict[str, Any]:
     from runtime.camera.view import View, view_of
     from runtime.headset.open_devices import open_devices
     from runtime.networks.onnx_approximator import approximator_of
-    from runtime.refinement.refine import Refinement, refine
-    from runtime.refinement.viewer import Eye
+    from runtime.refinement.panel_and_camera import PanelAndCamera
+    from runtime.refinement.picture_refinement import Refinement, refine
     from runtime.solver import solve
     from runtime.solving import jobs, target_planes, write_gray
 
@@ -91,7 +91,9 @@ def run(args: Namespace) -> dict[str, Any]:
                 taker.light(channel)
                 exposures[channel] = taker.expose(gray, black)
             turns = [partial(turn, c) for c in channels] if len(channels) > 1 else None
-            steps = refine(state, Eye(devices.panel, devices.camera, view, black, turns), args.captures)
+            steps = refine(
+                state, PanelAndCamera(devices.panel, devices.camera, view, black, turns), args.captures
+            )
         finally:
             devices.lasers.off()
     for out, gray in zip(outs, state.gray if outs else [], strict=True):

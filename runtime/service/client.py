@@ -1,4 +1,4 @@
-"""What a program uses to show pictures through the service.
+"""The Python client: a program's connection to the service.
 
 with connect("/run/hololoop/service.sock") as headset:
     headset.clear()
@@ -26,47 +26,28 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from firmware_iface.errors import InputError
-from runtime.service.link import Link
-from runtime.service.protocol import (
-    HIGHEST,
-    LOWEST,
-    MAGIC,
-    PROTOCOL,
-    Arm,
-    Begin,
-    Capture,
-    Clear,
-    Code,
-    Dark,
-    Done,
-    End,
-    Error,
-    Hello,
-    Refine,
-    Refined,
-    Shown,
-    State,
-    Status,
-    Timing,
-    Wait,
-    Welcome,
-)
-from runtime.service.protocol import (
-    Ring as RingMessage,
-)
-from runtime.service.ring import Ring, crc32, make_ring, read_sealed
+from runtime.service import protocol
+from runtime.service.protocol import PROTOCOL, Code, Done, Error, Refined, Shown, State, Timing, Welcome
+from runtime.service.shared_memory import Ring, crc32, make_ring, read_sealed
+from runtime.service.socket_link import MessageLink
 
 
 class RefusedError(InputError):
-    """The service did not do what was asked; `code` says why (a protocol.Code, or a number of a newer one)."""
+    """The service refused a request.
+
+    Attributes
+    ----------
+    code : int
+        The reason: a protocol.Code, or a number of a newer version.
+    """
 
     def __init__(self, error: Error) -> None:
         super().__init__(error.text)
         self.code = error.code
 
 
-class Lost(NamedTuple):
-    """An accepted frame that came to nothing."""
+class LostFrame(NamedTuple):
+    """An accepted frame that was not shown."""
 
     frame: int
     code: int
@@ -74,20 +55,28 @@ class Lost(NamedTuple):
 
 
 class Client:
-    """A connection to the service. Not for several threads at once.
+    """A connection to the service, for one thread at a time; `connect` makes it.
 
-    shape : (C, H, W) of a picture. Attributes: welcome (what the service said of itself), slots (number), refined (what
-    became of the last refinement; None while it goes on).
+    Attributes
+    ----------
+    welcome : Welcome
+        Version of the protocol and properties of the display.
+    shape : tuple of int
+        (C, H, W) of a picture.
+    slots : int
+        Slots of the ring.
+    refined : Refined or None
+        Result of the last refinement; None while it continues.
     """
 
-    def __init__(self, link: Link, welcome: Welcome, slots: int, timeout_s: float) -> None:
+    def __init__(self, link: MessageLink, welcome: Welcome, slots: int, timeout_s: float) -> None:
         self._link, self.welcome, self.slots, self._timeout_s = link, welcome, slots, timeout_s
         self.shape = (welcome.channels, welcome.height, welcome.width)
         self._serial = 1
         self._ring: Ring | None = None
         self._taken: dict[int, int] = {}  # slot by frame
         self._drawing: int | None = None
-        self._outcomes: deque[Shown | Lost] = deque()
+        self._outcomes: deque[Shown | LostFrame] = deque()
         self.refined: Refined | None = None
 
     def __enter__(self) -> Client:
@@ -107,49 +96,73 @@ class Client:
         return self._link.fileno()
 
     def status(self) -> State:
-        """How the headset is."""
-        return self._ask(Status(), State)[0]
+        """The state of the headset."""
+        return self._ask(protocol.Status(), State)[0]
 
     def clear(self) -> None:
-        """First step to light: forget a latched fault. Raises RefusedError while its cause is there."""
-        self._ask(Clear(), Done)
+        """First step to light: forget a latched fault.
+
+        Raises
+        ------
+        RefusedError
+            While the cause of the fault remains.
+        """
+        self._ask(protocol.Clear(), Done)
 
     def arm(self) -> None:
-        """Second step to light. Raises RefusedError without `clear` before it."""
-        self._ask(Arm(), Done)
+        """Second step to light.
+
+        Raises
+        ------
+        RefusedError
+            Without `clear` before it.
+        """
+        self._ask(protocol.Arm(), Done)
 
     def dark(self) -> None:
-        """Lasers off at once, until cleared and armed."""
-        self._ask(Dark(), Done)
+        """Switch the lasers off at once, until `clear` and `arm`."""
+        self._ask(protocol.Dark(), Done)
 
     def capture(self) -> np.ndarray:
-        """A picture of the camera that began after this call: counts, uint16 [h, w]."""
-        picture, fd = self._ask(Capture(), None)
+        """A picture from the camera whose exposure began after this call: counts, uint16 [h, w]."""
+        picture, fd = self._ask(protocol.Capture(), None)
         return read_sealed(fd, (picture.height, picture.width), np.uint16)
 
     def refine(self, captures: int = 24) -> None:
-        """Have the next frame's picture refined while frames with it are shown, for at most so many captures.
+        """Refine the next frame's picture while frames with it are shown.
 
-        What became of it is in `refined`, when it has ended and outcomes were asked for. 0 captures end it and go back
-        to the solver's own pattern.
+        `refined` has the result when the refinement has ended and `outcomes` was called.
+
+        Parameters
+        ----------
+        captures : int
+            Captures at most; 0 ends a refinement and goes back to the solver's own pattern.
         """
-        self._ask(Refine(captures), Done)
+        self._ask(protocol.Refine(captures), Done)
         self.refined = None
 
     def wait(self) -> Timing:
-        """The next frame, when it may begin."""
+        """The next frame, once it may begin."""
         if self._ring is None:
             self._open_ring()
-        return self._ask(Wait(), Timing)[0]
+        return self._ask(protocol.Wait(), Timing)[0]
 
     def begin(self, timing: Timing) -> None:
         """Drawing of the frame begins."""
-        self._ask(Begin(timing.frame), Done)
+        self._ask(protocol.Begin(timing.frame), Done)
 
     def slot(self) -> np.ndarray:
-        """Where to draw the frame that was begun: uint16 [C, H, W], linear irradiance.
+        """The array for the picture of the frame that was begun; waits for a free slot.
 
-        Waits for a slot to become free. Raises InputError where none does.
+        Returns
+        -------
+        uint16 array [C, H, W]
+            Linear irradiance, 65535 for the brightest.
+
+        Raises
+        ------
+        InputError
+            Where no slot becomes free in time.
         """
         if self._ring is None:
             self._open_ring()
@@ -164,12 +177,12 @@ class Client:
         return self._ring.slots[self._drawing]
 
     def end(self, timing: Timing) -> None:
-        """The frame is drawn; from now on its slot is the service's."""
+        """The frame is drawn; from now on its slot belongs to the service."""
         slot = self.slot()
         assert self._drawing is not None
         self._taken[timing.frame] = self._drawing
         try:
-            self._ask(End(timing.frame, self._drawing, crc32(slot)), Done)
+            self._ask(protocol.End(timing.frame, self._drawing, crc32(slot)), Done)
         except BaseException:
             self._taken.pop(timing.frame, None)
             raise
@@ -183,8 +196,8 @@ class Client:
         self.end(timing)
         return timing.frame
 
-    def outcomes(self, timeout_s: float = 0.0) -> Iterator[Shown | Lost]:
-        """What became of accepted frames since it was asked last; waits so long for the first."""
+    def outcomes(self, timeout_s: float = 0.0) -> Iterator[Shown | LostFrame]:
+        """Outcomes of accepted frames since the last call; waits at most `timeout_s` for the first."""
         until = time.monotonic() + timeout_s
         while self._receive(time.monotonic()):
             pass
@@ -200,22 +213,22 @@ class Client:
 
     def _open_ring(self) -> None:
         ring = make_ring(self.slots, self.shape, np.uint16)
-        self._ask(RingMessage(self.slots, ring.slots[0].nbytes), Done, [ring.fd])
+        self._ask(protocol.Ring(self.slots, ring.slots[0].nbytes), Done, [ring.fd])
         self._ring = ring
 
     def _ask(self, message: NamedTuple, answer: type | None, fds: list[int] | None = None) -> tuple[Any, Any]:
-        """Send a request and take what comes until its answer."""
+        """Send a request and receive messages until its answer."""
         serial = self._serial = self._serial % (2**32 - 1) + 1
         self._link.send(message, serial, fds or [])
         until = time.monotonic() + self._timeout_s
         while True:
-            got = self._receive(until)
-            if got is None:
+            received = self._receive(until)
+            if received is None:
                 raise InputError(
                     f"the service did not answer {type(message).__name__} within {self._timeout_s:g} s"
                 )
-            found, reply, fd = got
-            if found != serial:
+            answered, reply, fd = received
+            if answered != serial:
                 continue
             if isinstance(reply, Error):
                 raise RefusedError(reply)
@@ -224,7 +237,7 @@ class Client:
             return reply, fd
 
     def _receive(self, until: float) -> tuple[int, Any, int | None] | None:
-        """One message, or None at the time `until`; outcomes are noted."""
+        """One message, or None after the time `until`; notes outcomes."""
         if not select.select([self._link], [], [], max(0.0, until - time.monotonic()))[0]:
             return None
         serial, message, fd = self._link.receive()
@@ -238,15 +251,30 @@ class Client:
                 if message.frame == 0:
                     raise RefusedError(message)
                 self._taken.pop(message.frame, None)
-                self._outcomes.append(Lost(message.frame, message.code, message.text))
+                self._outcomes.append(LostFrame(message.frame, message.code, message.text))
         return serial, message, fd
 
 
 def connect(path: str | os.PathLike[str], slots: int = 3, timeout_s: float = 5.0) -> Client:
-    """Connect to the service at a socket's path.
+    """Connect to the service.
 
-    slots : of the ring; 3 let one be drawn, one be solved and one wait. timeout_s : for any answer
-    Raises InputError where there is no service, or it speaks no version that is spoken here or refuses.
+    Parameters
+    ----------
+    path : path
+        The service's socket.
+    slots : int
+        Slots of the ring; with 3, one is drawn, one is solved and one waits.
+    timeout_s : float, s
+        Longest wait for any answer.
+
+    Returns
+    -------
+    Client
+
+    Raises
+    ------
+    InputError
+        Where there is no service, where it supports no version that is supported here, or where it refuses.
     """
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC)
     try:
@@ -256,12 +284,12 @@ def connect(path: str | os.PathLike[str], slots: int = 3, timeout_s: float = 5.0
             raise InputError(
                 f"there is no service at {path} ({error.strerror}): start hololoop-runtime serve"
             ) from None
-        client = Client(Link(connection, PROTOCOL), Welcome(0, 0, 0, 0, 0, 0, 0), slots, timeout_s)
-        welcome, _ = client._ask(Hello(MAGIC, LOWEST, HIGHEST), Welcome)
+        client = Client(MessageLink(connection, PROTOCOL), Welcome(0, 0, 0, 0, 0, 0, 0), slots, timeout_s)
+        welcome, _ = client._ask(protocol.Hello(protocol.MAGIC, protocol.LOWEST, protocol.HIGHEST), Welcome)
         return Client(client._link, welcome, slots, timeout_s)
     except BaseException:
         connection.close()
         raise
 
 
-__all__ = ["Client", "Code", "Lost", "RefusedError", "connect"]
+__all__ = ["Client", "Code", "LostFrame", "RefusedError", "connect"]

@@ -69,7 +69,7 @@ def run(args: Namespace) -> dict[str, Any]:
         lasers.close()
         return {"dark": True}
     if args.units is not None:
-        from runtime.service.units import write_units
+        from runtime.service.systemd_units import write_units
 
         return {"units": [str(path) for path in write_units(configuration, args.units)]}
     supervisor = Supervisor(configuration)

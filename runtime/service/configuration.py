@@ -1,11 +1,11 @@
-"""The one TOML file that says what the headset is and how the service runs it.
+"""The service's configuration: one TOML file with the headset's devices and how the service runs them.
 
 schema = 1
 bundle = "bundle"                      # folder of the calibrated light path, from here
 
 [service]
 socket = "/run/hololoop/service.sock"  # unless systemd passes one
-users = [1000]                         # besides root and the service's own, who may connect
+users = [1000]                         # who may connect, as well as root and the service's own user
 
 [panel]                                # see firmware_iface.assembled for the devices' tables
 [lasers]
@@ -29,7 +29,7 @@ DEVICES = ("panel", "lasers", "camera")
 
 @dataclass(frozen=True)
 class Timing:
-    """When patterns are shown, and for how long they may be."""
+    """The table [service]: when patterns are shown and for how long, and where the service is reached."""
 
     refresh_hz: float = parameter(60.0, "pictures a second", 1, 2000)
     solve_ms: float = parameter(12.0, "time for a pattern, ms", 0.1, 60000)
@@ -45,8 +45,18 @@ class Timing:
 class Configuration:
     """A checked configuration.
 
-    file : where it stands. bundle : folder. timing : [service]. users : numbers of those who may connect.
-    devices : [panel], [lasers] and [camera] as they are written, those that are there
+    Attributes
+    ----------
+    file : Path
+        The configuration's file.
+    bundle : Path
+        Folder of the bundle.
+    timing : Timing
+        The table [service].
+    users : frozenset of int
+        Numbers of the users who may connect.
+    devices : dict
+        The tables [panel], [lasers] and, where it exists, [camera], as they are written.
     """
 
     file: Path
@@ -62,7 +72,13 @@ class Configuration:
 
 
 def read_configuration(file: str | os.PathLike[str]) -> Configuration:
-    """Read and check a configuration. Raises InputError that names the key and what is allowed."""
+    """Read and check a configuration.
+
+    Raises
+    ------
+    InputError
+        Names the key that is wrong and what is allowed.
+    """
     path = Path(file).absolute()
     try:
         tables = tomllib.loads(path.read_bytes().decode())

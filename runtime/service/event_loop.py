@@ -1,4 +1,4 @@
-"""The service's loop: sockets that are readable, and work that other threads hand over."""
+"""The service's event loop: sockets that are readable, and work from other threads."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from typing import Protocol
 
 
 class Readable(Protocol):
-    """Anything with a descriptor."""
+    """Anything with a file descriptor."""
 
     def fileno(self) -> int:
-        """Its number."""
+        """The descriptor."""
 
 
-class Loop:
-    """Calls who is told that something came; everything in it happens in one thread."""
+class EventLoop:
+    """Calls a function when its descriptor is readable. All calls are made in one thread."""
 
     def __init__(self) -> None:
         self._selector = selectors.DefaultSelector()
@@ -31,23 +31,23 @@ class Loop:
         self._selector.register(what, selectors.EVENT_READ, read)
 
     def forget(self, what: Readable) -> None:
-        """Watch it no more; before it is closed."""
+        """Stop watching it; call this before it is closed."""
         with suppress(KeyError, ValueError):
             self._selector.unregister(what)
 
     def later(self, do: Callable[[], None]) -> None:
-        """Have something done by the loop; from any thread and from signal handlers."""
+        """Call `do` in the loop's thread; for any thread and for signal handlers."""
         self._work.append(do)
         with suppress(BlockingIOError):
             os.eventfd_write(self._woken, 1)
 
     def turn(self, wait_s: float) -> None:
-        """Do what there is to do; wait so long for something."""
+        """Make the calls that are due; wait at most `wait_s` for the first."""
         for key, _ in self._selector.select(wait_s):
             key.data()
 
     def close(self) -> None:
-        """Watch nothing more."""
+        """Stop watching everything."""
         self._selector.close()
 
     def _wake(self) -> None:

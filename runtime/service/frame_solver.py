@@ -1,4 +1,4 @@
-"""From a picture to patterns by a deadline: the one place where the service calls the solver."""
+"""Patterns for a picture by a deadline: the only place where the service calls the solver."""
 
 from __future__ import annotations
 
@@ -22,10 +22,20 @@ from runtime.solver import Solution, Solver, shown
 
 @dataclass(frozen=True)
 class Pattern:
-    """Gray levels for each colour, uint8 [C, H, W], and what the calibrated model says that they show.
+    """Gray levels of a pattern, and what the calibrated model predicts for it.
 
-    psnr_db : of amplitude. final : nothing better is to come by the deadline. dark : the picture is black, and
-    no pattern shows that. shares : of the light in its brightest spots (eye_safety.spot_shares), if asked for
+    Attributes
+    ----------
+    gray : uint8 array [C, H, W]
+        Gray levels of each colour.
+    psnr_db : float, dB
+        Amplitude PSNR.
+    final : bool
+        No better pattern follows by the deadline.
+    dark : bool
+        The picture is black, which no pattern can show.
+    shares : tuple of float
+        Shares of the light in its brightest spots (eye_safety.spot_shares); empty where they were not asked for.
     """
 
     gray: np.ndarray
@@ -38,9 +48,18 @@ class Pattern:
 class PatternSolver:
     """Solves for one light path, frame after frame.
 
-    mrad_per_pixel : angle of a pixel at the eye, where the light of each pattern is to be predicted; 0: it is not
-    options : of `Solver`
-    shape : (1, H, W)
+    Parameters
+    ----------
+    path : LightPath
+    mrad_per_pixel : float, mrad
+        Angle of a pixel at the eye, for predicting the brightest spots of each pattern; 0: they are not predicted.
+    **options
+        Of `Solver`.
+
+    Attributes
+    ----------
+    shape : tuple of int
+        (1, H, W).
     """
 
     def __init__(self, path: LightPath, mrad_per_pixel: float = 0.0, **options: Any) -> None:
@@ -49,17 +68,32 @@ class PatternSolver:
         self._solver = Solver(path, **options)
 
     def patterns(self, target: np.ndarray, deadline_ns: int) -> Iterator[Pattern]:
-        """Ever better patterns for a target irradiance [1, H, W]; the last one by the deadline (monotonic, ns).
+        """Patterns for a target, each better than the one before.
 
-        The first, which begins with the frame before, always comes. Raises InputError for a target that
-        cannot be shown.
+        The first is always made, and starts from the pattern of the previous frame.
+
+        Parameters
+        ----------
+        target : float32 array [1, H, W]
+            Irradiance.
+        deadline_ns : int, ns
+            When the last pattern has to be ready (CLOCK_MONOTONIC).
+
+        Yields
+        ------
+        Pattern
+
+        Raises
+        ------
+        InputError
+            For a target that cannot be shown.
         """
         if not target.any():
             yield Pattern(np.zeros(self.shape, np.uint8), 0.0, final=True, dark=True)
             return
         first = self._solver.frame(target[0], 0)
         left_ms = (deadline_ns - time.monotonic_ns()) * 1e-6
-        enough = left_ms > first.milliseconds  # what beginning once more costs
+        enough = left_ms > first.milliseconds  # as much as another start costs
         yield self._pattern(first, final=not enough)
         if enough:
             better = self._solver.solve(target[0], deadline_ms=left_ms, start=first.phase)
@@ -73,7 +107,13 @@ class PatternSolver:
 
 
 def open_solver(configuration: Configuration) -> PatternSolver:
-    """The solver for a configuration's bundle and colour. Raises InputError where they do not fit."""
+    """The solver for a configuration's bundle and colour.
+
+    Raises
+    ------
+    InputError
+        Where the bundle and the colour do not fit.
+    """
     bundle = read_bundle(configuration.bundle)
     channels = bundle_channels(bundle)
     channel = configuration.timing.channel or None
@@ -92,7 +132,7 @@ def open_solver(configuration: Configuration) -> PatternSolver:
     return PatternSolver(
         path,
         mrad_per_pixel(configuration.devices["lasers"]),
-        grid="panel",  # by a deadline the finer grid buys less than the iterations that it costs
+        grid="panel",  # before a deadline, more iterations gain more than the finer grid
         approximator=approximator,
         initialiser=bundle.networks.get(INITIALISER),
     )

@@ -1,14 +1,14 @@
-/* The protocol of hololoop's service, version 1, for programs in C.
+/* The protocol of hololoop's service, version 1, for C programs.
  *
  * Connect a SOCK_SEQPACKET socket of AF_UNIX to the service's path. Each message is one of these structs, sent and
- * received whole; all numbers are little-endian. protocol.py, beside this file, says in which order they go:
+ * received whole; all numbers are little-endian. Their order (protocol.py, in the same folder, describes it in full):
  *
  *   HELLO            -> WELCOME
  *   RING + memfd     -> DONE        memfd_create(MFD_ALLOW_SEALING), ftruncate, F_ADD_SEALS of SHRINK and GROW
  *   WAIT             -> TIMING      when the next frame may begin
  *   BEGIN            -> DONE
  *   END              -> DONE        accepted; later, with serial 0: SHOWN, or ERROR with the frame's number
- *   CLEAR, ARM, DARK -> DONE        lasers
+ *   CLEAR, ARM, DARK -> DONE        the lasers
  *   STATUS           -> STATE
  *   CAPTURE          -> PICTURE + memfd
  *   REFINE           -> DONE        later, with serial 0: REFINED
@@ -75,7 +75,7 @@ enum hololoop_code {
     HOLOLOOP_STOPPING = 13
 };
 
-/* Begins every message. A request's serial is above 0 and comes back in its answer. */
+/* The first bytes of every message. A request's serial is above 0; its answer repeats it. */
 struct hololoop_header {
     uint16_t code;
     uint16_t bytes; /* of the whole message */
@@ -85,7 +85,7 @@ struct hololoop_header {
 struct hololoop_hello {
     struct hololoop_header header;
     char magic[8];
-    uint16_t lowest; /* versions that the program speaks */
+    uint16_t lowest; /* versions that the program supports */
     uint16_t highest;
     uint32_t reserved;
 };
@@ -115,7 +115,7 @@ struct hololoop_plain {
 struct hololoop_error {
     struct hololoop_header header;
     uint32_t code;
-    uint32_t frame; /* above 0: this accepted frame came to nothing */
+    uint32_t frame; /* above 0: this accepted frame was not shown */
     char text[240]; /* UTF-8, ends with a zero */
 };
 
@@ -177,7 +177,7 @@ struct hololoop_picture {
 
 struct hololoop_refine {
     struct hololoop_header header;
-    uint32_t captures; /* at most; 0: end a refinement, and back to the solver's own pattern */
+    uint32_t captures; /* at most; 0: end a refinement and go back to the solver's own pattern */
     uint32_t reserved;
 };
 

@@ -1,11 +1,11 @@
-"""The service's numbers in Prometheus's format, on 127.0.0.1."""
+"""The service's metrics in Prometheus's format, on 127.0.0.1."""
 
 from __future__ import annotations
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, start_http_server
 
 from firmware_iface.errors import InputError
-from runtime.service.protocol import Lasers
+from runtime.service.protocol import LaserState
 
 STAGES = ("queue", "solve", "transfer", "total")
 BUCKETS = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.016, 0.033, 0.066, 0.125, 0.25, 0.5, 1.0)
@@ -28,7 +28,7 @@ class Metrics:
         self.shown = self._counter("frames_shown", "Frames put on the panel")
         self.late = self._counter("frames_late", "Frames put on the panel after their predicted display time")
         self.failed = self._counter(
-            "frames_failed", "Accepted frames that came to nothing, by reason", "reason"
+            "frames_failed", "Accepted frames that were not shown, by reason", "reason"
         )
         self.faults = self._counter("faults", "Faults met, by kind", "kind")
         self.restarts = self._counter("restarts", "Child processes started again", "process")
@@ -41,18 +41,24 @@ class Metrics:
         self.laser_power = Gauge(
             "hololoop_laser_power", "Power asked for, fraction of full", ["channel"], registry=self.registry
         )
-        self.lasers(Lasers.OFF)
+        self.lasers(LaserState.OFF)
 
     def _counter(self, name: str, about: str, *labels: str) -> Counter:
         return Counter(f"hololoop_{name}", about, labels, registry=self.registry)
 
-    def lasers(self, state: Lasers) -> None:
+    def lasers(self, state: LaserState) -> None:
         """Set the lasers' state."""
-        for one in Lasers:
+        for one in LaserState:
             self.laser_state.labels(one.name.lower()).set(one == state)
 
     def serve(self, port: int) -> None:
-        """Answer http://127.0.0.1:port/metrics in a thread. Raises InputError where the port is taken."""
+        """Answer http://127.0.0.1:port/metrics in a thread.
+
+        Raises
+        ------
+        InputError
+            Where the port is taken.
+        """
         try:
             start_http_server(port, "127.0.0.1", self.registry)
         except OSError as error:

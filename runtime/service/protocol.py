@@ -1,31 +1,31 @@
-"""What a program and the service say to each other, version 1, over a Unix socket of type SOCK_SEQPACKET.
+"""The protocol of programs and the service, version 1, over a Unix socket of type SOCK_SEQPACKET.
 
     program                                   service
-    Hello (versions it speaks)           ->
-                                         <-   Welcome (the version to speak; the panel's size)
+    Hello (versions it supports)         ->
+                                         <-   Welcome (the version to use; the panel's size)
     Ring, with a sealed memfd            ->
                                          <-   Done
     Wait                                 ->
                                          <-   Timing, when the next frame may begin; with its predicted display time
     Begin                                ->
                                          <-   Done
-    (draws into a free slot of the ring)
+    (the program draws into a free slot of the ring)
     End (slot, CRC-32 of the slot)       ->
-                                         <-   Done: accepted. The slot is the service's
+                                         <-   Done: accepted. The slot belongs to the service
                                          <-   Shown, or Error with the frame's number: the slot is free again
 
 Every accepted frame ends in exactly one Shown or Error. A request that cannot be done is answered by Error
-with the request's serial. Begin without End before it discards the frame that was begun.
+with the request's serial. Begin without an End before it discards the frame that was begun.
 
 A slot holds linear irradiance, u16 [channels][height][width], 65535 for the brightest. Times are
 CLOCK_MONOTONIC, ns. The ring is made by memfd_create(MFD_ALLOW_SEALING) and sealed with F_SEAL_SHRINK and
 F_SEAL_GROW before it is sent, else it is refused. One program at a time has a ring and so the display; any
-number may ask for Status, Capture and Dark.
+number of programs may send Status, Capture and Dark.
 
-Refine asks that the picture of the next frame be refined with the camera while it is displayed: as long as frames with
-the same picture follow, they show the refinement's patterns. It ends by itself, with Refined; the best pattern stays
-while that picture does. Another picture ends it. Refine with 0 captures ends it and goes back to the solver's own
-pattern. The lasers are as they were: what is not lit is not learned from.
+Refine starts a refinement of the next frame's picture with the camera, while it is displayed: as long as frames with
+the same picture follow, they show the refinement's patterns. It ends by itself, with Refined; the best pattern is shown
+as long as that picture is. Another picture ends it. Refine with 0 captures ends it and goes back to the solver's own
+pattern. It does not change the lasers: it learns only from patterns that are lit.
 
 Lasers: Clear (forget a latched fault), then Arm. Both are needed, in this order, after every fault and every
 start; nothing else makes light. Dark always works.
@@ -36,15 +36,15 @@ from __future__ import annotations
 from enum import IntEnum, IntFlag
 from typing import NamedTuple
 
-from runtime.service.messages import F32, U16, U32, U64, Magic, Text, Vocabulary
+from runtime.service.message_format import F32, U16, U32, U64, Magic, Text, Vocabulary
 
 MAGIC = b"hololoop"
-LOWEST, HIGHEST = 1, 1  # versions spoken here
+LOWEST, HIGHEST = 1, 1  # versions supported here
 MOST_SLOTS = 16
 
 
 class Hello(NamedTuple):
-    """First message of a program: the versions that it speaks."""
+    """First message of a program: the versions that it supports."""
 
     magic: Magic
     lowest: U16
@@ -53,7 +53,7 @@ class Hello(NamedTuple):
 
 
 class Welcome(NamedTuple):
-    """The highest version that both speak, and what the display is."""
+    """The highest version that both support, and the display's properties."""
 
     version: U16
     channels: U16
@@ -76,7 +76,7 @@ class Done(NamedTuple):
 
 
 class Error(NamedTuple):
-    """A request or, with `frame` above 0, an accepted frame that came to nothing, and why."""
+    """A request that was refused or, with `frame` above 0, an accepted frame that was not shown, and why."""
 
     code: U32
     frame: U32
@@ -88,7 +88,7 @@ class Wait(NamedTuple):
 
 
 class Timing(NamedTuple):
-    """The frame to draw: when it will be seen, and when End must have come for that."""
+    """The frame to draw: when it will be displayed, and by when End must be sent for that."""
 
     display_ns: U64
     submit_by_ns: U64
@@ -125,11 +125,15 @@ class Shown(NamedTuple):
 
 
 class Status(NamedTuple):
-    """Asks how the headset is."""
+    """Asks for the state of the headset."""
 
 
 class State(NamedTuple):
-    """How the headset is. Panel, solver and camera are a Part, lasers a Lasers; faults are the controller's bits."""
+    """The state of the headset.
+
+    `panel`, `solver` and `camera` are a PartState, `lasers` is a LaserState, `laser_faults` are the bits of the safety
+    controller's faults.
+    """
 
     time_ns: U64
     shown: U64
@@ -144,7 +148,7 @@ class State(NamedTuple):
 
 
 class Clear(NamedTuple):
-    """First step to light: forget a latched fault whose cause is gone."""
+    """First step to light: forget a latched fault whose cause was removed."""
 
 
 class Arm(NamedTuple):
@@ -156,7 +160,7 @@ class Dark(NamedTuple):
 
 
 class Capture(NamedTuple):
-    """Asks for a picture of the camera."""
+    """Asks for a picture from the camera."""
 
 
 class Picture(NamedTuple):
@@ -170,7 +174,7 @@ class Picture(NamedTuple):
 
 
 class Refine(NamedTuple):
-    """Asks that the next frame's picture be refined for at most so many captures; 0: no more."""
+    """Asks for a refinement of the next frame's picture, with at most so many captures; 0: end it."""
 
     captures: U32
     reserved: U32 = 0
@@ -185,34 +189,34 @@ class Refined(NamedTuple):
     text: Text
 
 
-class Part(IntEnum):
-    """How a device or a process is."""
+class PartState(IntEnum):
+    """The state of a device or of a process."""
 
     ABSENT = 0  # the configuration has none
     FRESH = 1
     STALE = 2  # there, but its last sign of life is too old
-    LOST = 3  # gone; it is being looked for
+    LOST = 3  # disconnected or ended; the service tries to open or start it again
 
 
-class Lasers(IntEnum):
-    """How the lasers are."""
+class LaserState(IntEnum):
+    """The state of the lasers."""
 
     OFF = 0
-    ARMED = 1  # may emit; nothing fresh to show
+    ARMED = 1  # may emit; there is no fresh pattern
     EMITTING = 2
     FAULT = 3  # latched
-    LOST = 4  # the safety controller does not answer: it goes dark by itself
+    LOST = 4  # the safety controller does not answer: it switches the lasers off by itself
 
 
 class Flags(IntFlag):
-    """How a frame was shown."""
+    """Flags of a frame that was shown."""
 
     LATE = 1  # after its predicted display time
-    UNFINISHED = 2  # the best pattern so far: its solve had not ended
+    UNFINISHED = 2  # the best pattern so far: the solver had not finished
 
 
 class Code(IntEnum):
-    """Why something was not done."""
+    """Reasons of an Error."""
 
     MALFORMED = 1
     VERSION = 2
@@ -255,6 +259,6 @@ PROTOCOL = Vocabulary(
 
 
 def agreed_version(hello: Hello) -> int | None:
-    """The highest version that both sides speak, or None."""
+    """The highest version that both sides support, or None."""
     version = min(hello.highest, HIGHEST)
     return version if version >= max(hello.lowest, LOWEST) else None

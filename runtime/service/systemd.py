@@ -1,4 +1,4 @@
-"""What systemd and a service say to each other: sd_notify(3) and sd_listen_fds(3), in the standard library."""
+"""Messages to systemd and the socket from it: sd_notify(3) and sd_listen_fds(3), with the standard library alone."""
 
 from __future__ import annotations
 
@@ -12,9 +12,12 @@ FIRST_FD = 3
 
 
 class Notifier:
-    """Tells systemd how the service is; does nothing where systemd did not start it.
+    """Reports the service's state to systemd; does nothing where systemd did not start the service.
 
-    watchdog_s : how often `alive` has to be called at least, or None; half of what the unit allows
+    Attributes
+    ----------
+    watchdog_s : float or None, s
+        Longest time between calls of `alive`, half of what the unit allows; None without a watchdog.
     """
 
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:
@@ -32,32 +35,34 @@ class Notifier:
 
     def ready(self, status: str) -> None:
         """The service has started."""
-        self._tell(f"READY=1\nSTATUS={status}")
-
-    def status(self, status: str) -> None:
-        """One line for `systemctl status`."""
-        self._tell(f"STATUS={status}")
+        self._send(f"READY=1\nSTATUS={status}")
 
     def alive(self) -> None:
         """The service's loops turn."""
-        self._tell("WATCHDOG=1")
+        self._send("WATCHDOG=1")
 
     def stopping(self) -> None:
-        """The service is going down."""
-        self._tell("STOPPING=1")
+        """The service is stopping."""
+        self._send("STOPPING=1")
 
-    def _tell(self, text: str) -> None:
+    def _send(self, text: str) -> None:
         if self._socket is None:
             return
         try:
             self._socket.sendto(text.encode(), self._address)
-        except OSError:  # the service works without systemd as with it
+        except OSError:  # the service also works without systemd
             self._socket.close()
             self._socket = None
 
 
 def passed_socket(environment: Mapping[str, str] | None = None) -> socket.socket | None:
-    """The listening socket that systemd passed, or None. Raises InputError for one of another kind."""
+    """The listening socket that systemd passed, or None.
+
+    Raises
+    ------
+    InputError
+        For several sockets or a socket of another type.
+    """
     given = os.environ if environment is None else environment
     if given.get("LISTEN_PID") != str(os.getpid()):
         return None

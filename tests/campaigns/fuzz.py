@@ -179,8 +179,8 @@ def laser_board() -> Target:
 
 def service_messages() -> Target:
     """Messages of clients and of the service's own processes."""
-    from runtime.service.inside import CAMERA, SOLVER
-    from runtime.service.messages import ProtocolError
+    from runtime.service.message_format import ProtocolError
+    from runtime.service.process_messages import CAMERA, SOLVER
     from runtime.service.protocol import PROTOCOL
 
     def one(data: bytes) -> None:

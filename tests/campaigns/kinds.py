@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 
-from runtime.service.client import Lost
+from runtime.service.client import LostFrame
 from runtime.service.protocol import PROTOCOL, Begin, Code, Done, End
 from tests.campaigns.headset import knock
 from tests.campaigns.lane import Lane
@@ -121,7 +121,7 @@ def _torn_slot(lane: Lane) -> float:
     while time.monotonic() < end:
         for outcome in lane.take(0.1):
             if outcome.frame == timing.frame:
-                assert isinstance(outcome, Lost) and outcome.code == Code.TORN
+                assert isinstance(outcome, LostFrame) and outcome.code == Code.TORN
                 return at
     raise AssertionError("a torn frame had no outcome")
 

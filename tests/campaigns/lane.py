@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from firmware_iface.virtual.served import Remote, i2c_bus
-from runtime.service.client import Client, Lost, RefusedError
-from runtime.service.protocol import Lasers, Part, Shown
+from runtime.service.client import Client, LostFrame, RefusedError
+from runtime.service.protocol import LaserState, PartState, Shown
 from tests.campaigns.headset import ENVIRONMENT, connected, hardware, picture, urgent, write_configuration
 from tests.campaigns.service import noted
 
@@ -41,7 +41,7 @@ class Lane:
         solve_ms = min(SOLVE_MS, 300 / refresh_hz)
         self.file = write_configuration(folder, refresh_hz, solve_ms, STALE_MS, oak)
         self.accepted = self.shown = self.lost = 0
-        self.outcomes: list[Shown | Lost] = []
+        self.outcomes: list[Shown | LostFrame] = []
         self.latest = self.stored = 0
         self._stack = ExitStack()
         self.remote: Remote = self._stack.enter_context(hardware(folder, seed, oak))
@@ -100,11 +100,11 @@ class Lane:
             time.sleep(0.002)
         self.take()
 
-    def take(self, within_s: float = 0.0) -> list[Shown | Lost]:
+    def take(self, within_s: float = 0.0) -> list[Shown | LostFrame]:
         """Outcomes since the last time."""
         self.outcomes = list(self.client.outcomes(within_s))
         self.shown += sum(isinstance(o, Shown) for o in self.outcomes)
-        self.lost += sum(isinstance(o, Lost) for o in self.outcomes)
+        self.lost += sum(isinstance(o, LostFrame) for o in self.outcomes)
         return self.outcomes
 
     def reconnect(self, within_s: float = RECOVERY_S) -> None:
@@ -139,15 +139,15 @@ class Lane:
         answered = time.monotonic()
         while time.monotonic() < end:
             state = self.client.status()
-            if state.lasers != Lasers.LOST:
+            if state.lasers != LaserState.LOST:
                 answered = time.monotonic()
             elif time.monotonic() > answered + LOST_FOR_S:
                 self.store_dark()
                 answered = time.monotonic()
             parts = {state.panel, state.solver, state.camera}
-            if state.lasers == Lasers.EMITTING and parts == {Part.FRESH} and self.lit():
+            if state.lasers == LaserState.EMITTING and parts == {PartState.FRESH} and self.lit():
                 return True
-            if parts == {Part.FRESH} and state.lasers in (Lasers.OFF, Lasers.FAULT):
+            if parts == {PartState.FRESH} and state.lasers in (LaserState.OFF, LaserState.FAULT):
                 with suppress(RefusedError):
                     self.client.clear()
                     self.client.arm()
@@ -174,6 +174,6 @@ def _words(pid: str) -> str:
 
 
 def _crc(gray: np.ndarray) -> int:
-    from runtime.service.ring import crc32
+    from runtime.service.shared_memory import crc32
 
     return crc32(gray)

@@ -14,7 +14,7 @@ from pathlib import Path
 from runtime.service import solver_process
 from runtime.service.configuration import read_configuration
 from runtime.service.frame_solver import Pattern
-from runtime.service.ring import crc32
+from runtime.service.shared_memory import crc32
 from runtime.service.supervisor import Supervisor
 
 NOTES = "patterns.crc"
@@ -49,5 +49,5 @@ if __name__ == "__main__":
     else:
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # it is not to outlive its campaign
         supervisor = Supervisor(read_configuration(sys.argv[1]))
-        supervisor.pipeline.solver.module = "tests.campaigns.service"
+        supervisor.pipeline.solver.process.module = "tests.campaigns.service"
         supervisor.run()

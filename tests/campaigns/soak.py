@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from runtime.service.client import Lost
+from runtime.service.client import LostFrame
 from tests.campaigns.lane import Lane
 
 SETTLED = 0.1  # of the frames, before memory counts
@@ -47,7 +47,7 @@ def soak(frames: int, refresh_hz: float) -> dict[str, Any]:
                 sent[lane.latest] = time.monotonic()
                 for outcome in lane.outcomes:
                     at = sent.pop(outcome.frame, None)
-                    if isinstance(outcome, Lost):
+                    if isinstance(outcome, LostFrame):
                         lost += 1
                         print(f"frame {outcome.frame}: {outcome.text}", file=sys.stderr)
                     elif at is not None:

@@ -1,4 +1,4 @@
-"""`hololoop-runtime benchmark`: its keys, and figures that hang together."""
+"""`hololoop-runtime benchmark`: its keys, and figures that agree with each other."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def measured() -> dict:
     return measure(((72, 128), (54, 96)), solves=5)
 
 
-def test_the_figures_hang_together(measured: dict) -> None:
+def test_the_figures_agree_with_each_other(measured: dict) -> None:
     assert measured["iteration_over_floor"] == pytest.approx(
         measured["iteration_ms"] / measured["fft_floor_ms"], rel=0.05
     )

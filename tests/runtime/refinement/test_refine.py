@@ -1,4 +1,4 @@
-"""A displayed picture gets better by what a camera sees of it; it stops, goes back, logs, and lets lasers be."""
+"""A displayed picture gets better by the camera's captures; refinement stops, rolls back, logs, and sets no laser."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from runtime.camera.view import View
 from runtime.cli import main
 from runtime.lightpath.light_path import LightPath
 from runtime.networks.onnx_approximator import Approximator
-from runtime.refinement.refine import HOLD_OUT, Refinement, _to_step, refine
-from runtime.refinement.viewer import Eye
+from runtime.refinement.panel_and_camera import PanelAndCamera
+from runtime.refinement.picture_refinement import HOLD_OUT, Refinement, _to_step, refine
 from runtime.solver import solve
 from tests.runtime.benches import converted, ideal_path, scene
 
@@ -66,8 +66,8 @@ def lit_headset(*defects: str) -> VirtualHeadset:
     return headset
 
 
-def eye(headset: VirtualHeadset) -> Eye:
-    return Eye(headset.panel, headset.camera, View(SHAPE), 64.0)
+def panel_and_camera_of(headset: VirtualHeadset) -> PanelAndCamera:
+    return PanelAndCamera(headset.panel, headset.camera, View(SHAPE), 64.0)
 
 
 @pytest.mark.parametrize(
@@ -83,19 +83,19 @@ def test_the_displayed_picture_gets_better(
     target = scene(SHAPE)[None]
     state = Refinement([path], approximator, target, start)
     before = quality(headset.true_irradiance(state.gray[0], "green"), target[0]).psnr_db
-    steps = refine(state, eye(headset), 30)
+    steps = refine(state, panel_and_camera_of(headset), 30)
     after = quality(headset.true_irradiance(headset.panel.gray, "green"), target[0]).psnr_db
     assert after > before + better_db
     np.testing.assert_array_equal(headset.panel.gray, state.gray[0])  # the best is what stays on the panel
     assert max(s.psnr_db for s in steps) > steps[0].psnr_db + better_db
 
 
-def test_the_adapters_learn_what_a_camera_sees(
+def test_the_adapters_learn_from_captures(
     approximator: Approximator, path: LightPath, start: np.ndarray
 ) -> None:
-    """A perfect bench: the pattern hardly moves, and D comes nearer to captures that it never learned from."""
+    """D learns, and only from captures that are not held out."""
     state = Refinement([path], approximator, scene(SHAPE)[None], start)
-    steps = refine(state, eye(lit_headset("ghost")), 13)
+    steps = refine(state, panel_and_camera_of(lit_headset("ghost")), 13)
     held = [s for s in steps if s.held_out]
     assert [s.number for s in held] == [1, 4, 7, 10, 13]
     assert all(s.heldout == held[0].heldout for s in steps[:HOLD_OUT])
@@ -105,18 +105,18 @@ def test_the_adapters_learn_what_a_camera_sees(
 def test_it_stops_where_the_held_out_error_rises_and_keeps_the_best(
     approximator: Approximator, path: LightPath, start: np.ndarray
 ) -> None:
-    """Somebody walks through the light, except when a capture is held out: what is learned then is wrong."""
+    """The captures are shifted, except when one is held out: the adapters learn something wrong."""
     headset = lit_headset()
-    look, taken = eye(headset), 0
+    capture, count = panel_and_camera_of(headset), 0
 
-    def see(gray: np.ndarray) -> np.ndarray:
-        nonlocal taken
-        taken += 1
-        seen = look(gray)
-        return seen if taken < 8 or (taken - 1) % HOLD_OUT == 0 else np.roll(seen, 17, axis=2)
+    def show_and_capture(gray: np.ndarray) -> np.ndarray:
+        nonlocal count
+        count += 1
+        captured = capture(gray)
+        return captured if count < 8 or (count - 1) % HOLD_OUT == 0 else np.roll(captured, 17, axis=2)
 
     state = Refinement([path], approximator, scene(SHAPE)[None], start)
-    steps = refine(state, see, 60)
+    steps = refine(state, show_and_capture, 60)
     assert steps[-1].stopped == "the held-out error rises" and 10 <= len(steps) < 40
     assert all(s.stopped is None for s in steps[:-1])
     worst = max(s.drift for s in steps)
@@ -129,7 +129,7 @@ def test_it_can_be_rolled_back(approximator: Approximator, path: LightPath, star
     before = {name: weights.copy() for name, weights in approximator.adapters.items()}
     state = Refinement([path], approximator, scene(SHAPE)[None], start)
     first = state.gray
-    refine(state, eye(lit_headset("ghost")), 5)
+    refine(state, panel_and_camera_of(lit_headset("ghost")), 5)
     assert any((approximator.adapters[n] != w).any() for n, w in before.items())
     state.rollback()
     assert state.stopped is None
@@ -144,7 +144,7 @@ def test_every_capture_is_a_line_of_the_drift_log(
 ) -> None:
     log = io.StringIO()
     state = Refinement([path], approximator, scene(SHAPE)[None], start, log)
-    steps = refine(state, eye(lit_headset()), 4)
+    steps = refine(state, panel_and_camera_of(lit_headset()), 4)
     lines = [json.loads(line) for line in log.getvalue().splitlines()]
     assert [line["number"] for line in lines] == [1, 2, 3, 4]
     assert lines[2]["drift"] == steps[2].drift and lines[0]["held_out"] and not lines[1]["held_out"]
@@ -159,18 +159,18 @@ def test_it_never_moves_the_laser(approximator: Approximator, path: LightPath, s
 
     for name in ("set_power", "off"):
         setattr(headset.lasers, name, refuse(name))
-    looker = eye(headset)
-    refine(Refinement([path], approximator, scene(SHAPE)[None], start), looker, 6)
+    panel_and_camera = panel_and_camera_of(headset)
+    refine(Refinement([path], approximator, scene(SHAPE)[None], start), panel_and_camera, 6)
     assert asked == [] and headset.lasers.power("green") == 0.8 and headset.camera.exposure_ms == 25.0
-    assert not any(value is headset.lasers for value in vars(looker).values())
+    assert not any(value is headset.lasers for value in vars(panel_and_camera).values())
 
 
 def test_where_camera_and_model_agree_the_gradient_is_the_models(
     approximator: Approximator, path: LightPath, start: np.ndarray
 ) -> None:
-    """The captured picture takes the place of the simulated one: given the simulated one, it is plain descent."""
+    """With the simulated picture as the captured one, the step is plain gradient descent."""
     from runtime.lightpath.light_path import irradiance, irradiance_and_pullback, pixel_irradiance
-    from runtime.refinement.refine import STEP, _amplitude, _matched
+    from runtime.refinement.picture_refinement import STEP, _amplitude, _matched
 
     target = scene(SHAPE)[None]
     start = start + np.random.default_rng(0).normal(0, 0.5, start.shape).astype(np.float32)
@@ -189,7 +189,7 @@ def test_where_camera_and_model_agree_the_gradient_is_the_models(
     assert np.abs(wanted - start[0]).max() > 0.05
 
 
-def test_what_does_not_fit_is_said(
+def test_sizes_that_differ_are_refused(
     files: dict[str, bytes], approximator: Approximator, path: LightPath, start: np.ndarray
 ) -> None:
     target = scene(SHAPE)[None]
@@ -202,7 +202,7 @@ def test_what_does_not_fit_is_said(
         state.take(np.ones(SHAPE))
 
 
-def test_the_command_refines_a_picture_and_leaves_the_bundle_and_the_dark(
+def test_the_command_refines_a_picture_and_changes_neither_bundle_nor_lasers(
     files: dict[str, bytes],
     path: LightPath,
     tmp_path: Path,
@@ -313,5 +313,4 @@ def test_three_colours_take_turns_and_each_is_refined(
             quality(headset.true_irradiance(gray, name), wanted).psnr_db
             for gray in (solve(path, wanted).gray, shown)
         )
-        print(name, before, after)
         assert after > before + 3, name

@@ -1,4 +1,4 @@
-"""A small share of the fault campaign, and the soak, in every run of the tests."""
+"""A small part of the fault campaign, and a short run without faults, in every run of the tests."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.campaigns.soak import soak
 
 
 def test_every_kind_of_fault_is_survived() -> None:
-    """Dark where that is demanded, nothing torn, nothing lost without a word, and back again."""
+    """Dark where that is required, nothing torn, every frame answered, and every headset recovers."""
     result = campaign(count=68, seed=7, lanes=2, oak=False)
     found = summary(result)
     assert list(found) == [
@@ -34,12 +34,12 @@ def test_every_kind_of_fault_is_survived() -> None:
     assert set(found["by_kind"]) == {kind.name for kind in KINDS}
     assert found["torn_frames"] == found["lost_without_error"] == found["not_recovered"] == 0
     assert found["dark_required"] > 30
-    # a machine that does other things may steal some milliseconds; the table in the README is of a quiet one
+    # a busy machine may delay it by some milliseconds; the table in the README was measured on an idle one
     assert found["dark_in_time"] >= 0.9 * found["dark_required"]
     assert found["worst_dark_ms"] < 900
 
 
-def test_a_plan_is_fixed_by_its_seed_and_shares_all_faults_out() -> None:
+def test_a_plan_is_fixed_by_its_seed_and_has_all_faults() -> None:
     first = plans(500, 3, 3, slow_first=True)
     assert first == plans(500, 3, 3, slow_first=True) != plans(500, 4, 3, slow_first=True)
     assert sum(map(len, first)) == 500 and len(first[0]) == pytest.approx(100, abs=1)
@@ -48,14 +48,13 @@ def test_a_plan_is_fixed_by_its_seed_and_shares_all_faults_out() -> None:
 def test_a_run_without_faults_loses_nothing_and_does_not_grow() -> None:
     found = soak(600, 100.0)
     assert found["shown"] + found["lost"] >= 590 and found["lost_without_error"] == found["torn_frames"] == 0
-    assert (
-        found["lost"] <= 2
-    )  # a machine that does other things may stop everything for longer than a frame may wait
+    # a busy machine may stop everything for longer than a frame may wait
+    assert found["lost"] <= 2
     assert all(memory["end"] - memory["settled"] < 3 for memory in found["memory_mb"].values())
 
 
 def test_noise_in_the_dacs_memory_keeps_the_light_off_until_it_is_written_dark(tmp_path: Path) -> None:
-    """As garbage on the bus can write it. Opening the lasers refuses until a person has mended it."""
+    """As random bytes on the bus can write it. Opening the lasers refuses until a person has corrected it."""
     lane = Lane(tmp_path, 0)
     try:
         assert lane.light_up()

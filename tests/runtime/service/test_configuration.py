@@ -1,4 +1,4 @@
-"""The one TOML file: what is read, and the sentence for everything that cannot be."""
+"""The configuration: what is read, and the error for everything that cannot be."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "says"),
+    ("before", "after", "message"),
     [
         ("schema = 1", "schema = 2", "schema = 1"),
         ('bundle = "bundle"', "", "names no bundle"),
@@ -45,8 +45,8 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
         ("[panel]", "[panel", "is not TOML"),
     ],
 )
-def test_a_mistake_is_a_sentence_and_exit_2(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], before: str, after: str, says: str
+def test_a_mistake_is_one_line_and_exit_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], before: str, after: str, message: str
 ) -> None:
     file = write_configuration(tmp_path)
     text = file.read_text()
@@ -54,12 +54,12 @@ def test_a_mistake_is_a_sentence_and_exit_2(
     file.write_text(text.replace(before, after, 1))
     with pytest.raises(InputError) as found:
         read_configuration(file)
-    assert says in str(found.value)
+    assert message in str(found.value)
     assert main(["serve", str(file)]) == 2
     out, err = capsys.readouterr()
-    assert out == "" and err.count("\n") == 1 and says in err
+    assert out == "" and err.count("\n") == 1 and message in err
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_file_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["serve", str(tmp_path / "none.toml")]) == 2
     assert "none.toml is missing" in capsys.readouterr().err

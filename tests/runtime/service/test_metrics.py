@@ -1,4 +1,4 @@
-"""Metrics: every name that monitoring relies on is there from the start, and counts what happens."""
+"""Metrics: every name that monitoring relies on exists from the start, and counts the events."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from firmware_iface.errors import InputError
-from runtime.service.faults import Faults
+from runtime.service.fault_log import FaultLog
 from runtime.service.metrics import STAGES, Metrics
-from runtime.service.protocol import Lasers
+from runtime.service.protocol import LaserState
 
 
 def scraped(metrics: Metrics) -> dict[tuple[str, ...], float]:
@@ -31,18 +31,18 @@ def test_what_happened_is_read_over_http(capsys: pytest.CaptureFixture[str]) -> 
     metrics = Metrics()
     metrics.shown.inc()
     metrics.late.inc(0)
-    metrics.lasers(Lasers.FAULT)
+    metrics.lasers(LaserState.FAULT)
     metrics.laser_power.labels("green").set(0.5)
     metrics.stage_seconds.labels("solve").observe(0.003)
-    faults = Faults(metrics)
+    faults = FaultLog(metrics)
     for _ in range(3):
         faults.note("panel", "unplugged")
     found = scraped(metrics)
     assert found["hololoop_frames_shown_total",] == 1 and found["hololoop_frames_late_total",] == 0
     assert found["hololoop_faults_total", "panel"] == faults.count == 3
-    assert capsys.readouterr().err == "panel: unplugged\n"  # said once
-    states = {state: found["hololoop_laser_state", state.name.lower()] for state in Lasers}
-    assert states == {state: float(state is Lasers.FAULT) for state in Lasers}
+    assert capsys.readouterr().err == "panel: unplugged\n"  # written once
+    states = {state: found["hololoop_laser_state", state.name.lower()] for state in LaserState}
+    assert states == {state: float(state is LaserState.FAULT) for state in LaserState}
     assert found["hololoop_laser_power", "green"] == 0.5
     assert {stage: found["hololoop_frame_stage_seconds_count", stage] for stage in STAGES} == {
         stage: float(stage == "solve") for stage in STAGES
@@ -51,7 +51,7 @@ def test_what_happened_is_read_over_http(capsys: pytest.CaptureFixture[str]) -> 
     assert found["hololoop_frame_stage_seconds_bucket", "0.004", "solve"] == 1
 
 
-def test_a_port_that_is_taken_is_a_sentence() -> None:
+def test_a_port_that_is_taken_is_an_error() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

@@ -21,11 +21,11 @@ import pytest
 from firmware_iface.virtual.served import Remote
 from runtime.cli import main
 from runtime.service import protocol
-from runtime.service.client import Client, Lost, RefusedError
+from runtime.service.client import Client, LostFrame, RefusedError
 from runtime.service.configuration import read_configuration
-from runtime.service.link import Link, Peer
-from runtime.service.messages import HEADER
-from runtime.service.protocol import Code, Lasers, Part, Shown
+from runtime.service.message_format import HEADER
+from runtime.service.protocol import Code, LaserState, PartState, Shown
+from runtime.service.socket_link import MessageLink, PeerCredentials
 from runtime.service.supervisor import Supervisor
 from tests.campaigns.headset import ENVIRONMENT, connected, hardware, picture, served, write_configuration
 
@@ -46,7 +46,7 @@ def headset(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Headset]:
 @pytest.fixture
 def client(headset: Headset) -> Iterator[Client]:
     with connected(headset.file) as client:
-        until(lambda: {client.status().panel, client.status().camera} == {Part.FRESH})
+        until(lambda: {client.status().panel, client.status().camera} == {PartState.FRESH})
         yield client
         client.dark()
 
@@ -54,21 +54,21 @@ def client(headset: Headset) -> Iterator[Client]:
 def until(condition: Callable[[], object], within_s: float = 15.0) -> None:
     end = time.monotonic() + within_s
     while not condition():
-        assert time.monotonic() < end, "it did not happen"
+        assert time.monotonic() < end, "it did not happen in time"
         time.sleep(0.01)
 
 
-def patiently(once: Callable[[], None]) -> None:
-    """Up to five times: a busy machine lets something go stale now and then, and then a person has to arm."""
+def within_five_attempts(once: Callable[[], None]) -> None:
+    """Try up to five times: on a busy machine something may become stale, and then a program has to arm again."""
     for _ in range(4):
         with suppress(AssertionError):
             return once()
     return once()
 
 
-def show(client: Client, frames: int) -> list[Shown | Lost]:
-    """What became of so many frames."""
-    outcomes: list[Shown | Lost] = []
+def show(client: Client, frames: int) -> list[Shown | LostFrame]:
+    """Outcomes of `frames` frames."""
+    outcomes: list[Shown | LostFrame] = []
     for k in range(frames):
         client.show(picture(client, k))
         outcomes += client.outcomes()
@@ -78,11 +78,11 @@ def show(client: Client, frames: int) -> list[Shown | Lost]:
 
 
 def light_up(client: Client, remote: Remote) -> None:
-    """Clear, arm and show until there is light; again where a busy machine let something go stale meanwhile."""
+    """Clear, arm and show until there is light; again where something became stale on a busy machine."""
     end = time.monotonic() + 30
     while emitted_uw(remote) == 0:
         assert time.monotonic() < end, client.status()
-        if client.status().lasers in (Lasers.OFF, Lasers.FAULT):
+        if client.status().lasers in (LaserState.OFF, LaserState.FAULT):
             with suppress(RefusedError):
                 client.clear()
                 client.arm()
@@ -105,7 +105,7 @@ def test_every_frame_is_shown_and_what_the_panel_displays_is_what_was_solved(
 
 def test_light_needs_clear_and_arm_and_a_fresh_picture(headset: Headset, client: Client) -> None:
     show(client, 3)
-    assert emitted_uw(headset.remote) == 0 and client.status().lasers in (Lasers.OFF, Lasers.FAULT)
+    assert emitted_uw(headset.remote) == 0 and client.status().lasers in (LaserState.OFF, LaserState.FAULT)
     with pytest.raises(RefusedError, match="Clear first"):
         client.arm()
 
@@ -113,11 +113,11 @@ def test_light_needs_clear_and_arm_and_a_fresh_picture(headset: Headset, client:
         light_up(client, headset.remote)
         until(lambda: show(client, 1) and emitted_uw(headset.remote) == pytest.approx(50, rel=0.02), 5)
         until(lambda: emitted_uw(headset.remote) == 0, 3)  # nothing new is shown
-        until(lambda: client.status().lasers == Lasers.ARMED, 1)
-        # nothing was wrong, so nobody has to clear and arm
+        until(lambda: client.status().lasers == LaserState.ARMED, 1)
+        # there was no fault, so no program has to clear and arm
         until(lambda: show(client, 2) and emitted_uw(headset.remote) > 0, 3)
 
-    patiently(once)
+    within_five_attempts(once)
     client.dark()
     assert emitted_uw(headset.remote) == 0
 
@@ -129,7 +129,7 @@ def test_the_camera_sees_what_the_lasers_light(headset: Headset, client: Client)
         light_up(client, headset.remote)
         until(lambda: show(client, 1) and client.capture().mean() > dark + 20, 5)
 
-    patiently(once)
+    within_five_attempts(once)
 
 
 def test_an_open_interlock_is_dark_and_latches(headset: Headset, client: Client) -> None:
@@ -137,7 +137,7 @@ def test_an_open_interlock_is_dark_and_latches(headset: Headset, client: Client)
     opened = headset.remote.set_to("interlock", False)
     assert emitted_uw(headset.remote) == 0
     assert all(at < opened + 0.02 for at, power in headset.remote.light(opened) if power)
-    until(lambda: client.status().lasers == Lasers.FAULT)
+    until(lambda: client.status().lasers == LaserState.FAULT)
     with pytest.raises(RefusedError, match="interlock"):
         client.clear()
     headset.remote.set_to("interlock", True)
@@ -146,17 +146,17 @@ def test_an_open_interlock_is_dark_and_latches(headset: Headset, client: Client)
     light_up(client, headset.remote)
 
 
-def test_a_panel_that_is_unplugged_is_dark_and_comes_back_without_a_restart(
+def test_an_unplugged_panel_is_dark_and_works_again_without_a_restart(
     headset: Headset, client: Client
 ) -> None:
     light_up(client, headset.remote)
     headset.remote.break_part("panel", "unplug")
     until(lambda: emitted_uw(headset.remote) == 0, 3)
     lost = show(client, 3)
-    assert lost and all(isinstance(o, Lost) and o.code == Code.PANEL for o in lost)
-    until(lambda: client.status().panel == Part.LOST)
+    assert lost and all(isinstance(o, LostFrame) and o.code == Code.PANEL for o in lost)
+    until(lambda: client.status().panel == PartState.LOST)
     headset.remote.mend("panel")
-    until(lambda: client.status().panel == Part.FRESH)
+    until(lambda: client.status().panel == PartState.FRESH)
     light_up(client, headset.remote)
 
 
@@ -165,7 +165,7 @@ def test_a_killed_process_is_dark_and_is_started_again(headset: Headset, client:
     light_up(client, headset.remote)
     os.kill(child(client, name), signal.SIGKILL)
     until(lambda: emitted_uw(headset.remote) == 0, 3)
-    until(lambda: getattr(client.status(), name) == Part.FRESH)
+    until(lambda: getattr(client.status(), name) == PartState.FRESH)
     light_up(client, headset.remote)
 
 
@@ -187,10 +187,12 @@ def test_a_slot_that_is_written_after_end_is_not_shown(client: Client) -> None:
     client._taken[timing.frame] = 0
     client._ask(right, protocol.Done)
     [outcome] = client.outcomes(5)
-    assert isinstance(outcome, Lost) and outcome.code == Code.TORN
+    assert isinstance(outcome, LostFrame) and outcome.code == Code.TORN
 
 
-def test_one_program_has_the_display_and_others_may_look_and_darken(headset: Headset, client: Client) -> None:
+def test_one_program_has_the_display_and_others_may_ask_for_status_and_dark(
+    headset: Headset, client: Client
+) -> None:
     light_up(client, headset.remote)
     with connected(headset.file) as other:
         with pytest.raises(RefusedError) as refused:
@@ -201,7 +203,7 @@ def test_one_program_has_the_display_and_others_may_look_and_darken(headset: Hea
     assert emitted_uw(headset.remote) == 0
 
 
-def test_the_display_is_free_when_its_program_goes(headset: Headset, client: Client) -> None:
+def test_the_display_is_free_when_its_program_disconnects(headset: Headset, client: Client) -> None:
     client.show(picture(client))
     client.close()
     with connected(headset.file) as other:
@@ -231,7 +233,7 @@ def raw(headset: Headset) -> socket.socket:
     return connection
 
 
-def test_a_version_that_is_not_spoken_is_refused_with_the_ones_that_are(headset: Headset) -> None:
+def test_an_unknown_version_is_refused_with_the_supported_ones(headset: Headset) -> None:
     with raw(headset) as connection:
         connection.send(protocol.PROTOCOL.pack(protocol.Hello(protocol.MAGIC, 7, 9), 1))
         serial, error = protocol.PROTOCOL.unpack(connection.recv(512))
@@ -239,8 +241,10 @@ def test_a_version_that_is_not_spoken_is_refused_with_the_ones_that_are(headset:
         assert connection.recv(512) == b""
 
 
-def test_random_messages_are_answered_by_errors_and_harm_nobody(headset: Headset, client: Client) -> None:
-    """Seeded: whole garbage, garbage behind a right header, right messages in a wrong order."""
+def test_random_messages_are_answered_by_errors_and_disturb_no_other_program(
+    headset: Headset, client: Client
+) -> None:
+    """Seeded: random bytes, random bytes after a valid header, valid messages in a wrong order."""
     rng = np.random.default_rng(5)
     kinds = protocol.PROTOCOL._bodies
     for k in range(300):
@@ -281,7 +285,7 @@ def test_a_passed_pipe_or_unsealed_memory_is_refused_as_a_ring(client: Client) -
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
 def test_a_program_in_c_shows_a_frame(headset: Headset, tmp_path: Path) -> None:
-    """With the header alone."""
+    """With only the header."""
     source, header = Path(__file__).with_name("client.c"), Path(protocol.__file__).parent
     program = tmp_path / "client"
     command = [
@@ -302,40 +306,44 @@ def test_a_program_in_c_shows_a_frame(headset: Headset, tmp_path: Path) -> None:
     assert done.stdout.startswith("24 x 32, frame 1 in slot 1, ") and done.stdout.endswith("solver 1\n")
 
 
-def test_a_black_picture_is_dark_at_once_and_light_comes_back_without_arming(
+def test_a_black_picture_is_dark_at_once_and_the_next_is_lit_without_arming(
     headset: Headset, client: Client
 ) -> None:
-    """No pattern shows black: all light goes somewhere."""
+    """No pattern can show black: the light always goes somewhere."""
+
+    def dark_after_its_outcome() -> bool:
+        list(client.outcomes(0.5))
+        return emitted_uw(headset.remote) == 0
 
     def once() -> None:
         light_up(client, headset.remote)
         client.show(np.zeros(client.shape, np.uint16))
-        until(lambda: list(client.outcomes(0.5)) is not None and emitted_uw(headset.remote) == 0, 0.4)
-        assert client.status().lasers == Lasers.ARMED
+        until(dark_after_its_outcome, 0.4)
+        assert client.status().lasers == LaserState.ARMED
         until(lambda: show(client, 2) and emitted_uw(headset.remote) > 0, 5)
 
-    patiently(once)
+    within_five_attempts(once)
 
 
 def test_frames_are_lit_by_all_lasers_when_the_light_of_each_pattern_is_predicted(tmp_path: Path) -> None:
-    """Every pattern then waits for the lasers' word before it is shown."""
+    """Every pattern then waits until the lasers are ready for it."""
     file = write_configuration(tmp_path)
     power = "power = { red = 1.0, green = 1.0, blue = 1.0 }\nmrad_per_pixel = 5.0"
     file.write_text(file.read_text().replace("power = { green = 0.5 }", power))
     with hardware(tmp_path) as remote, served(file), connected(file) as client:
-        until(lambda: client.status().panel == Part.FRESH and client.status().camera == Part.FRESH)
+        until(lambda: client.status().panel == PartState.FRESH and client.status().camera == PartState.FRESH)
 
         def once() -> None:
             light_up(client, remote)
             until(lambda: show(client, 2) and emitted_uw(remote) == pytest.approx(235, rel=0.02), 5)
 
-        patiently(once)
+        within_five_attempts(once)
 
 
 def test_a_user_who_is_not_listed_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the credentials that the kernel gives, before anything is read."""
+    """By the kernel's credentials, before anything is read."""
     supervisor = Supervisor(read_configuration(write_configuration(tmp_path)))
-    monkeypatch.setattr(Link, "peer", lambda link: Peer(1, 12345, 12345))
+    monkeypatch.setattr(MessageLink, "peer", lambda link: PeerCredentials(1, 12345, 12345))
     with (
         socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener,
         socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as program,
@@ -343,10 +351,10 @@ def test_a_user_who_is_not_listed_is_refused(tmp_path: Path, monkeypatch: pytest
         listener.bind(str(tmp_path / "here"))
         listener.listen(1)
         program.connect(str(tmp_path / "here"))
-        supervisor._accept(listener)
+        supervisor.programs.accept(listener)
         _, error = protocol.PROTOCOL.unpack(program.recv(512))
         assert error.code == Code.REFUSED and "12345" in error.text
-        assert program.recv(512) == b"" and not supervisor.sessions
+        assert program.recv(512) == b"" and not supervisor.programs.sessions
 
 
 def test_the_lasers_are_switched_off_by_a_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -361,7 +369,7 @@ def test_the_lasers_are_switched_off_by_a_command(tmp_path: Path, capsys: pytest
 
 
 def test_a_socket_that_systemd_passes_is_served(tmp_path: Path) -> None:
-    """sd_listen_fds: the listener is descriptor 3, and connections wait in it until the service is there."""
+    """sd_listen_fds: the listener is descriptor 3, and connections wait in it until the service has started."""
     file = write_configuration(tmp_path)
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with listener, hardware(tmp_path):
@@ -383,7 +391,7 @@ def test_a_socket_that_systemd_passes_is_served(tmp_path: Path) -> None:
     assert process.returncode == 0
 
 
-def test_sigterm_is_dark_first_and_tells_programs(tmp_path: Path) -> None:
+def test_sigterm_switches_the_lasers_off_and_ends_the_service(tmp_path: Path) -> None:
     file = write_configuration(tmp_path)
     notify = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     with notify, hardware(tmp_path) as remote:
@@ -393,7 +401,11 @@ def test_sigterm_is_dark_first_and_tells_programs(tmp_path: Path) -> None:
             assert notify.recv(500).startswith(b"READY=1")
             assert notify.recv(500) == b"WATCHDOG=1"
             with connected(file) as client:
-                until(lambda: client.status().panel == Part.FRESH and client.status().camera == Part.FRESH)
+                until(
+                    lambda: (
+                        client.status().panel == PartState.FRESH and client.status().camera == PartState.FRESH
+                    )
+                )
                 light_up(client, remote)
                 client.show(picture(client))
                 process.send_signal(signal.SIGTERM)
@@ -407,7 +419,9 @@ def test_a_service_that_is_killed_is_dark_by_the_dead_man_and_can_be_started_aga
     file = write_configuration(tmp_path)
     with hardware(tmp_path) as remote:
         with served(file) as process, connected(file) as client:
-            until(lambda: client.status().panel == Part.FRESH and client.status().camera == Part.FRESH)
+            until(
+                lambda: client.status().panel == PartState.FRESH and client.status().camera == PartState.FRESH
+            )
             light_up(client, remote)
             killed = time.monotonic()
             process.kill()
@@ -415,11 +429,13 @@ def test_a_service_that_is_killed_is_dark_by_the_dead_man_and_can_be_started_aga
             until(lambda: emitted_uw(remote) == 0, 1)
             assert max(at for at, _ in remote.light(killed)) < killed + 0.15
         with served(file), connected(file) as client:
-            until(lambda: client.status().panel == Part.FRESH and client.status().camera == Part.FRESH)
+            until(
+                lambda: client.status().panel == PartState.FRESH and client.status().camera == PartState.FRESH
+            )
             light_up(client, remote)
 
 
-def test_a_broken_bundle_ends_the_service_with_a_sentence(tmp_path: Path) -> None:
+def test_a_broken_bundle_ends_the_service_with_one_error(tmp_path: Path) -> None:
     file = write_configuration(tmp_path)
     arrays = tmp_path / "bundle" / "lightpath.safetensors"
     data = bytearray(arrays.read_bytes())

@@ -1,4 +1,4 @@
-"""systemd's side: notifications, the watchdog, the passed socket, and unit files that it takes."""
+"""systemd: notifications, the watchdog, the passed socket, and unit files that systemd accepts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from firmware_iface.errors import InputError
 from runtime.service.configuration import read_configuration
 from runtime.service.systemd import Notifier, passed_socket
-from runtime.service.units import write_units
+from runtime.service.systemd_units import write_units
 from tests.campaigns.headset import write_configuration
 
 
@@ -29,7 +29,7 @@ def test_notifications_arrive_as_sd_notify_sends_them(tmp_path: Path) -> None:
         notifier.alive()
         notifier.stopping()
         assert [manager.recv(100) for _ in range(3)] == [b"READY=1\nSTATUS=up", b"WATCHDOG=1", b"STOPPING=1"]
-    notifier.alive()  # a manager that has gone is no reason to fail
+    notifier.alive()  # a manager that has ended is no reason to fail
 
 
 def test_an_abstract_socket_is_understood() -> None:
@@ -40,7 +40,7 @@ def test_an_abstract_socket_is_understood() -> None:
         assert manager.recv(100) == b"WATCHDOG=1"
 
 
-def test_without_systemd_nothing_is_said() -> None:
+def test_without_systemd_nothing_is_sent() -> None:
     notifier = Notifier({})
     notifier.ready("up")
     assert notifier.watchdog_s is None
@@ -61,7 +61,7 @@ def test_two_sockets_are_one_too_many() -> None:
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="there is no systemd-analyze")
-def test_systemd_takes_the_unit_files(tmp_path: Path) -> None:
+def test_systemd_accepts_the_unit_files(tmp_path: Path) -> None:
     paths = write_units(read_configuration(write_configuration(tmp_path)), tmp_path / "units")
     done = subprocess.run(
         ["systemd-analyze", "verify", *map(str, paths)], capture_output=True, text=True, check=False

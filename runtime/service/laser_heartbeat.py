@@ -1,9 +1,9 @@
-"""The lasers' thread: the heartbeat, and light only for what is fresh.
+"""The lasers' thread: the heartbeat of the safety controller, and power only while a fresh pattern is displayed.
 
-Nothing here makes light safe; the safety controller does. This thread feeds its dead-man while panel, solver,
-camera and the service's own loop show signs of life, asks for power only while a fresh pattern is on the
-panel, and takes whatever the bus does wrong as a reason to go dark. When this process dies or hangs, the
-heartbeat ends and the controller darkens the lasers by itself.
+Nothing here makes light safe; the safety controller does. This thread feeds the controller's dead-man timer while
+panel, solver, camera and the service's own loop show signs of life. It asks for power only while a fresh pattern is on
+the panel, and it switches the lasers off after any error on the bus. When this process dies or hangs, the heartbeat
+ends and the controller switches the lasers off by itself.
 """
 
 from __future__ import annotations
@@ -20,36 +20,56 @@ from typing import Any
 
 from firmware_iface.errors import DeviceError, InputError
 from firmware_iface.lasers.safety_controller import Fault
-from runtime.service.protocol import Lasers
+from runtime.service.protocol import LaserState
 
 BEAT_S, RAMP_STEP_S = 0.020, 0.005
-LOOK_S = 0.1  # a board that is not armed is asked for its state so often
+LOOK_S = 0.1  # between requests for the state of a board that is not armed
 AGAIN_S = 0.05  # between attempts to open the lasers
-RISE_AGAIN_S = 1.0  # after a pattern had the power lowered
+RISE_AGAIN_S = 1.0  # after a pattern lowered the power
 CLEAR_TO_ARM_S = 5.0
 DEVICE_ERRORS = (DeviceError, InputError, OSError)
-STATES = {"off": Lasers.OFF, "armed": Lasers.ARMED, "emit": Lasers.EMITTING, "fault": Lasers.FAULT}
+STATES = {
+    "off": LaserState.OFF,
+    "armed": LaserState.ARMED,
+    "emit": LaserState.EMITTING,
+    "fault": LaserState.FAULT,
+}
 
 
 @dataclass(frozen=True)
-class Request:
-    """Something asked of the lasers, and where the answer goes: None for done, else what is wrong."""
+class LaserRequest:
+    """A request to the lasers, and the function that gets the answer: None for done, else what is wrong."""
 
     what: str
     answer: Callable[[str | None], None]
 
 
-class Lighting(threading.Thread):
+class LaserHeartbeat(threading.Thread):
     """Owns the lasers.
 
-    open_lasers : opens them, dark; called again whenever the bus was lost
-    power : fraction of full for each channel while something fresh is shown
-    fresh_until : by name, until when each loop that has to be fresh is (CLOCK_MONOTONIC, ns)
-    lit_until_ns : until when what is on the panel may be lit
-    fault : called with a kind and a sentence for each fault, in this thread
+    Parameters
+    ----------
+    open_lasers : callable
+        Opens the lasers, dark; called again whenever the bus was lost.
+    power : dict of str to float
+        Fraction of full power for each channel while a fresh pattern is displayed.
+    fresh_until : callable
+        Returns, by name, until when each part that light depends on counts as fresh (CLOCK_MONOTONIC, ns).
+    lit_until_ns : callable
+        Returns until when the pattern on the panel may be lit (CLOCK_MONOTONIC, ns).
+    fault : callable
+        Called with a kind and a sentence for each fault, in this thread.
 
-    Attributes: state and faults (of the safety controller), turned_ns (this loop's own sign of life), level
-    (fraction of full that each channel is at).
+    Attributes
+    ----------
+    state : LaserState
+        State of the safety controller.
+    faults : int
+        Bits of the safety controller's faults.
+    turned_ns : int, ns
+        When the loop last turned: the thread's own sign of life.
+    level : dict of str to float
+        Present power of each channel, fraction of full.
     """
 
     def __init__(
@@ -60,45 +80,51 @@ class Lighting(threading.Thread):
         lit_until_ns: Callable[[], int],
         fault: Callable[[str, str], None],
     ) -> None:
-        super().__init__(name="lighting", daemon=True)
+        super().__init__(name="lasers", daemon=True)
         self._open, self._power, self._fresh_until = open_lasers, power, fresh_until
         self._lit_until_ns, self._fault = lit_until_ns, fault
         self._lasers: Any = None
         self._ramp: Iterator[None] | None = None
-        self._requests: deque[Request] = deque()
+        self._requests: deque[LaserRequest] = deque()
         self._wake = threading.Event()
         self._stopping = False
         self._cleared_at = -CLEAR_TO_ARM_S
         self._looked_at = 0.0
         self._risen_at = 0.0
         self._expected: tuple[float, ...] = ()
-        self.state, self.faults = Lasers.LOST, 0
+        self.state, self.faults = LaserState.LOST, 0
         self.level = dict.fromkeys(power, 0.0)
         self.turned_ns = time.monotonic_ns()
 
     @property
     def armed(self) -> bool:
         """Whether light is possible."""
-        return self.state in (Lasers.ARMED, Lasers.EMITTING)
+        return self.state in (LaserState.ARMED, LaserState.EMITTING)
 
     def ask(self, what: str, answer: Callable[[str | None], None]) -> None:
         """Ask for "clear", "arm" or "dark"; `answer` is called in this thread."""
-        self._requests.append(Request(what, answer))
+        self._requests.append(LaserRequest(what, answer))
         self._wake.set()
 
     def expect(self, shares: bytes, then: Callable[[], None]) -> None:
-        """Say what light the next pattern is predicted to make, and what to do when the power is right for it.
+        """Set the limits of power for the next pattern, then call `then`.
 
-        shares : 13 float32, from eye_safety.spot_shares; zeros: not predicted, and taken to be one spot
+        Parameters
+        ----------
+        shares : bytes
+            13 float32, from eye_safety.spot_shares: the light that the pattern is predicted to make. Zeros: it is
+            not predicted, and all light counts as one spot.
+        then : callable
+            Called when the power is right for the pattern.
         """
         if not any(shares) or not self.armed:
             then()
             return
         self._expected = struct.unpack("<13f", shares)
-        self.ask("expect", lambda wrong: then())
+        self.ask("expect", lambda problem: then())
 
     def stop(self) -> None:
-        """Dark at once, then end the thread."""
+        """Switch the lasers off at once, then end the thread."""
         self._stopping = True
         self._wake.set()
         self.join(2)
@@ -120,7 +146,7 @@ class Lighting(threading.Thread):
         self._close()
 
     def _turn(self) -> None:
-        """One beat: what was asked, whether all is fresh, the heartbeat, the light."""
+        """One beat: requests, signs of life, the heartbeat, the power."""
         while self._requests:
             request = self._requests.popleft()
             request.answer(self._do(request.what))
@@ -134,25 +160,25 @@ class Lighting(threading.Thread):
         now = time.monotonic_ns()
         if silent := self._silent(now):
             self._lasers.trip()
-            self._fallen("silent", f"dark: no sign of life of {', '.join(silent)}")
+            self._darkened("silent", f"dark: no sign of life of {', '.join(silent)}")
             return
         try:
             self._lasers.heartbeat()
             self._light(now < self._lit_until_ns())
-        except DeviceError as error:  # the driver has darkened everything before it said so
-            self._fallen("lasers", str(error))
+        except DeviceError as error:  # the driver has switched everything off before it raised
+            self._darkened("lasers", str(error))
 
-    def _light(self, wanted: bool) -> None:
-        """Up slowly while something fresh is shown, down at once when it is not."""
-        if not wanted:
+    def _light(self, on: bool) -> None:
+        """Raise the power slowly while a fresh pattern is displayed; switch off at once when none is."""
+        if not on:
             self._ramp = None
-            if self.state == Lasers.EMITTING:
+            if self.state == LaserState.EMITTING:
                 self._lasers.off()
-                self.state = Lasers.ARMED
-        elif self._ramp is None and (self.state == Lasers.ARMED or self._may_rise()):
+                self.state = LaserState.ARMED
+        elif self._ramp is None and (self.state == LaserState.ARMED or self._may_rise()):
             self._ramp = chain.from_iterable(self._lasers.ramp(c, p) for c, p in self._power.items())
             self._risen_at = time.monotonic()
-            self.state = Lasers.EMITTING
+            self.state = LaserState.EMITTING
         try:
             if self._ramp is not None and next(self._ramp, self) is self:
                 self._ramp = None
@@ -162,12 +188,12 @@ class Lighting(threading.Thread):
         self.level = {channel: self._lasers.power(channel) for channel in self._power}
 
     def _may_rise(self) -> bool:
-        """Whether a pattern had the power lowered, and enough time has passed for another to allow more."""
+        """Whether a pattern lowered the power, and enough time has passed to try more for another."""
         lowered = any(self.level[channel] < power for channel, power in self._power.items())
         return lowered and time.monotonic() - self._risen_at > RISE_AGAIN_S
 
     def _do(self, what: str) -> str | None:
-        """Do what was asked; what is wrong, or None."""
+        """Do what was asked; returns what is wrong, or None."""
         now = time.monotonic()
         try:
             if what == "expect":
@@ -176,12 +202,12 @@ class Lighting(threading.Thread):
                 self._lasers.trip()
                 self._dark()
             elif what == "clear":
-                # a board that was without power has lost its ceilings and limits: set everything anew
+                # a board that was without power has lost its ceilings and limits: set all of them again
                 self._close()
                 self._lasers = self._open()
                 self._lasers.clear()
                 self._cleared_at = now
-                self.state, self.faults = Lasers.OFF, 0
+                self.state, self.faults = LaserState.OFF, 0
             elif now - self._cleared_at > CLEAR_TO_ARM_S:
                 return f"send Clear first, at most {CLEAR_TO_ARM_S:g} s before Arm"
             elif silent := self._silent(time.monotonic_ns()):
@@ -189,7 +215,7 @@ class Lighting(threading.Thread):
             else:
                 self._cleared_at = -CLEAR_TO_ARM_S
                 self._lasers.arm()
-                self.state = Lasers.ARMED
+                self.state = LaserState.ARMED
         except DEVICE_ERRORS as error:
             self._dark()
             return str(error)
@@ -198,21 +224,27 @@ class Lighting(threading.Thread):
     def _silent(self, now_ns: int) -> list[str]:
         return [name for name, until_ns in self._fresh_until().items() if until_ns < now_ns]
 
-    def _fallen(self, kind: str, text: str) -> None:
-        """The lasers are dark because of this."""
+    def _darkened(self, kind: str, text: str) -> None:
+        """Note the fault that has made the lasers dark."""
         self._fault(kind, text)
         self._dark()
 
     def _dark(self) -> None:
-        """The driver has darkened everything; what the board says of that is asked at the next turn."""
+        """The driver has switched everything off; the next turn asks the board for its state."""
         self._ramp = None
         self.level = dict.fromkeys(self._power, 0.0)
         self._looked_at = 0.0
         if self.armed:
-            self.state = Lasers.FAULT
+            self.state = LaserState.FAULT
 
     def _look(self) -> None:
-        """What the board says of itself. Raises DeviceError where it says nothing."""
+        """Ask the board for its state.
+
+        Raises
+        ------
+        DeviceError
+            Where it does not answer.
+        """
         self._ramp = None
         self._looked_at = time.monotonic()
         status = self._lasers.status()
@@ -221,10 +253,10 @@ class Lighting(threading.Thread):
         self.level = dict(status["power"])
 
     def _lost(self, error: Exception) -> None:
-        """The board does not answer: without a heartbeat it goes dark by itself; try again from the start."""
-        if self.state != Lasers.LOST:
+        """The board does not answer: without a heartbeat it switches the lasers off by itself. Open it again."""
+        if self.state != LaserState.LOST:
             self._fault("laser_bus", str(error))
-        self.state, self.faults = Lasers.LOST, 0
+        self.state, self.faults = LaserState.LOST, 0
         while self._requests:
             self._requests.popleft().answer(f"the lasers do not answer: {error}")
         self._close()

@@ -9,24 +9,24 @@ import struct
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from runtime.service.messages import LARGEST, ProtocolError, Vocabulary
+from runtime.service.message_format import LARGEST, ProtocolError, Vocabulary
 
-MOST_FDS = 4  # room for more than any message has, so that too many are seen and closed
+MOST_FDS = 4  # room for more than any message has, so that surplus descriptors are received and closed
 
 
-class Peer(NamedTuple):
-    """Who is at the other end, as the kernel says."""
+class PeerCredentials(NamedTuple):
+    """Process and user at the other end, as the kernel reports them."""
 
     pid: int
     uid: int
     gid: int
 
 
-class Link:
+class MessageLink:
     """Sends and receives whole messages, each with at most one file descriptor.
 
-    Sending never waits for the other side on a socket that does not block: a peer that lets its buffer fill
-    up is a BlockingIOError, to be taken as gone.
+    On a socket that does not block, sending never waits for the other side: a peer that lets its buffer fill
+    up causes BlockingIOError, and the caller treats it as disconnected.
     """
 
     def __init__(self, connection: socket.socket, vocabulary: Vocabulary) -> None:
@@ -37,7 +37,13 @@ class Link:
         return self.connection.fileno()
 
     def send(self, message: NamedTuple, serial: int = 0, fds: Sequence[int] = ()) -> None:
-        """Send one message. Raises OSError where the other side is gone or does not read."""
+        """Send one message.
+
+        Raises
+        ------
+        OSError
+            Where the other side has disconnected or does not read.
+        """
         data = self.vocabulary.pack(message, serial)
         if fds:
             socket.send_fds(self.connection, [data], list(fds))
@@ -45,10 +51,23 @@ class Link:
             self.connection.send(data)
 
     def receive(self) -> tuple[int, Any, int | None]:
-        """Serial, message, and the descriptor that came with it; the caller closes that.
+        """Receive one message.
 
-        Raises ProtocolError for what is no message, ConnectionResetError at the end, and on a socket that does
-        not block BlockingIOError where there is nothing yet.
+        Returns
+        -------
+        serial : int
+        message : NamedTuple
+        fd : int or None
+            The descriptor that came with the message; the caller closes it.
+
+        Raises
+        ------
+        ProtocolError
+            For bytes that are not a message.
+        ConnectionResetError
+            At the end of the connection.
+        BlockingIOError
+            On a socket that does not block, where there is nothing yet.
         """
         room = socket.CMSG_SPACE(MOST_FDS * 4)
         data, control, flags, _ = self.connection.recvmsg(LARGEST, room, socket.MSG_CMSG_CLOEXEC)
@@ -70,10 +89,10 @@ class Link:
             raise
         return serial, message, fds[0] if fds else None
 
-    def peer(self) -> Peer:
+    def peer(self) -> PeerCredentials:
         """The credentials of the other side at the time it connected."""
         size = struct.calcsize("3i")
-        return Peer(
+        return PeerCredentials(
             *struct.unpack("3i", self.connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size))
         )
 

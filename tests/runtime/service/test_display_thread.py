@@ -1,4 +1,4 @@
-"""The panel's thread: order, tries again, staleness, a panel that goes and comes back."""
+"""The panel's thread: order, retries, staleness, a panel that is disconnected and connected again."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ import numpy as np
 import pytest
 
 from firmware_iface.errors import DeviceError, DeviceGoneError
-from runtime.service.display import Clock, Display, Ready
+from runtime.service.display_thread import DisplayClock, DisplayPattern, DisplayThread
 
 PERIOD_NS = 5_000_000
 STALE_NS = 100_000_000
 
 
 class Panel:
-    """Notes what it is shown; fails as it is told."""
+    """Records what it is shown; fails as the test sets it."""
 
     def __init__(self) -> None:
-        self.seen: list[int] = []
+        self.shown: list[int] = []
         self.failures: list[Exception] = []
-        self.there = True
+        self.connected = True
         self.opened = 0
 
     def open(self) -> Panel:
-        if not self.there:
+        if not self.connected:
             raise DeviceGoneError("unplugged")
         self.opened += 1
         return self
 
     def show(self, gray: np.ndarray) -> None:
         self._fail()
-        self.seen.append(int(gray[0, 0]))
+        self.shown.append(int(gray[0, 0]))
 
     def status(self) -> dict:
         self._fail()
@@ -42,7 +42,7 @@ class Panel:
         pass
 
     def _fail(self) -> None:
-        if not self.there:
+        if not self.connected:
             raise DeviceGoneError("unplugged")
         if self.failures:
             raise self.failures.pop()
@@ -54,10 +54,10 @@ class Events:
         self.dropped_jobs: list[int] = []
         self.faults: list[str] = []
 
-    def shown(self, pattern: Ready, at_ns: int, transfer_s: float) -> None:
+    def shown(self, pattern: DisplayPattern, at_ns: int, transfer_s: float) -> None:
         self.shown_jobs.append(pattern.job)
 
-    def dropped(self, pattern: Ready, reason: str) -> None:
+    def dropped(self, pattern: DisplayPattern, reason: str) -> None:
         self.dropped_jobs.append(pattern.job)
 
     def panel_fault(self, error: Exception) -> None:
@@ -65,17 +65,17 @@ class Events:
 
 
 @pytest.fixture
-def running() -> Iterator[tuple[Panel, Display, Events]]:
+def running() -> Iterator[tuple[Panel, DisplayThread, Events]]:
     panel, events = Panel(), Events()
-    display = Display(panel.open, Clock(PERIOD_NS), STALE_NS, events)
+    display = DisplayThread(panel.open, DisplayClock(PERIOD_NS), STALE_NS, events)
     display.start()
     yield panel, display, events
     display.stop()
 
 
-def ready(job: int, in_ns: int, value: int | None = None, final: bool = True) -> Ready:
+def ready(job: int, in_ns: int, value: int | None = None, final: bool = True) -> DisplayPattern:
     gray = np.full((1, 2, 2), job if value is None else value, np.uint8)
-    return Ready(job, time.monotonic_ns() + in_ns, gray, 0, 30.0, final)
+    return DisplayPattern(job, time.monotonic_ns() + in_ns, gray, 0, 30.0, final)
 
 
 def until(condition, within_s: float = 5.0) -> None:
@@ -92,7 +92,7 @@ def test_patterns_are_shown_in_order_and_not_before_their_time(running) -> None:
     display.put(ready(1, 3 * PERIOD_NS))
     until(lambda: events.shown_jobs == [1, 2])
     assert time.monotonic_ns() > late.display_ns - PERIOD_NS
-    assert panel.seen == [1, 2] and not events.dropped_jobs
+    assert panel.shown == [1, 2] and not events.dropped_jobs
 
 
 def test_the_best_pattern_by_the_display_time_is_shown(running) -> None:
@@ -100,10 +100,10 @@ def test_the_best_pattern_by_the_display_time_is_shown(running) -> None:
     display.put(ready(1, 4 * PERIOD_NS, value=7, final=False))
     display.put(ready(1, 4 * PERIOD_NS, value=9))
     until(lambda: events.shown_jobs == [1])
-    assert panel.seen == [9]
+    assert panel.shown == [9]
 
 
-def test_what_the_panel_did_not_take_is_tried_again(running) -> None:
+def test_a_pattern_that_the_panel_did_not_accept_is_tried_again(running) -> None:
     panel, display, events = running
     panel.failures = [DeviceError("short"), DeviceError("garbage")]
     display.put(ready(1, 0))
@@ -115,16 +115,16 @@ def test_a_stale_pattern_is_dropped_and_not_shown(running) -> None:
     panel, display, events = running
     display.put(ready(1, -2 * STALE_NS))
     until(lambda: events.dropped_jobs == [1])
-    assert panel.seen == [] and display.lit_until_ns == 0
+    assert panel.shown == [] and display.lit_until_ns == 0
 
 
 def test_a_panel_that_comes_back_shows_again_and_meanwhile_frames_are_dropped(running) -> None:
     panel, display, events = running
-    panel.there = False
+    panel.connected = False
     display.put(ready(1, PERIOD_NS))
     until(lambda: events.dropped_jobs == [1] and not display.open)
     answered = display.answered_ns
-    panel.there = True
+    panel.connected = True
     until(lambda: display.open)
     display.put(ready(2, PERIOD_NS))
     until(lambda: events.shown_jobs == [2])
@@ -148,7 +148,7 @@ def test_light_is_allowed_for_the_stale_limit_only(running) -> None:
 
 @pytest.mark.parametrize("offset", [-3, 0, 1, 4_999_999, 5_000_000, 123_456_789])
 def test_the_clock_gives_the_first_display_time_that_is_not_before(offset: int) -> None:
-    clock = Clock(PERIOD_NS)
+    clock = DisplayClock(PERIOD_NS)
     tick = clock.after(clock.origin_ns + offset)
     assert (tick - clock.origin_ns) % PERIOD_NS == 0
     assert 0 <= tick - (clock.origin_ns + offset) < PERIOD_NS

@@ -1,7 +1,7 @@
 """Arrays in memory that two processes share: a ring of equal slots in a sealed memfd.
 
-A memfd that may shrink lets its owner kill the reader (SIGBUS on the missing page), so one without the seals
-is refused. Who may write which slot when is said by messages; the kernel does not know.
+A memfd that may shrink lets its owner kill the reader (SIGBUS on the missing page), so a memfd without the seals
+is refused. Messages say which process may write which slot; the kernel does not enforce it.
 """
 
 from __future__ import annotations
@@ -22,21 +22,26 @@ UNCHANGEABLE = FIXED_SIZE | fcntl.F_SEAL_WRITE | fcntl.F_SEAL_SEAL
 class Ring:
     """Slots of one shape and type.
 
-    slots : array [n, *shape]; read-only where the ring came from another process
+    Attributes
+    ----------
+    fd : int
+        Descriptor of the memfd; -1 after `close`.
+    slots : array [n, *shape]
+        Read-only where the ring came from another process.
     """
 
     def __init__(self, fd: int, slots: np.ndarray) -> None:
         self.fd, self.slots = fd, slots
 
     def close(self) -> None:
-        """Close the descriptor; the memory goes when the last array on it does."""
+        """Close the descriptor; the memory is freed with the last array on it."""
         if self.fd >= 0:
             os.close(self.fd)
             self.fd = -1
 
 
 def make_ring(count: int, shape: tuple[int, ...], dtype: type[np.generic]) -> Ring:
-    """A new ring of `count` zeroed slots, writable here, of a size that nobody can change."""
+    """A new ring of `count` zeroed slots, writable here, of a size that no process can change."""
     slot_bytes = int(np.prod(shape)) * np.dtype(dtype).itemsize
     fd = os.memfd_create("hololoop-ring", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
     try:
@@ -50,9 +55,12 @@ def make_ring(count: int, shape: tuple[int, ...], dtype: type[np.generic]) -> Ri
 
 
 def open_ring(fd: int, count: int, shape: tuple[int, ...], dtype: type[np.generic]) -> Ring:
-    """Another process's ring, read-only; takes `fd` over.
+    """Another process's ring, read-only. The ring owns `fd` from now on.
 
-    Raises InputError, and closes `fd`, where it is no sealed memfd of at least that size.
+    Raises
+    ------
+    InputError
+        Where `fd` is not a sealed memfd of at least that size; `fd` is then closed.
     """
     try:
         size = count * int(np.prod(shape)) * np.dtype(dtype).itemsize
@@ -72,7 +80,7 @@ def open_ring(fd: int, count: int, shape: tuple[int, ...], dtype: type[np.generi
 
 
 def sealed_copy(array: np.ndarray) -> int:
-    """A memfd that holds an array's bytes and that nobody can change; the caller closes it."""
+    """A memfd that holds an array's bytes and that no process can change; the caller closes it."""
     fd = os.memfd_create("hololoop-picture", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
     try:
         with os.fdopen(os.dup(fd), "wb") as file:
@@ -85,7 +93,13 @@ def sealed_copy(array: np.ndarray) -> int:
 
 
 def read_sealed(fd: int, shape: tuple[int, ...], dtype: type[np.generic]) -> np.ndarray:
-    """The array in another process's memfd, read-only; takes `fd` over. Raises InputError as `open_ring`."""
+    """The array in another process's memfd, read-only; closes `fd`.
+
+    Raises
+    ------
+    InputError
+        As `open_ring`.
+    """
     ring = open_ring(fd, 1, shape, dtype)
     ring.close()
     return ring.slots[0]

@@ -16,7 +16,7 @@ import pytest
 from firmware_iface.virtual.served import Remote
 from runtime.bundle.bundle_folder import read_bundle, write_bundle
 from runtime.service.client import Client, RefusedError
-from runtime.service.protocol import Code, Lasers, Part, Shown
+from runtime.service.protocol import Code, LaserState, PartState, Shown
 from tests.campaigns.headset import SHAPE, connected, hardware, picture, served, write_configuration
 
 DEFECT = """
@@ -54,9 +54,9 @@ def headset(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Headset]:
 def client(headset: Headset) -> Iterator[Client]:
     with connected(headset.file) as client:
         end = time.monotonic() + 15
-        while {client.status().panel, client.status().camera} != {Part.FRESH}:
+        while {client.status().panel, client.status().camera} != {PartState.FRESH}:
             assert time.monotonic() < end
-        while client.status().lasers != Lasers.EMITTING:
+        while client.status().lasers != LaserState.EMITTING:
             assert time.monotonic() < end + 15
             keep_lit(client)
             display(client, 3)
@@ -65,15 +65,15 @@ def client(headset: Headset) -> Iterator[Client]:
 
 
 def keep_lit(client: Client) -> None:
-    """Arm again where a busy machine has let something go stale."""
-    if client.status().lasers in (Lasers.OFF, Lasers.FAULT):
+    """Arm again where something became stale on a busy machine."""
+    if client.status().lasers in (LaserState.OFF, LaserState.FAULT):
         with suppress(RefusedError):
             client.clear()
             client.arm()
 
 
 def display(client: Client, frames: int, seed: int = 0) -> list[Shown]:
-    """Show one picture so many times."""
+    """Show one picture `frames` times."""
     shown: list[Shown] = []
     for _ in range(frames):
         client.show(picture(client, seed))
@@ -90,20 +90,20 @@ def test_the_picture_on_display_gets_better_and_the_lasers_stay_as_they_are(
     began = time.monotonic()
     client.refine(12)
     end = time.monotonic() + 60
-    tried: set[int] = set()
+    displayed: set[int] = set()
     while client.refined is None:
         assert time.monotonic() < end, client.status()
         keep_lit(client)
-        tried |= {s.pattern_crc for s in display(client, 5)}
-    told = client.refined
-    assert told.captures == 12 and told.text == "all captures are taken"
-    assert told.best_psnr_db > told.first_psnr_db + 1
-    assert len(tried - before) >= 6
+        displayed |= {s.pattern_crc for s in display(client, 5)}
+    result = client.refined
+    assert result.captures == 12 and result.text == "all captures are taken"
+    assert result.best_psnr_db > result.first_psnr_db + 1
+    assert len(displayed - before) >= 6
     # never brighter than what was set; dark where this program paused
     assert all(power == pytest.approx(50, rel=0.02) or power < 50 for _, power in headset.remote.light(began))
-    # the best stays while the picture does; then the solver has its own again
+    # the best is shown as long as the picture; then the solver shows its own pattern again
     (best,) = {s.pattern_crc for s in display(client, 4)}
-    assert best in tried
+    assert best in displayed
     display(client, 2, seed=1)
     assert best not in {s.pattern_crc for s in display(client, 3)}
 
@@ -136,7 +136,7 @@ def test_it_ends_with_the_solver_and_begins_again(headset: Headset, client: Clie
     wait_for_the_end(client)
     assert client.refined is not None and "the solver had it" in client.refined.text
     end = time.monotonic() + 15
-    while client.status().solver != Part.FRESH:
+    while client.status().solver != PartState.FRESH:
         assert time.monotonic() < end
     client.refine(1000)
     display(client, 10)
@@ -145,19 +145,19 @@ def test_it_ends_with_the_solver_and_begins_again(headset: Headset, client: Clie
     assert client.refined.text == "its picture is no longer displayed"
 
 
-def test_what_cannot_be_refined_is_said(tmp_path: Path) -> None:
+def test_the_reason_is_given_where_nothing_can_be_refined(tmp_path: Path) -> None:
     file = write_configuration(tmp_path)
     with hardware(tmp_path), served(file), connected(file) as client:
         client.show(picture(client))
-        began_to_refine(client)
+        refine_once_dark_was_captured(client)
         display(client, 3)
         wait_for_the_end(client)
         assert client.refined is not None and client.refined.captures == 0
         assert "no approximator" in client.refined.text
 
 
-def began_to_refine(client: Client) -> None:
-    """Once the camera has seen darkness."""
+def refine_once_dark_was_captured(client: Client) -> None:
+    """Ask for a refinement until the camera has taken a picture in darkness."""
     end = time.monotonic() + 20
     while True:
         try:

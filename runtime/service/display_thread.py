@@ -1,8 +1,8 @@
 """The panel's thread: at every display time it puts the next pattern that is due on the panel.
 
-The panel is written to from here only, so no two frames mix. Patterns are shown in order, one a display time;
-one that the panel did not take is tried again at the next, until it is stale. A panel that is gone is looked
-for until it is back.
+Only this thread writes to the panel, so no two frames mix. Patterns are shown in order, one at each display time. A
+pattern that the panel did not accept is tried again at the next display time, until it is stale. A panel that was
+disconnected is opened again as soon as it answers.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ import numpy as np
 from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
 
 AGAIN_S = 0.02  # between attempts to open the panel
-ASK_S = 0.03  # an idle panel is asked for its status so often
-WAKE_NS = 300_000  # before the transfer begins, for the thread to get going
+ASK_S = 0.03  # between requests for the status of an idle panel
+WAKE_NS = 300_000  # before the transfer begins, for the thread to wake up
 DEVICE_ERRORS = (DeviceError, InputError, OSError)
 
 
-class Clock:
-    """The display's times: every `period_ns` since the start. All times are CLOCK_MONOTONIC, ns."""
+class DisplayClock:
+    """The display's times: one every `period_ns` since the start. All times are CLOCK_MONOTONIC, ns."""
 
     def __init__(self, period_ns: int) -> None:
         self.period_ns = period_ns
@@ -37,10 +37,27 @@ class Clock:
 
 
 @dataclass(frozen=True)
-class Ready:
-    """A pattern for the panel: gray levels of each colour, uint8 [C, H, W].
+class DisplayPattern:
+    """A pattern that is ready for the panel.
 
-    dark: not to be lit. refined: one of a refinement's, which the camera is to see.
+    Attributes
+    ----------
+    job : int
+        Number of the frame's job.
+    display_ns : int, ns
+        When the frame is to be displayed (CLOCK_MONOTONIC).
+    gray : uint8 array [C, H, W]
+        Gray levels of each colour.
+    crc : int
+        CRC-32 of `gray`.
+    psnr_db : float, dB
+        Amplitude PSNR that the calibrated model predicts.
+    final : bool
+        No better pattern follows for this job.
+    dark : bool
+        The pattern must not be lit.
+    refined : bool
+        The pattern is one of a refinement's, which the camera has to capture.
     """
 
     job: int
@@ -53,52 +70,74 @@ class Ready:
     refined: bool = False
 
 
-class Events(Protocol):
-    """What the display tells; called in its thread."""
+class DisplayEvents(Protocol):
+    """Calls that the display makes, in its own thread."""
 
-    def shown(self, pattern: Ready, at_ns: int, transfer_s: float) -> None:
+    def shown(self, pattern: DisplayPattern, at_ns: int, transfer_s: float) -> None:
         """A pattern is on the panel."""
 
-    def dropped(self, pattern: Ready, reason: str) -> None:
-        """A pattern will never be on the panel."""
+    def dropped(self, pattern: DisplayPattern, reason: str) -> None:
+        """A pattern will not be shown."""
 
     def panel_fault(self, error: Exception) -> None:
-        """The panel did not do something."""
+        """The panel failed to do something."""
 
 
-class Display(threading.Thread):
+class DisplayThread(threading.Thread):
     """Owns the panel.
 
-    open_panel : opens it; called again whenever it was lost
-    clock : display times
-    stale_ns : how long after its display time a pattern may be lit, and the panel be silent
+    Parameters
+    ----------
+    open_panel : callable
+        Opens the panel; called again whenever the panel was lost.
+    clock : DisplayClock
+        Display times.
+    stale_ns : int, ns
+        How long after its display time a pattern may be lit, and how long the panel may be silent.
+    events : DisplayEvents
+        What is called when a pattern was shown or dropped, or the panel failed.
+
+    Attributes
+    ----------
+    transfer_ns : int, ns
+        Running mean of the time that a transfer to the panel takes.
+    taken_ns : int, ns
+        Latest display time that has a pattern.
+    answered_ns : int, ns
+        When the panel last did what it was asked (CLOCK_MONOTONIC).
+    turned_ns : int, ns
+        When the loop last turned: the thread's own sign of life.
+    lit_until_ns : int, ns
+        Until when the pattern on the panel may be lit.
     """
 
-    def __init__(self, open_panel: Callable[[], Any], clock: Clock, stale_ns: int, events: Events) -> None:
+    def __init__(
+        self, open_panel: Callable[[], Any], clock: DisplayClock, stale_ns: int, events: DisplayEvents
+    ) -> None:
         super().__init__(name="display", daemon=True)
         self._open, self._clock, self._stale_ns, self._events = open_panel, clock, stale_ns, events
         self._lock = threading.Lock()
-        self._waiting: dict[int, Ready] = {}  # by job
+        self._waiting: dict[int, DisplayPattern] = {}  # by job
         self._panel: Any = None
         self._stopping = threading.Event()
-        self.transfer_ns = clock.period_ns // 10  # what a transfer takes, kept up to date
-        self.taken_ns = 0  # display time that has a pattern
-        self.answered_ns = 0  # when the panel last did what it was asked
+        self.transfer_ns = clock.period_ns // 10
+        self.taken_ns = 0
+        self.answered_ns = 0
         self.turned_ns = time.monotonic_ns()
-        self.lit_until_ns = 0  # what is on the panel may be lit until then
+        self.lit_until_ns = 0
 
     @property
     def open(self) -> bool:
-        """Whether the panel is there."""
+        """Whether the panel is open."""
         return self._panel is not None
 
-    def put(self, pattern: Ready) -> None:
-        """Show this at its display time; a job's better pattern replaces its worse one."""
+    def put(self, pattern: DisplayPattern) -> None:
+        """Show this at its display time; it replaces an earlier pattern of the same job."""
         with self._lock:
             self._waiting[pattern.job] = pattern
 
     def forget(self) -> None:
-        """Show nothing of what waits: whoever wanted it has gone."""
+        """Discard all waiting patterns: their program has disconnected."""
         with self._lock:
             self._waiting.clear()
 
@@ -111,7 +150,7 @@ class Display(threading.Thread):
         while not self._stopping.is_set():
             self.turned_ns = time.monotonic_ns()
             if self._panel is None and not self._opened():
-                self._drop_stale(time.monotonic_ns(), "the panel is gone")
+                self._drop_stale(time.monotonic_ns(), "the panel is disconnected")
                 self._stopping.wait(AGAIN_S)
                 continue
             tick = self._clock.after(time.monotonic_ns() + self.transfer_ns + WAKE_NS)
@@ -122,7 +161,7 @@ class Display(threading.Thread):
                 self._panel.close()
 
     def _turn(self, tick: int) -> None:
-        """What there is to do for one display time."""
+        """Do the work of one display time."""
         pattern = self._due(tick)
         try:
             if pattern is not None:
@@ -143,8 +182,8 @@ class Display(threading.Thread):
             if pattern is not None:
                 self._keep(pattern)
 
-    def _due(self, tick: int) -> Ready | None:
-        """The oldest pattern whose time has come and that is not stale; what is stale is dropped."""
+    def _due(self, tick: int) -> DisplayPattern | None:
+        """The oldest pattern that is due; drops stale patterns."""
         self._drop_stale(tick, "it could not be shown before it was stale")
         with self._lock:
             due = [p for p in self._waiting.values() if p.display_ns <= tick + self._clock.period_ns // 2]
@@ -152,7 +191,7 @@ class Display(threading.Thread):
                 return None
             return self._waiting.pop(min(due, key=lambda p: p.display_ns).job)
 
-    def _keep(self, pattern: Ready) -> None:
+    def _keep(self, pattern: DisplayPattern) -> None:
         """Try it again at the next display time."""
         with self._lock:
             self._waiting.setdefault(pattern.job, pattern)
@@ -165,7 +204,7 @@ class Display(threading.Thread):
         for pattern in stale:
             self._events.dropped(pattern, reason)
 
-    def _shown(self, pattern: Ready, tick: int, began_ns: int) -> None:
+    def _shown(self, pattern: DisplayPattern, tick: int, began_ns: int) -> None:
         now = time.monotonic_ns()
         took = now - began_ns
         self.transfer_ns = min(int(0.9 * self.transfer_ns + 0.1 * took), self._clock.period_ns // 2)

@@ -1,4 +1,4 @@
-"""Messages: every byte in its place, in Python and in C, and nothing but messages accepted."""
+"""The wire format: every byte in its place, in Python and in C; only messages are accepted."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from runtime.service import inside, protocol
-from runtime.service.messages import LARGEST, ProtocolError, Vocabulary, formats
+from runtime.service import process_messages, protocol
+from runtime.service.message_format import LARGEST, ProtocolError, Vocabulary, formats
 from runtime.service.protocol import PROTOCOL
 
 HEADER_FILE = Path(protocol.__file__).with_name("hololoop_service.h")
-VOCABULARIES = (PROTOCOL, inside.SOLVER, inside.CAMERA)
+VOCABULARIES = (PROTOCOL, process_messages.SOLVER, process_messages.CAMERA)
 VALUES = {
     "H": st.integers(0, 2**16 - 1),
     "I": st.integers(0, 2**32 - 1),
@@ -27,14 +27,14 @@ VALUES = {
 }
 
 
-def kinds(vocabulary: Vocabulary) -> list[type]:
+def message_types(vocabulary: Vocabulary) -> list[type]:
     return list(vocabulary._types.values())
 
 
 @given(st.data(), st.sampled_from(VOCABULARIES), st.integers(0, 2**32 - 1))
 def test_what_is_packed_comes_back(data: st.DataObject, vocabulary: Vocabulary, serial: int) -> None:
-    kind = data.draw(st.sampled_from(kinds(vocabulary)))
-    message = kind(*(data.draw(VALUES[f]) for f in formats(kind)))
+    message_type = data.draw(st.sampled_from(message_types(vocabulary)))
+    message = message_type(*(data.draw(VALUES[f]) for f in formats(message_type)))
     packed = vocabulary.pack(message, serial)
     assert len(packed) <= LARGEST
     assert vocabulary.unpack(packed) == (serial, message)
@@ -59,7 +59,7 @@ def test_a_long_text_is_cut_between_characters() -> None:
 
 
 def test_the_bytes_of_an_end_message() -> None:
-    """Written out, so that a change of the wire format is seen."""
+    """All bytes, so that a change of the wire format fails here."""
     packed = PROTOCOL.pack(protocol.End(frame=0x01020304, slot=2, crc=0xAABBCCDD), serial=7)
     assert packed.hex(" ") == "09 00 18 00 07 00 00 00 04 03 02 01 02 00 00 00 dd cc bb aa 00 00 00 00"
 
@@ -67,7 +67,7 @@ def test_the_bytes_of_an_end_message() -> None:
 @pytest.mark.parametrize(
     ("lowest", "highest", "agreed"), [(1, 1, 1), (1, 9, 1), (0, 1, 1), (2, 9, None), (0, 0, None)]
 )
-def test_versions_are_agreed_on(lowest: int, highest: int, agreed: int | None) -> None:
+def test_the_highest_common_version_is_agreed_on(lowest: int, highest: int, agreed: int | None) -> None:
     assert protocol.agreed_version(protocol.Hello(protocol.MAGIC, lowest, highest)) == agreed
 
 
@@ -86,16 +86,18 @@ STRUCTS = {
 def test_the_c_header_has_the_same_bytes(tmp_path: Path) -> None:
     """Sizes, offsets and codes, as the compiler sees them."""
     lines = []
-    for code, kind in PROTOCOL._types.items():
-        struct = f"struct hololoop_{STRUCTS.get(kind, kind.__name__.lower())}"
+    for code, message_type in PROTOCOL._types.items():
+        struct = f"struct hololoop_{STRUCTS.get(message_type, message_type.__name__.lower())}"
         offset = 8
         lines.append(
-            f'_Static_assert(HOLOLOOP_{kind.__name__.upper()} == {code}, "code of {kind.__name__}");'
+            f'_Static_assert(HOLOLOOP_{message_type.__name__.upper()} == {code}, "code of {message_type.__name__}");'
         )
-        for name, form in zip(kind._fields, formats(kind), strict=True):
-            lines.append(f'_Static_assert(offsetof({struct}, {name}) == {offset}, "{kind.__name__}.{name}");')
+        for name, form in zip(message_type._fields, formats(message_type), strict=True):
+            lines.append(
+                f'_Static_assert(offsetof({struct}, {name}) == {offset}, "{message_type.__name__}.{name}");'
+            )
             offset += {"H": 2, "I": 4, "Q": 8, "f": 4, "8s": 8, "240s": 240}[form]
-        lines.append(f'_Static_assert(sizeof({struct}) == {offset}, "size of {kind.__name__}");')
+        lines.append(f'_Static_assert(sizeof({struct}) == {offset}, "size of {message_type.__name__}");')
     names = {"WRONG_VERSION": "VERSION", "WRONG_ORDER": "ORDER", "WRONG_RING": "RING", "WRONG_SLOT": "SLOT"}
     names |= {f"NO_{part}": part for part in ("SOLVER", "PANEL", "LASERS", "CAMERA")}
     in_c = {python: c for c, python in names.items()}
@@ -103,9 +105,9 @@ def test_the_c_header_has_the_same_bytes(tmp_path: Path) -> None:
         lines.append(
             f'_Static_assert(HOLOLOOP_{in_c.get(code.name, code.name)} == {code.value}, "{code.name}");'
         )
-    for state in protocol.Lasers:
+    for state in protocol.LaserState:
         lines.append(f'_Static_assert(HOLOLOOP_LASERS_{state.name} == {state.value}, "{state.name}");')
-    for part in protocol.Part:
+    for part in protocol.PartState:
         lines.append(f'_Static_assert(HOLOLOOP_{part.name} == {part.value}, "{part.name}");')
     source = tmp_path / "check.c"
     source.write_text(

@@ -1,4 +1,4 @@
-"""Child processes of the supervisor: started with one end of a link, started again when they die."""
+"""Child processes of the supervisor: started with one end of a link, and started again when they die."""
 
 from __future__ import annotations
 
@@ -11,34 +11,46 @@ import sys
 import time
 from contextlib import suppress
 
-from runtime.service.link import Link
-from runtime.service.messages import Vocabulary
+from runtime.service.message_format import Vocabulary
+from runtime.service.socket_link import MessageLink
 
-PAUSE_S = 0.05  # before a child is started again, doubled with each death soon after its start
+PAUSE_S = 0.05  # before a child is started again; doubled with each death soon after its start
 LONGEST_PAUSE_S = 5.0
-SETTLED_S = 5.0  # alive so long, it counts as well started
+SETTLED_S = 5.0  # a child that lived so long was started well
 PR_SET_PDEATHSIG = 1
 
 
-class Child:
+class ChildProcess:
     """A Python module that runs as a process of its own: `python -m MODULE FD ARGUMENT`.
 
-    link : to it, non-blocking; None while it is not running
+    Parameters
+    ----------
+    module : str
+        Module to run, with its packages.
+    argument : str
+        What the module gets after the descriptor of its end of the link.
+    vocabulary : Vocabulary
+        Messages that may pass over the link.
+
+    Attributes
+    ----------
+    link : MessageLink or None
+        The supervisor's end, non-blocking; None while the process is not running.
     """
 
-    def __init__(self, name: str, module: str, argument: str, vocabulary: Vocabulary) -> None:
-        self.name, self.module, self.argument, self.vocabulary = name, module, argument, vocabulary
-        self.link: Link | None = None
+    def __init__(self, module: str, argument: str, vocabulary: Vocabulary) -> None:
+        self.module, self.argument, self.vocabulary = module, argument, vocabulary
+        self.link: MessageLink | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._pause_s = PAUSE_S
-        self._started = 0.0
-        self._start_at = 0.0
+        self._started_s = 0.0
+        self._next_start_s = 0.0
 
     def due(self, now_s: float) -> bool:
         """Whether it is not running and it is time to start it."""
-        return self.link is None and now_s >= self._start_at
+        return self.link is None and now_s >= self._next_start_s
 
-    def start(self) -> Link:
+    def start(self) -> MessageLink:
         """Start the process; returns the link to it."""
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         ours.setblocking(False)
@@ -49,8 +61,8 @@ class Child:
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,  # Ctrl-C is for the supervisor, which darkens the lasers first
             )
-        self._started = time.monotonic()
-        self.link = Link(ours, self.vocabulary)
+        self._started_s = time.monotonic()
+        self.link = MessageLink(ours, self.vocabulary)
         return self.link
 
     def stop(self) -> None:
@@ -64,16 +76,16 @@ class Child:
             self._process.wait()
             self._process = None
         now = time.monotonic()
-        if now - self._started > SETTLED_S:
+        if now - self._started_s > SETTLED_S:
             self._pause_s = PAUSE_S
-        self._start_at = now + self._pause_s
+        self._next_start_s = now + self._pause_s
         self._pause_s = min(2 * self._pause_s, LONGEST_PAUSE_S)
 
 
-def child_link(fd: str, vocabulary: Vocabulary) -> Link:
-    """The child's end, from its first argument; the process dies with its supervisor."""
+def child_link(fd: str, vocabulary: Vocabulary) -> MessageLink:
+    """The child's end of the link, from its first argument. The process then dies with its supervisor."""
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     connection = socket.socket(fileno=int(fd))
     os.set_inheritable(connection.fileno(), False)
-    return Link(connection, vocabulary)
+    return MessageLink(connection, vocabulary)

@@ -1,4 +1,4 @@
-"""The lasers' thread with a board of the test's own: what makes it dark, and what light it allows a pattern."""
+"""The lasers' thread with a simulated board: what makes it dark, and the power that it allows for a pattern."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ import pytest
 
 from firmware_iface.errors import DeviceError, InputError
 from firmware_iface.lasers.eye_safety import SIZES_MRAD
-from runtime.service.lighting import Lighting
-from runtime.service.protocol import Lasers
+from runtime.service.laser_heartbeat import LaserHeartbeat
+from runtime.service.protocol import LaserState
 
 SHARES = tuple(0.02 + 0.001 * (k + 1) for k in range(len(SIZES_MRAD)))
 
 
 class Board:
-    """Notes what it is told; fails as it is told."""
+    """Records its calls; fails as the test sets it."""
 
     def __init__(self) -> None:
-        self.told: list[Any] = []
+        self.calls: list[Any] = []
         self.state, self.level, self.fails = "off", 0.0, ""
         self.allowed = 1.0
 
@@ -30,7 +30,7 @@ class Board:
             self.trip()
             raise DeviceError(f"{what} failed")
         if what not in ("status", "heartbeat"):
-            self.told.append(what)
+            self.calls.append(what)
 
     def open(self) -> Board:
         self._do("open")
@@ -48,7 +48,7 @@ class Board:
         self.state = "armed"
 
     def trip(self) -> None:
-        self.told.append("trip")
+        self.calls.append("trip")
         self.state, self.level = "fault", 0.0
 
     def off(self) -> None:
@@ -56,11 +56,11 @@ class Board:
         self.level = 0.0
 
     def close(self) -> None:
-        self.told.append("close")
+        self.calls.append("close")
         self.state, self.level = "off", 0.0
 
     def expect(self, shares: Any) -> float:
-        self.told.append(shares)
+        self.calls.append(shares)
         self.allowed = 0.2 if shares["green"][0] > 0.1 else 1.0
         self.level = min(self.level, self.allowed)
         return 1.0
@@ -88,7 +88,7 @@ class Bench:
     def __init__(self) -> None:
         self.board, self.faults = Board(), []
         self.solver_until = self.lit_until = time.monotonic_ns() + 10**12
-        self.lighting = Lighting(
+        self.lasers = LaserHeartbeat(
             self.board.open,
             {"green": 0.5},
             lambda: {"solver": self.solver_until},
@@ -98,7 +98,7 @@ class Bench:
 
     def ask(self, what: str) -> str | None:
         answers: list[str | None] = []
-        self.lighting.ask(what, answers.append)
+        self.lasers.ask(what, answers.append)
         until(lambda: answers)
         return answers[0]
 
@@ -110,9 +110,9 @@ class Bench:
 @pytest.fixture
 def bench() -> Iterator[Bench]:
     bench = Bench()
-    bench.lighting.start()
+    bench.lasers.start()
     yield bench
-    bench.lighting.stop()
+    bench.lasers.stop()
 
 
 def until(condition, within_s: float = 5.0) -> None:
@@ -129,21 +129,21 @@ def test_nothing_is_armed_without_clear_and_what_was_cleared_is_armed_once(bench
     assert "Clear first" in (bench.ask("arm") or "") and bench.board.level == 0
 
 
-def test_a_loop_without_a_sign_of_life_latches(bench: Bench) -> None:
+def test_a_part_without_a_sign_of_life_latches(bench: Bench) -> None:
     bench.light_up()
     bench.solver_until = 0
-    until(lambda: bench.lighting.state == Lasers.FAULT)
-    assert bench.board.told[-1] == "trip" and bench.faults == ["silent"]
+    until(lambda: bench.lasers.state == LaserState.FAULT)
+    assert bench.board.calls[-1] == "trip" and bench.faults == ["silent"]
     assert bench.ask("clear") is None and "solver" in (bench.ask("arm") or "")
     bench.solver_until = time.monotonic_ns() + 10**12
     bench.light_up()
 
 
-def test_what_is_stale_is_not_lit_and_nothing_latches(bench: Bench) -> None:
+def test_a_stale_pattern_is_not_lit_and_nothing_latches(bench: Bench) -> None:
     bench.light_up()
     bench.lit_until = 0
     until(lambda: bench.board.level == 0)
-    assert bench.lighting.state == Lasers.ARMED and bench.faults == []
+    assert bench.lasers.state == LaserState.ARMED and bench.faults == []
     bench.lit_until = time.monotonic_ns() + 10**12
     until(lambda: bench.board.level == 0.5)
 
@@ -153,47 +153,47 @@ def test_a_board_that_fails_is_not_lit_again_by_itself(bench: Bench, what: str) 
     bench.light_up()
     bench.board.fails = what
     bench.lit_until = 0
-    until(lambda: bench.lighting.state == Lasers.FAULT)
+    until(lambda: bench.lasers.state == LaserState.FAULT)
     bench.board.fails, bench.lit_until = "", time.monotonic_ns() + 10**12
     time.sleep(0.1)
     assert bench.board.level == 0 and bench.faults == ["lasers"]
     bench.light_up()
 
 
-def test_a_board_that_says_nothing_is_opened_again(bench: Bench) -> None:
+def test_a_board_that_does_not_answer_is_opened_again(bench: Bench) -> None:
     bench.light_up()
     bench.board.fails = "status"
-    assert bench.ask("dark") is None  # it was told to go dark; that nothing is known of it then comes after
-    until(lambda: bench.lighting.state == Lasers.LOST)
+    assert bench.ask("dark") is None  # the board went dark; that its state is unknown is found later
+    until(lambda: bench.lasers.state == LaserState.LOST)
     bench.board.fails = ""
-    until(lambda: bench.lighting.state == Lasers.OFF)
+    until(lambda: bench.lasers.state == LaserState.OFF)
     bench.light_up()
 
 
 def test_a_pattern_waits_for_the_power_that_its_bright_spots_allow(bench: Bench) -> None:
     bench.light_up()
     shown: list[str] = []
-    bench.lighting.expect(struct.pack("<13f", *SHARES), lambda: shown.append("pattern"))
+    bench.lasers.expect(struct.pack("<13f", *SHARES), lambda: shown.append("pattern"))
     until(lambda: shown)
-    assert bench.board.told[-1] == {"green": pytest.approx(SHARES)}
-    told = len(bench.board.told)
-    bench.lighting.expect(bytes(52), lambda: shown.append("unpredicted"))
-    assert shown[-1] == "unpredicted" and len(bench.board.told) == told
+    assert bench.board.calls[-1] == {"green": pytest.approx(SHARES)}
+    count = len(bench.board.calls)
+    bench.lasers.expect(bytes(52), lambda: shown.append("unpredicted"))
+    assert shown[-1] == "unpredicted" and len(bench.board.calls) == count
 
 
 def test_power_that_a_bright_spot_lowered_comes_back_when_a_pattern_allows_it(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("runtime.service.lighting.RISE_AGAIN_S", 0.05)
+    monkeypatch.setattr("runtime.service.laser_heartbeat.RISE_AGAIN_S", 0.05)
     bench.light_up()
-    bench.lighting.expect(struct.pack("<13f", *(10 * s for s in SHARES)), lambda: None)
+    bench.lasers.expect(struct.pack("<13f", *(10 * s for s in SHARES)), lambda: None)
     until(lambda: "budget" in bench.faults)
-    assert bench.board.level == pytest.approx(0.2) and bench.lighting.state == Lasers.EMITTING
-    bench.lighting.expect(struct.pack("<13f", *SHARES), lambda: None)
+    assert bench.board.level == pytest.approx(0.2) and bench.lasers.state == LaserState.EMITTING
+    bench.lasers.expect(struct.pack("<13f", *SHARES), lambda: None)
     until(lambda: bench.board.level == 0.5)
 
 
 def test_the_end_is_dark(bench: Bench) -> None:
     bench.light_up()
-    bench.lighting.stop()
-    assert bench.board.told[-1] == "close" and bench.board.level == 0
+    bench.lasers.stop()
+    assert bench.board.calls[-1] == "close" and bench.board.level == 0

@@ -20,7 +20,7 @@ StartLimitBurst=5
 Type=notify
 NotifyAccess=main
 ExecStart={command} serve {config}
-# After every end, however it came: the safety controller's dead-man has already darkened the lasers.
+# After every end, for any reason: the safety controller's dead-man has already darkened the lasers.
 ExecStopPost={command} serve --dark {config}
 WatchdogSec=2
 WatchdogSignal=SIGKILL
@@ -30,7 +30,7 @@ TimeoutStopSec=3
 KillMode=control-group
 RuntimeDirectory=hololoop
 RuntimeDirectoryPreserve=yes
-# The heartbeat must not wait for anybody: 20 ms of the 100 ms are its own.
+# The heartbeat must not wait for other processes: 20 ms of the 100 ms are its own.
 CPUSchedulingPolicy=rr
 CPUSchedulingPriority=10
 LimitMEMLOCK=infinity
@@ -66,9 +66,12 @@ WantedBy=sockets.target
 
 
 def write_units(configuration: Configuration, folder: Path) -> list[Path]:
-    """Write hololoop.service and hololoop.socket into `folder`, made if it is not there; returns their paths.
+    """Write hololoop.service and hololoop.socket into `folder`, made if it does not exist; returns their paths.
 
-    Raises InputError where they cannot be written.
+    Raises
+    ------
+    InputError
+        Where they cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     found = shutil.which("hololoop-runtime", path=str(Path(sys.executable).parent)) or shutil.which(

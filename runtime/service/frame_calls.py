@@ -8,19 +8,30 @@ class OrderError(ValueError):
 
 
 class FrameCalls:
-    """Which frame was waited for, which is being drawn, and which slots the service has.
+    """The frame that was waited for, the frame that is being drawn, and the slots that the service has.
 
-    Frames count from 1.
+    Attributes
+    ----------
+    latest : int
+        Number of the latest frame; frames count from 1.
+    slots : dict of int to int
+        Slot of each accepted frame, by frame.
     """
 
     def __init__(self) -> None:
         self.latest = 0
         self._waited: int | None = None
         self._begun: int | None = None
-        self.slots: dict[int, int] = {}  # of accepted frames, by frame
+        self.slots: dict[int, int] = {}
 
     def check_wait(self) -> None:
-        """Raises OrderError while an earlier frame waits for its Begin."""
+        """Check that a Wait is allowed now.
+
+        Raises
+        ------
+        OrderError
+            While an earlier frame waits for its Begin.
+        """
         if self._waited is not None:
             raise OrderError(f"frame {self._waited} was given and not begun: send Begin before the next Wait")
 
@@ -49,5 +60,5 @@ class FrameCalls:
         self.slots[frame] = slot
 
     def settle(self, frame: int) -> int:
-        """A frame has come to its end; returns its slot, which is free."""
+        """A frame was shown or failed; returns its slot, which is free from now on."""
         return self.slots.pop(frame)

@@ -1,4 +1,4 @@
-"""Shared memory: what is accepted, and that it can neither shrink nor change under its reader."""
+"""Shared memory: which memory is accepted, and that it can neither shrink nor change while it is read."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from firmware_iface.errors import InputError
-from runtime.service.ring import crc32, make_ring, open_ring, read_sealed, sealed_copy
+from runtime.service.shared_memory import crc32, make_ring, open_ring, read_sealed, sealed_copy
 
 SHAPE = (2, 3, 4)
 
@@ -54,12 +54,12 @@ def plain_file() -> int:
 
 
 @pytest.mark.parametrize(
-    ("make", "says"),
+    ("make", "message"),
     [(unsealed, "seal it"), (half_sealed, "seal it"), (small, "larger"), (plain_file, "not a memfd")],
 )
-def test_what_could_fail_under_the_reader_is_refused(make, says: str) -> None:
+def test_what_could_fail_under_the_reader_is_refused(make, message: str) -> None:
     fd = make()
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=message):
         open_ring(fd, 3, SHAPE, np.uint16)
     with pytest.raises(OSError):
         os.fstat(fd)  # it was closed

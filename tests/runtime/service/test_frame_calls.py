@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.service.frames import FrameCalls, OrderError
+from runtime.service.frame_calls import FrameCalls, OrderError
 
 CALLS = st.lists(
     st.tuples(st.sampled_from(["wait", "begin", "end", "settle"]), st.integers(0, 4), st.integers(0, 2)),
