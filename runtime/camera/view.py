@@ -17,8 +17,8 @@ from firmware_iface.errors import InputError
 from runtime.bundle.bundle_folder import Bundle
 from runtime.camera.registration import panel_points
 from runtime.lightpath.fft import irfft2, rfft2
+from runtime.lightpath.grid import FINE, Grid, image_frequencies
 from runtime.lightpath.legendre import edge_to_edge, legendre_maps
-from runtime.lightpath.light_path import FINE, Grid, image_frequencies
 
 SENSITIVITY_ORDER = 4  # of the camera's own fall-off, so that none of it is taken for the beam's
 TERMS = 14  # of that order

@@ -15,14 +15,8 @@ import torch
 from torch import Tensor
 
 from runtime.lightpath.fft import irfft2, rfft2
-from runtime.lightpath.light_path import (
-    FINE,
-    LightPath,
-    at_pixels,
-    mode_irradiance,
-    panel_phase,
-    panel_spectrum,
-)
+from runtime.lightpath.grid import FINE, at_pixels
+from runtime.lightpath.light_path import LightPath, mode_irradiance, panel_phase, panel_spectrum
 from runtime.lightpath.propagation import (
     band_limit,
     far_field_matrix,

@@ -169,7 +169,8 @@ def test_where_camera_and_model_agree_the_gradient_is_the_models(
     approximator: Approximator, path: LightPath, start: np.ndarray
 ) -> None:
     """The captured picture takes the place of the simulated one: given the simulated one, it is plain descent."""
-    from runtime.lightpath.light_path import irradiance, irradiance_and_pullback, pixel_irradiance
+    from runtime.lightpath.light_path import irradiance, pixel_irradiance
+    from runtime.lightpath.light_path_adjoint import irradiance_and_pullback
     from runtime.refinement.refine import STEP, _amplitude, _matched
 
     target = scene(SHAPE)[None]
