@@ -16,7 +16,7 @@ Array = Any
 LOUD = 0.98  # share of pixels whose amplitude double phase reproduces; brighter ones are cut
 SAMPLED = 5  # every so many pixels, an axis, are ranked for that
 FAINTEST = 0.7  # of the amplitude in the middle: fainter edges of the image are corrected only as far as this
-EDGES = 3  # times as far in as the panel's end darkens an even image, edges of a frame begin anew
+EDGES = 3  # times as far in as the panel's end darkens an even image, edges of a frame get a new start
 WIDE = 0.9  # of the panel's band: with a wider iris double phase errs by more than its edges
 
 

@@ -29,7 +29,7 @@ class DriveRange:
     gapless : bool
         A whole turn is covered everywhere.
     bounded : bool
-        Phases a turn apart are not alike, so a step has to stay in range.
+        Phases a turn apart do not act the same, so a step has to stay in range.
 
     Raises
     ------

@@ -2,8 +2,8 @@
 
 This is the one deliberate second copy of `runtime.lightpath.light_path`, which defines the mathematics and says what
 each array means; here it is arranged for speed. Rows that are dark and columns that the iris stops are not
-transformed, and elementwise work is done on strips of rows while they are in a core's cache. A test keeps the two
-alike to 1e-9 in double precision, irradiance and gradient (`tests/runtime/test_solver_optics.py`).
+transformed, and elementwise work is done on strips of rows while they are in a core's cache. A test keeps
+irradiance and gradient of the two equal to 1e-9 in double precision (`tests/runtime/test_solver_optics.py`).
 
 The panel's side is in `in_place_panel`, the image's in `in_place_image`, and the pupil between them is here.
 

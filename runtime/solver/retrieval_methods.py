@@ -32,7 +32,7 @@ class Method(Protocol):
 class QuasiNewton:
     """Memoryless BFGS (L-BFGS with one pair), one gradient a step and no line search.
 
-    Where phases a turn apart are not alike (crosstalk mixes them; a drive of less than a turn lacks some),
+    Where phases a turn apart do not act the same (crosstalk mixes them; a drive of less than a turn lacks some),
     steps are projected onto the panel's range, and pixels that are pushed out of it stay out of the curvature.
 
     References

@@ -161,10 +161,6 @@ class Solver:
         progress : callable or None
             Called with the iterations done and the best PSNR (dB) so far.
 
-        Returns
-        -------
-        Solution
-
         Raises
         ------
         InputError
@@ -198,15 +194,6 @@ class Solver:
             As in `solve`.
         motion : (int, int) or None, pixels
             How far content has moved since: down, right. None: found from the frames.
-
-        Returns
-        -------
-        Solution
-
-        Raises
-        ------
-        InputError
-            As `solve` does.
         """
         targets, begun = self._begun(target, iterations, deadline_ms)
         picture = targets[0, 0]

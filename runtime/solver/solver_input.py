@@ -87,7 +87,13 @@ def checked_target(target: np.ndarray, colours: int, planes: int, shape: tuple[i
 
 
 def checked_region(region: np.ndarray | None, shape: tuple[int, int]) -> np.ndarray | None:
-    """Weights of pixels as floats [H, W]. Raises InputError for another shape and for weights below zero."""
+    """Weights of pixels as floats [H, W].
+
+    Raises
+    ------
+    InputError
+        For another shape, for weights below zero and where all are zero.
+    """
     if region is None:
         return None
     region = np.asarray(region, float)

@@ -146,8 +146,8 @@ def test_a_backend_that_is_not_there_is_refused() -> None:
             backend("cupy")
 
 
-def test_the_gpus_way_through_the_code_gives_the_same_pattern(monkeypatch: pytest.MonkeyPatch) -> None:
-    """CuPy stood in for by NumPy: whole arrays for strips and the other transforms, the same result."""
+def test_the_gpus_code_gives_the_same_pattern(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With NumPy in CuPy's place: whole arrays for strips and the other transforms, the same result."""
     import sys
     import types
 
