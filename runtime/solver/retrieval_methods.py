@@ -29,7 +29,7 @@ class Method(Protocol):
         """The next phase, after `Objective.look(phase)`."""
 
 
-class QuasiNewton:
+class MemorylessBfgs:
     """Memoryless BFGS (L-BFGS with one pair), one gradient a step and no line search.
 
     Where phases a turn apart do not act the same (crosstalk mixes them; a drive of less than a turn lacks some),
@@ -237,7 +237,7 @@ class GerchbergSaxton:
 
 
 METHODS: dict[str, Any] = {
-    "bfgs": QuasiNewton,
+    "bfgs": MemorylessBfgs,
     "adam": Adam,
     "gerchberg_saxton": GerchbergSaxton,
     "double_phase": None,  # the start alone

@@ -28,9 +28,8 @@ def test_beats_double_phase_by_an_independent_propagation(ideal: LightPath) -> N
     start = quality(padded_irradiance(solve(ideal, target, 0).phase, DISTANCE), target)
     assert seen.psnr_db > start.psnr_db + 6
     assert seen.psnr_db > 24
-    assert seen.psnr_db == pytest.approx(
-        solution.quality.psnr_db, abs=3
-    )  # the light in a frequency bin at the iris's edge
+    # They differ by the light in the frequency bin at the iris's edge.
+    assert seen.psnr_db == pytest.approx(solution.quality.psnr_db, abs=3)
 
 
 def test_double_phase_shows_the_picture_where_the_iris_stops_its_chequerboard() -> None:
