@@ -38,7 +38,7 @@ amplitude PSNR is of what the calibrated model says that the pattern shows, zero
 as the panel's, whatever the solver computed on; more iterations or time never make it worse, and 20 iterations are
 usually within a few dB of what can be reached."""
 
-SOLVERS = ("default", "double_phase", "gerchberg_saxton", "adam")
+SOLVERS = ("bfgs", "double_phase", "gerchberg_saxton", "adam")
 PATIENT = 25  # iterations
 PENALTIES = ("amplitude", "irradiance", "l1")
 
@@ -75,7 +75,13 @@ def arguments(parser: ArgumentParser) -> None:
         type=_milliseconds,
         help="from picture to pattern; the best pattern so far is given (this machine is measured first)",
     )
-    parser.add_argument("--solver", choices=SOLVERS, default="default", help="how (default: memoryless BFGS)")
+    parser.add_argument(
+        "--solver",
+        type=_solver_name,
+        choices=SOLVERS,
+        default="bfgs",
+        help="how (default: bfgs, memoryless BFGS)",
+    )
     parser.add_argument(
         "--penalty", choices=PENALTIES, default="amplitude", help="of what error (default: squared amplitude)"
     )
@@ -113,6 +119,11 @@ def whole(low: int, high: int) -> Callable[[str], int]:
         return value
 
     return read
+
+
+def _solver_name(text: str) -> str:
+    """A solver's name; "default" is an older spelling of "bfgs"."""
+    return "bfgs" if text == "default" else text
 
 
 def _milliseconds(text: str) -> float:

@@ -33,7 +33,7 @@ TUNED = {
     "betas": (0.9, 0.999),
 }  # the best of a search over rates 0.01 to 0.2 and betas, see the README
 SOLVERS: dict[str, tuple[str, dict[str, Any], int]] = {
-    "default": ("default", {}, 50),
+    "bfgs": ("bfgs", {}, 50),
     "adam": ("adam", {}, 100),
     "adam_tuned": ("adam", TUNED, 100),
     "gerchberg_saxton": ("gerchberg_saxton", {}, 20),

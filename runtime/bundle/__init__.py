@@ -1,1 +1,1 @@
-"""The bundle: a calibrated light path as the trainer hands it to the headset."""
+"""The bundle: the folder in which a calibrated light path goes from the trainer to the headset."""

@@ -1,4 +1,4 @@
-"""The bundle: a calibrated light path as the trainer hands it to the headset. A folder with
+"""The bundle: the folder in which a calibrated light path goes from the trainer to the headset. It has
 
     bundle.json             {"format": "hololoop-bundle", "version": 1, "files": {name: SHA-256},
                             "description": {...}, "provenance": {...},
@@ -48,16 +48,27 @@ Shape = Sequence[int | str | None]
 
 @dataclass(frozen=True)
 class Bundle:
-    """A verified bundle. The arrays are read-only."""
+    """A verified bundle.
+
+    Attributes
+    ----------
+    description : dict
+    arrays : dict of str to array
+        Read-only.
+    provenance : dict
+    approximator_path : path or None
+    approximator : bytes or None
+        What was verified at approximator_path; load this and not the file, which may have changed since.
+    networks : dict of str to bytes
+        The same for each of NETWORKS that the bundle has, by name.
+    """
 
     description: dict[str, Any]
     arrays: dict[str, np.ndarray]
     provenance: dict[str, Any]
     approximator_path: Path | None = None
     approximator: bytes | None = None
-    """What was verified at approximator_path; load this and not the file, which may have changed since."""
     networks: dict[str, bytes] = field(default_factory=dict)
-    """The same for each of NETWORKS that is there, by name."""
 
 
 def write_bundle(
@@ -71,13 +82,31 @@ def write_bundle(
     replace: bool = False,
     keep: str | os.PathLike[str] | None = None,
 ) -> None:
-    """Write a bundle, whole or not at all. A folder that is not empty is refused unless `replace`.
+    """Write a bundle, whole or not at all.
 
-    networks : further files of NETWORKS, by name
-    keep : where the bundle that is replaced goes; none: it is removed
+    Parameters
+    ----------
+    folder : path
+    arrays : mapping of str to array
+        Of the light path, as `read_bundle` returns them.
+    description, provenance : mapping
+        Plain JSON.
+    approximator : bytes or None
+        The network after the optics, in ONNX.
+    networks : mapping of str to bytes, or None
+        Further files of NETWORKS, by name.
+    replace : bool
+        Replace a folder that is not empty, which is refused otherwise.
+    keep : path or None
+        Where the bundle that is replaced goes; None: it is removed.
+
+    Raises
+    ------
+    InputError
+        For arrays that a bundle does not hold, for what is not JSON, and where the folder cannot be written.
     """
     if not arrays:
-        raise InputError(f"{folder}: a bundle without arrays says nothing of the light path")
+        raise InputError(f"{folder}: a bundle without arrays does not describe a light path")
     laid_out = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     for name, array in laid_out.items():
         _check_array(f"{folder}: array {name!r}", array)
@@ -106,11 +135,23 @@ def write_bundle(
 def read_bundle(
     folder: str | os.PathLike[str], required: Iterable[str] | Mapping[str, Shape | None] = ()
 ) -> Bundle:
-    """Read and verify a bundle; anything wrong is an InputError that names the file and the reason.
+    """Read and verify a bundle.
 
-    `required` names arrays that must be there, as {name: shape} also with their shapes. A dimension is a
-    number, None for any, or a word that stands for one and the same number wherever it appears:
-    {"source": ("y", "x"), "leak": ("y", "x")}.
+    Parameters
+    ----------
+    folder : path
+    required : iterable of str, or mapping of str to shape
+        Arrays that the bundle must have, and their shapes. A dimension is a number, None for any, or a word that
+        stands for the same number wherever it appears: {"source": ("y", "x"), "leak": ("y", "x")}.
+
+    Returns
+    -------
+    Bundle
+
+    Raises
+    ------
+    InputError
+        For anything wrong: it names the file and the reason.
     """
     folder = Path(folder)
     manifest = _read_manifest(folder)
@@ -233,7 +274,7 @@ def _read(path: Path) -> bytes:
 
 
 def _plain_json(where: str, value: Mapping[str, Any]) -> dict[str, Any]:
-    """As it will be read back, so that its hash is the same on both sides."""
+    """The value as it will be read back, so that its hash is the same on both sides."""
 
     def numpy_scalar(item: Any) -> Any:
         if isinstance(item, np.generic):

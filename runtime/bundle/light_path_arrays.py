@@ -20,7 +20,8 @@ import numpy as np
 
 from firmware_iface.errors import InputError, nearest
 from runtime.bundle.bundle_folder import ARRAYS, MANIFEST, Bundle
-from runtime.lightpath.light_path import FINE, Grid, LightPath
+from runtime.lightpath.grid import FINE, Grid
+from runtime.lightpath.light_path import LightPath
 
 COMPLEX, REAL = np.dtype(np.complex64), np.dtype(np.float32)
 NEEDED = ("response", "source", "transfers", "weights", "aperture")
@@ -38,10 +39,18 @@ Record = dict[str, Any]
 def pack_light_paths(
     paths: Iterable[tuple[str, float, float, LightPath]],
 ) -> tuple[list[Record], dict[str, np.ndarray]]:
-    """Records and arrays of light paths, given as (channel, plane in mm, wavelength in nm, path) on NumPy
-    arrays.
+    """Records and arrays of light paths.
 
-    Arrays become float32 and complex64; equal ones are kept once, under the name of the first that has them.
+    Parameters
+    ----------
+    paths : iterable of (str, float, float, LightPath)
+        Channel, plane (mm), wavelength (nm), and the path on NumPy arrays.
+
+    Returns
+    -------
+    records : list of dict
+    arrays : dict of str to array
+        float32 and complex64; equal ones are kept once, under the name of the first path that has them.
     """
     records: list[Record] = []
     arrays: dict[str, np.ndarray] = {}
@@ -75,7 +84,7 @@ def pack_light_paths(
 
 
 def _fields(path: LightPath) -> dict[str, np.ndarray]:
-    """The arrays of a light path that are there, by field."""
+    """The arrays that a light path has, by field."""
     fields = {
         "response": path.response,
         "source": path.source,
@@ -92,7 +101,13 @@ def _fields(path: LightPath) -> dict[str, np.ndarray]:
 
 
 def bundle_paths(bundle: Bundle) -> list[Record]:
-    """The records of all light paths in a bundle. Raises InputError where there are none."""
+    """The records of all light paths in a bundle.
+
+    Raises
+    ------
+    InputError
+        Where there are none.
+    """
     records = bundle.description.get("paths")
     if not isinstance(records, list) or not records or not all(isinstance(r, dict) for r in records):
         raise InputError(f"{MANIFEST} describes no light paths: export the bundle again")
@@ -113,9 +128,22 @@ def bundle_channels(bundle: Bundle) -> list[str]:
 def load_light_path(bundle: Bundle, channel: str | None = None, plane_mm: float | None = None) -> LightPath:
     """The light path of one colour and plane of a bundle, on NumPy arrays.
 
-    channel: may be left out where the bundle has one colour. plane_mm: where it is left out, the bench's own
-    distance if the bundle has it, else the colour's first plane. Raises InputError for a colour or plane that
-    the bundle lacks, and where its arrays do not fit together.
+    Parameters
+    ----------
+    bundle : Bundle
+    channel : str or None
+        None is enough where the bundle has one colour.
+    plane_mm : float or None, mm
+        None: the bench's own distance if the bundle has it, else the colour's first plane.
+
+    Returns
+    -------
+    LightPath
+
+    Raises
+    ------
+    InputError
+        For a colour or plane that the bundle lacks, and where its arrays do not fit together.
     """
     record = _find(bundle, channel, plane_mm)
     where = f"light path {record['channel']}, {record['plane_mm']:g} mm"
@@ -144,7 +172,7 @@ def load_light_path(bundle: Bundle, channel: str | None = None, plane_mm: float 
 
 
 def plane_of(bundle: Bundle, channel: str | None = None, plane_mm: float | None = None) -> float:
-    """The plane (mm) of what `load_light_path` gives for the same arguments. Raises InputError as it does."""
+    """The plane (mm) of what `load_light_path` returns for the same arguments, with the same errors."""
     return float(_find(bundle, channel, plane_mm)["plane_mm"])
 
 
@@ -209,8 +237,8 @@ def _array(bundle: Bundle, name: Any, field: str, where: str) -> np.ndarray | No
     array = bundle.arrays[name]
     wanted = {COMPLEX, REAL} if field == "irradiance_filter" else {TYPES.get(field, REAL)}
     if array.dtype not in wanted:
-        kinds = " or ".join(sorted(str(d) for d in wanted))
-        raise InputError(f"{ARRAYS}: '{name}' is {array.dtype}, and {field} of {where} must be {kinds}")
+        types = " or ".join(sorted(str(d) for d in wanted))
+        raise InputError(f"{ARRAYS}: '{name}' is {array.dtype}, and {field} of {where} must be {types}")
     return array
 
 

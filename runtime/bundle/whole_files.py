@@ -1,7 +1,7 @@
 """Files and folders that appear whole or not at all.
 
 What is written goes to a temporary neighbour, named `.NAME.<random>.part`, that takes the final name when
-it is complete and on the disk. After an error nothing of it is left; after a crash only the neighbour is,
+it is complete and on the disk. After an error nothing of it is left. After a crash only the neighbour is left,
 and it can be deleted.
 """
 
@@ -24,7 +24,16 @@ from firmware_iface.errors import InputError
 def whole_file(path: str | os.PathLike[str], mode: str = "wb") -> Iterator[IO[Any]]:
     """Open `path` for writing; it is replaced when the block ends without error.
 
-    `mode` is "wb", or "w" for text: UTF-8, and lines end as they are written.
+    Parameters
+    ----------
+    path : path
+    mode : str
+        "wb", or "w" for text: UTF-8, and line ends are not changed.
+
+    Raises
+    ------
+    InputError
+        Where it cannot be written.
     """
     if mode not in ("wb", "w"):
         raise ValueError(f"mode is 'wb' or 'w', not {mode!r}")
@@ -33,7 +42,7 @@ def whole_file(path: str | os.PathLike[str], mode: str = "wb") -> Iterator[IO[An
         raise InputError(f"{path} is a folder; give the name of a file")
     temporary = _neighbour(target, "part")
     try:
-        # "x" refuses a file that is there already and, unlike mkstemp, keeps to the person's umask
+        # "x" refuses a file that exists and, unlike mkstemp, respects the person's umask
         if mode == "wb":
             file: IO[Any] = open(temporary, "xb")  # noqa: SIM115 - closed below, before the rename
         else:
@@ -62,9 +71,21 @@ def whole_folder(
 ) -> Iterator[Path]:
     """Give an empty temporary folder to fill; it is renamed to `path` when the block ends without error.
 
-    A folder that is there and not empty is refused, or with `replace` exchanged for the new one and then removed, or
-    moved to `keep` (what was there goes). Linux exchanges two names at once; elsewhere it takes two renames, so that
-    a reader may find no folder for an instant, but never a mixture.
+    Linux exchanges two names at once. Elsewhere it takes two renames, so a reader may find no folder for an instant,
+    but never a mixture.
+
+    Parameters
+    ----------
+    path : path
+    replace : bool
+        Exchange a folder that exists and is not empty for the new one; otherwise it is refused.
+    keep : path or None
+        Where the folder that is replaced goes, in place of what is there; None: it is removed.
+
+    Raises
+    ------
+    InputError
+        For a folder that is not empty without `replace`, and where it cannot be written.
     """
     target = _resolved(path)
     _refuse_taken(path, target, replace)
@@ -114,7 +135,7 @@ def _swap(new: Path, target: Path, keep: Path | None) -> None:
 
 
 def _exchange(one: Path, other: Path) -> bool:
-    """Let two names change places at once; False where the system or the file system cannot."""
+    """Exchange two names at once; False where the system or the file system cannot."""
     try:
         rename = ctypes.CDLL(None, use_errno=True).renameat2
     except (OSError, AttributeError):
@@ -159,7 +180,7 @@ def _cannot_write(path: str | os.PathLike[str], error: OSError) -> InputError:
 
 
 def _sync(path: Path) -> None:
-    """Make what was written last through a power cut; some file systems cannot, and do no worse for it."""
+    """Write it to the disk, so that it survives a power cut; file systems that cannot do so are left as they are."""
     if path.is_symlink():
         return
     with suppress(OSError):

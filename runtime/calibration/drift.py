@@ -14,8 +14,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.interpolate import BSpline
 
+from runtime.lightpath.grid import band_frequencies
 from runtime.lightpath.legendre import edge_to_edge, legendre_maps, legendre_surface
-from runtime.lightpath.light_path import LightPath, band_frequencies
+from runtime.lightpath.light_path import LightPath
 
 LOWEST_WAVEFRONT, LOWEST_AMPLITUDE = 2, 1  # Legendre orders: without piston and tilt; without power
 

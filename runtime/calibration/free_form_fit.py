@@ -19,7 +19,8 @@ from scipy.optimize import minimize
 from runtime.calibration.drift import drifted, node_weights
 from runtime.calibration.drift_fit import Base, Estimate, Shot, gain_of, seen_by
 from runtime.camera.view import sampler_and_adjoint
-from runtime.lightpath.light_path import irradiance_and_pullback, panel_phase
+from runtime.lightpath.light_path import panel_phase
+from runtime.lightpath.light_path_adjoint import irradiance_and_pullback
 
 NODE = 4  # panel pixels
 MOST = (270, 480)  # nodes: larger panels get coarser maps

@@ -17,7 +17,7 @@ from scipy.sparse import csr_matrix
 
 from runtime.camera.registration import panel_points
 from runtime.lightpath.fft import irfft2
-from runtime.lightpath.light_path import FINE, Grid
+from runtime.lightpath.grid import FINE, Grid
 
 Array = Any
 

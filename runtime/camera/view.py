@@ -25,8 +25,8 @@ from runtime.camera.sampling import (
     spline_matrix,
 )
 from runtime.lightpath.fft import irfft2, rfft2
+from runtime.lightpath.grid import Grid, image_frequencies
 from runtime.lightpath.legendre import edge_to_edge, legendre_maps
-from runtime.lightpath.light_path import Grid, image_frequencies
 
 SENSITIVITY_ORDER = 4  # of the camera's own fall-off, so that none of it is taken for the beam's
 TERMS = 14  # of that order

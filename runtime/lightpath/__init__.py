@@ -1,1 +1,1 @@
-"""The light path from the panel to the image plane, for NumPy and torch alike, and what it is made of."""
+"""The light path from the panel to the image plane, for NumPy and torch, and the parts that it is made of."""

@@ -1,4 +1,4 @@
-"""One-dimensional Fourier transforms along an axis, by the fastest library that fits the array.
+"""Fourier transforms along an axis, by the fastest library that fits the array.
 
 NumPy arrays go to ducc0 (SciPy where ducc0 is missing); any other array goes to its own namespace's ``fft``.
 Forward transforms are not scaled, inverse ones are divided by their length (NumPy's convention).
@@ -48,12 +48,12 @@ def irfft2(x: Array, shape: tuple[int, int]) -> Array:
 
 
 def has_ducc() -> bool:
-    """Whether ducc0 is there; SciPy does its work otherwise."""
+    """Whether ducc0 is installed; SciPy does its work otherwise."""
     return _ducc is not None
 
 
 def into(x: np.ndarray, out: np.ndarray, axes: int | tuple[int, ...], forward: bool, threads: int) -> None:
-    """DFT of complex `x` [n, m] along axes, written to `out` (which may be x); neither way is scaled."""
+    """DFT of complex `x` [n, m] along axes, written to `out` (which may be x); neither direction is scaled."""
     over = (axes,) if isinstance(axes, int) else axes
     if _ducc is not None:
         _ducc.c2c(x, axes=over, forward=forward, out=out, nthreads=threads)
@@ -64,9 +64,15 @@ def into(x: np.ndarray, out: np.ndarray, axes: int | tuple[int, ...], forward: b
 
 
 def filter_into(image: np.ndarray, transfer: np.ndarray, spectrum: np.ndarray, threads: int) -> None:
-    """A real image [n, m] times a transfer function over its half spectrum, in place.
+    """Multiply a real image by a transfer function over its half spectrum, in place.
 
-    `spectrum` is room for it: complex [n, m//2 + 1], as `transfer`.
+    Parameters
+    ----------
+    image : float array [n, m]
+    transfer : complex array [n, m//2 + 1]
+    spectrum : complex array [n, m//2 + 1]
+        Room to work in.
+    threads : int
     """
     if _ducc is not None:
         _ducc.r2c(image, axes=(0, 1), out=spectrum, nthreads=threads)

@@ -6,16 +6,31 @@ import math
 
 import numpy as np
 
-from runtime.lightpath.light_path import LightPath, band_frequencies, grid_for
+from runtime.lightpath.grid import band_frequencies, grid_for
+from runtime.lightpath.light_path import LightPath
 from runtime.lightpath.propagation import Aperture, band_limit, check_sampling, transfer_function
 
 
 def ideal_path(
     shape: tuple[int, int], pitch: float, wavelength: float, distance: float, half_width: float
 ) -> LightPath:
-    """A perfect panel [H, W] of 256 levels, in double precision; lengths in metres.
+    """A perfect panel of 256 levels, in double precision.
 
-    half_width: the iris's, as a share of the panel's band. Raises InputError where the sampling does not hold.
+    Parameters
+    ----------
+    shape : (int, int), pixels
+    pitch, wavelength, distance : float, m
+    half_width : float
+        Of the iris, as a share of the panel's band.
+
+    Returns
+    -------
+    LightPath
+
+    Raises
+    ------
+    InputError
+        Where the sampling does not hold.
     """
     grid = grid_for(shape, pitch, wavelength, distance, half_width)
     edge = half_width / (2 * pitch) * (1 + 1e-9)

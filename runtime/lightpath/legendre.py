@@ -1,6 +1,6 @@
-"""Smooth curves and maps as sums of Legendre polynomials, against the array API.
+"""Smooth curves and surfaces as sums of Legendre polynomials, against the array API.
 
-All are dimensionless and of order one, lowest order first; maps are stacks [count, rows, columns]. Over a
+All are dimensionless and of order one, lowest order first; stacks of surfaces are [count, rows, columns]. Over a
 panel or a picture, y and x run from -1 to 1 from edge to edge, at pixels' centres (`edge_to_edge`).
 """
 
@@ -41,9 +41,20 @@ def legendre_maps(y: Array, x: Array, order: int, lowest: int = 1) -> Array:
 
 
 def legendre_surface(terms: Array, y: Array, x: Array, lowest: int = 1) -> Array:
-    """Sum of `terms` times `legendre_maps`, over the grid that y [H, W] (rows) and x [H, W] (columns) span: [H, W].
+    """Sum of `terms` times `legendre_maps`, as two small matrix products instead of a stack.
 
-    Two small matrix products instead of a stack of maps. The order follows from the number of terms.
+    Parameters
+    ----------
+    terms : float array [count]
+        The order follows from their number.
+    y, x : float array [H, W]
+        Coordinates over the rows and over the columns, -1 .. 1.
+    lowest : int
+        The lowest order among the terms.
+
+    Returns
+    -------
+    float array [H, W]
     """
     xp = array_namespace(terms)
     order = legendre_order(terms.shape[0], lowest)

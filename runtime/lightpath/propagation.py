@@ -1,9 +1,9 @@
 """Free-space propagation between the panel and an image plane: transfer functions, and where they hold.
 
-Three forms of the diffraction integral (seed sections 1.1-1.2): the band-limited angular spectrum (exact;
-seed eq. 5, Matsushima and Shimobaba 2009), Fresnel (paraxial) and Fraunhofer (far field). Written against
-the array API: NumPy in the headset, any differentiable namespace in the trainer. Lengths are in metres,
-frequencies in cycles per metre; frequency grids are the DFT's own.
+Three forms of the diffraction integral (Chakravarthula et al. 2020, sections 1.1-1.2): the band-limited angular
+spectrum (exact; Matsushima and Shimobaba 2009), Fresnel (paraxial) and Fraunhofer (far field). Written against the
+array API: NumPy in the headset, any differentiable namespace in the trainer. Lengths are in metres, frequencies in
+cycles per metre; frequency grids are the DFT's own.
 """
 
 from __future__ import annotations
@@ -23,7 +23,17 @@ METHODS = ("angular_spectrum", "fresnel", "fraunhofer")
 
 @dataclass(frozen=True)
 class Aperture:
-    """What a propagation starts from: rows x columns of samples `pitch` metres apart, padded to `padded`."""
+    """The sampled area that a propagation starts from.
+
+    Attributes
+    ----------
+    shape : (int, int)
+        Samples: rows, columns.
+    padded : (int, int)
+        The same with zero padding.
+    pitch : float, m
+        Between samples.
+    """
 
     shape: tuple[int, int]
     padded: tuple[int, int]
@@ -38,13 +48,33 @@ class Aperture:
 def transfer_function(
     fy: Array, fx: Array, wavelength: Array, distance: Array, limits: tuple[float, float], method: str
 ) -> Array:
-    """Complex transfer function of free space over a grid of spatial frequencies: [n, m].
+    """Complex transfer function of free space over a grid of spatial frequencies.
 
-    fy [n, 1] and fx [1, m] are in cycles/m; `wavelength` and `distance` (m) are scalars or scalar arrays;
-    beyond `limits` (cycles/m, along y and x; see `band_limit`) the sampled function is aliased and set to
-    zero. Seed eq. 5 for "angular_spectrum"; its paraxial expansion (seed eq. 8) for "fresnel". Both without
-    the plane wave's own 2 pi z / lambda, which is thousands of turns and changes no irradiance. Evanescent
-    frequencies are zero. Raises InputError for another method.
+    It lacks the plane wave's own 2 pi z / lambda, which is thousands of turns and changes no irradiance.
+    Evanescent frequencies are zero.
+
+    Parameters
+    ----------
+    fy : float array [n, 1], cycles/m
+    fx : float array [1, m], cycles/m
+    wavelength, distance : float or scalar array, m
+    limits : (float, float), cycles/m
+        Along y and x: beyond them the sampled function is aliased and set to zero (see `band_limit`).
+    method : str
+        "angular_spectrum", or "fresnel" for its paraxial expansion.
+
+    Returns
+    -------
+    complex array [n, m]
+
+    Raises
+    ------
+    InputError
+        For another method.
+
+    References
+    ----------
+    Chakravarthula et al. 2020, eq. 5 (angular spectrum) and eq. 8 (Fresnel).
     """
     xp = array_namespace(fy, fx)
     sine2 = (wavelength * fy) ** 2 + (wavelength * fx) ** 2
@@ -65,18 +95,46 @@ def transfer_function(
 
 
 def band_limit(wavelength: float, distance: float, side: float) -> float:
-    """Highest frequency (cycles/m) that a sampled transfer function carries over a field `side` metres wide.
+    """Highest frequency that a sampled transfer function carries.
 
-    Matsushima and Shimobaba 2009, eq. 13, with frequency samples 1/side apart.
+    Parameters
+    ----------
+    wavelength, distance : float, m
+    side : float, m
+        Of the field; frequency samples are 1/side apart.
+
+    Returns
+    -------
+    float, cycles/m
+
+    References
+    ----------
+    Matsushima and Shimobaba 2009, eq. 13.
     """
     return 1 / (wavelength * math.sqrt((2 * distance / side) ** 2 + 1))
 
 
 def far_field(u: Array, pitch: float, y: Array, x: Array, wavelength: Array, distance: Array) -> Array:
-    """Fraunhofer field of `u` [..., H, W] at image-plane positions y [n] and x [m] (metres from the axis).
+    """Fraunhofer field, up to the quadratic phase in the image plane, which changes no irradiance.
 
-    A matrix Fourier transform, so the image grid is free: [..., n, m]. Up to the quadratic phase in the image
-    plane, which changes no irradiance (Goodman, Introduction to Fourier Optics, eq. 4-25).
+    A matrix Fourier transform, so the image grid is free.
+
+    Parameters
+    ----------
+    u : complex array [..., H, W]
+        The field in the aperture, samples `pitch` apart.
+    pitch : float, m
+    y, x : float array [n], float array [m], m
+        Positions in the image plane, from the axis.
+    wavelength, distance : float or scalar array, m
+
+    Returns
+    -------
+    complex array [..., n, m]
+
+    References
+    ----------
+    Goodman, Introduction to Fourier Optics, eq. 4-25.
     """
     xp = array_namespace(u)
     height, width = u.shape[-2:]
@@ -94,10 +152,26 @@ def far_field_matrix(
     wavelength: Array,
     distance: Array,
 ) -> Array:
-    """Fraunhofer field at `position` [n] (m) from the spectrum along one axis: [n, len(band)] complex.
+    """Matrix from the spectrum along one axis to the Fraunhofer field.
 
-    The spectrum is the DFT over `padded` samples, at the frequency indices `band`, of a field on the first `count`
-    samples: an inverse DFT onto the panel, then `far_field` along this axis.
+    An inverse DFT onto the panel, then `far_field` along this axis.
+
+    Parameters
+    ----------
+    band : list of int
+        Frequency indices of the spectrum.
+    padded : int
+        Samples of the DFT that the spectrum is taken from.
+    count : int
+        Samples of it, from the first, that the field is on.
+    pitch : float, m
+    position : float array [n], m
+        In the image plane, from the axis.
+    wavelength, distance : float or scalar array, m
+
+    Returns
+    -------
+    complex array [n, len(band)]
     """
     xp = array_namespace(position)
     sample = xp.arange(count, dtype=position.dtype)
@@ -116,9 +190,21 @@ def _far_kernel(position: Array, count: int, pitch: float, wavelength: Array, di
 def check_sampling(
     method: str, aperture: Aperture, wavelength: float, distance: float, half_band: float
 ) -> None:
-    """Raise InputError (which limit, by how much, what would hold) where `method` cannot be sampled.
+    """Refuse a propagation that the grid cannot sample.
 
-    `half_band` (cycles/m) is the highest frequency that the iris lets through.
+    Parameters
+    ----------
+    method : str
+        One of METHODS.
+    aperture : Aperture
+    wavelength, distance : float, m
+    half_band : float, cycles/m
+        The highest frequency that the iris passes.
+
+    Raises
+    ------
+    InputError
+        Where `method` cannot be sampled: which limit, by how much, and what would hold.
     """
     if method not in METHODS:
         raise InputError(f"unknown propagation method '{method}': use one of {', '.join(METHODS)}")

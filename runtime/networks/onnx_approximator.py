@@ -1,8 +1,8 @@
-"""The aberration approximator D: irradiance that the optics predict to irradiance that is seen (seed eq. 13).
+"""The aberration approximator D: from irradiance that the optics predict to irradiance that a camera measures.
 
-It comes in a bundle as two networks in ONNX: `approximator.onnx`, irradiance to corrected, and
-`approximator_gradient.onnx`, irradiance and target to a loss and its gradient over irradiance, with the
-weights that may be refined on the headset as further inputs. All are [1, C, H, W], float32, irradiance with a
+Chakravarthula et al. 2020, eq. 13. It comes in a bundle as two networks in ONNX: `approximator.onnx`, irradiance to
+corrected, and `approximator_gradient.onnx`, irradiance and target to a loss and its gradient over irradiance, with
+the weights that may be refined on the headset as further inputs. All are [1, C, H, W], float32, irradiance with a
 mean of about 1.
 """
 
@@ -17,17 +17,35 @@ from safetensors import SafetensorError
 
 from firmware_iface.errors import InputError
 from runtime.bundle.bundle_folder import ADAPTERS, APPROXIMATOR, GRADIENT, Bundle
-from runtime.networks.onnx_session import Session
+from runtime.networks.onnx_session import OnnxSession
 
 CORRECTIONS = 2  # of a target that is pre-distorted
-EPSILON = 1e-3  # under the square roots of the loss that is in the gradient's network
+EPSILON = 1e-3  # added under the square roots of the loss that is in the gradient's network
 
 
 class Approximator:
-    """D for pictures of one size, shape (C, H, W).
+    """D for pictures of one size.
 
-    irradiance, target, corrected, slope: its arrays, float32 [C, H, W], which callers fill and read in place.
-    adapters: weights by the name of their input. Raises InputError for networks that do not fit.
+    Parameters
+    ----------
+    shape : (int, int, int)
+        C, H, W.
+    model : bytes
+        The network in ONNX from irradiance to corrected.
+    gradient : bytes or None
+        The network in ONNX from irradiance and target to a loss and its gradient.
+    adapters : mapping of str to array, or None
+        Weights that the gradient's network takes, by the name of their input.
+
+    Attributes
+    ----------
+    irradiance, target, corrected, slope : float32 array [C, H, W]
+        Its inputs and outputs, which callers fill and read in place.
+
+    Raises
+    ------
+    InputError
+        For networks that do not fit.
     """
 
     def __init__(
@@ -46,12 +64,12 @@ class Approximator:
             a[0] for a in (self._irradiance, self._target, self._corrected, self._slope)
         )
         self._loss = np.zeros((), np.float32)
-        self._forward = Session(model, "approximator.onnx")
+        self._forward = OnnxSession(model, "approximator.onnx")
         _check(self._forward, {"irradiance"}, {"corrected"}, whole)
         self._forward.bind(irradiance=self._irradiance, corrected=self._corrected)
-        self._backward: Session | None = None
+        self._backward: OnnxSession | None = None
         if gradient is not None:
-            self._backward = Session(gradient, "approximator_gradient.onnx")
+            self._backward = OnnxSession(gradient, "approximator_gradient.onnx")
             given = dict(adapters or {})
             _check(self._backward, {"irradiance", "target", *given}, {"loss", "gradient"}, whole)
             room: dict[str, np.ndarray] = {
@@ -88,7 +106,13 @@ class Approximator:
         self._forward.run()
 
     def look(self) -> float:
-        """The loss of `irradiance` against `target`; fills `slope`, its gradient over irradiance."""
+        """The loss of `irradiance` against `target`; fills `slope`, its gradient over irradiance.
+
+        Raises
+        ------
+        InputError
+            Where the bundle has no network for the gradient.
+        """
         if self._backward is None:
             raise InputError(
                 "the bundle has no approximator_gradient.onnx: export it, or pre-distort targets"
@@ -102,7 +126,24 @@ class Approximator:
 
 
 def approximator_of(bundle: Bundle, shape: tuple[int, int, int]) -> Approximator | None:
-    """The approximator in a bundle, for irradiance [C, H, W] of a shape; without one D is the identity: None."""
+    """The approximator in a bundle.
+
+    Parameters
+    ----------
+    bundle : Bundle
+    shape : (int, int, int)
+        Of irradiance: C, H, W.
+
+    Returns
+    -------
+    Approximator or None
+        None where the bundle has none: D is the identity.
+
+    Raises
+    ------
+    InputError
+        For adapters that cannot be read and networks that do not fit.
+    """
     if APPROXIMATOR not in bundle.networks:
         return None
     adapters = {}
@@ -117,7 +158,7 @@ def approximator_of(bundle: Bundle, shape: tuple[int, int, int]) -> Approximator
 
 
 def predistorted(d: Approximator, targets: np.ndarray) -> np.ndarray:
-    """Targets [C, 1, H, W] that D turns into the given ones, as nearly as two corrections find.
+    """Targets [C, 1, H, W] that D turns into the given ones, as nearly as two corrections allow.
 
     Where D is near the identity, t - D(J) is about what J lacks.
     """
@@ -136,12 +177,12 @@ def predistorted(d: Approximator, targets: np.ndarray) -> np.ndarray:
     return d.irradiance[:, None]
 
 
-def _check(session: Session, inputs: set[str], outputs: set[str], shape: tuple[int, ...]) -> None:
+def _check(session: OnnxSession, inputs: set[str], outputs: set[str], shape: tuple[int, ...]) -> None:
     if missing := sorted(inputs - set(session.inputs)) + sorted(outputs - set(session.outputs)):
         raise InputError(f"{session.name} has no '{missing[0]}': export the bundle again")
     if extra := sorted(set(session.inputs) - inputs):
         raise InputError(
-            f"{session.name} wants an input '{extra[0]}' that the bundle does not hold: export it again"
+            f"{session.name} needs an input '{extra[0]}' that the bundle does not hold: export it again"
         )
     declared: Any = session.inputs["irradiance"]
     sizes = list(zip(declared, shape, strict=False))

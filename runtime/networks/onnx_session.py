@@ -1,4 +1,4 @@
-"""ONNX Runtime as the frame loop wants it: the fastest provider there is, and no threads that spin.
+"""ONNX Runtime as the frame loop needs it: the fastest provider available, and no threads that spin.
 
 A session whose threads spin while they wait steals the cores from the transforms around it, which then take
 half as long again. Arrays are bound once, so a call allocates nothing.
@@ -19,8 +19,29 @@ PROVIDERS = (
 )
 
 
-class Session:
-    """A network in ONNX with inputs and outputs in arrays that stay where they are."""
+class OnnxSession:
+    """A network in ONNX whose inputs and outputs are in fixed arrays.
+
+    Parameters
+    ----------
+    model : bytes
+    name : str
+        Of its file, for messages.
+    threads : int
+
+    Attributes
+    ----------
+    inputs : dict of str to list
+        Shapes by name.
+    outputs : list of str
+    provider : str
+        The one that ONNX Runtime chose.
+
+    Raises
+    ------
+    InputError
+        For a model that cannot be loaded.
+    """
 
     def __init__(self, model: bytes, name: str, threads: int = THREADS) -> None:
         import onnxruntime
@@ -46,14 +67,20 @@ class Session:
         self._kept: dict[str, np.ndarray] = {}  # the binding holds no reference of its own
 
     def bind(self, **arrays: np.ndarray) -> None:
-        """Say once where inputs are read and outputs written: contiguous float32 arrays."""
+        """Set once where inputs are read and outputs written: contiguous float32 arrays."""
         for name, array in arrays.items():
             to = self._binding.bind_input if name in self.inputs else self._binding.bind_output
             to(name, "cpu", 0, np.float32, array.shape, array.ctypes.data)
             self._kept[name] = array
 
     def run(self) -> None:
-        """Fill the outputs from the inputs. Raises InputError where the network does not take their sizes."""
+        """Fill the outputs from the inputs.
+
+        Raises
+        ------
+        InputError
+            Where the network does not take their sizes.
+        """
         try:
             self._session.run_with_iobinding(self._binding)
         except Exception as error:

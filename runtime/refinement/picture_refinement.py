@@ -23,12 +23,8 @@ from typing import IO
 import numpy as np
 
 from firmware_iface.errors import InputError
-from runtime.lightpath.light_path import (
-    LightPath,
-    irradiance_and_pullback,
-    pixel_irradiance,
-    pixel_irradiance_adjoint,
-)
+from runtime.lightpath.light_path import LightPath, pixel_irradiance
+from runtime.lightpath.light_path_adjoint import irradiance_and_pullback, pixel_irradiance_adjoint
 from runtime.networks.onnx_approximator import EPSILON, Approximator
 from runtime.refinement.adapter_learning import AdapterLearning
 from runtime.solver import DriveRange, quality

@@ -1,7 +1,7 @@
 """Where the solver's arrays live and what transforms them: NumPy on the CPU's cores, or CuPy on a GPU.
 
 The namespace is chosen once, by `backend()`. Everything the inner loop does is in place: elementwise work goes
-over strips of rows that fit a core's cache, several cores at a time; transforms write where they are told.
+over strips of rows that fit a core's cache, several cores at a time; transforms write to a given array.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from runtime.lightpath import fft
 Array = Any
 Strip = Callable[[int, slice], "tuple[float, ...] | None"]
 
-STRIP_BYTES = 1 << 19  # of one row buffer: a share of a core's second cache
+STRIP_BYTES = 1 << 19  # of one row buffer: a share of a core's second-level cache
 COLUMNS = 96  # of a column transform by one core
 BACKENDS = ("numpy", "cupy")
 
 
 class Backend:
-    """NumPy arrays, worked on by all of the machine's cores."""
+    """NumPy arrays, processed by all of the machine's cores."""
 
     name = "numpy"
     xp: Any = np
@@ -40,9 +40,20 @@ class Backend:
         return max(1, STRIP_BYTES // (8 * width))
 
     def over_rows(self, rows: int, size: int, work: Strip) -> tuple[float, ...]:
-        """Call work(worker, rows of a strip) for all rows; the sums of what it returns.
+        """Call `work` for all rows, in strips.
 
-        `worker` is below `threads`, and no two calls share it at a time: it says whose row buffer to use.
+        Parameters
+        ----------
+        rows, size : int
+            Rows in all and in a strip.
+        work : callable
+            Takes (worker, rows of a strip). `worker` is below `threads`, and no two calls share it at a time: it is
+            the number of the row buffer to use.
+
+        Returns
+        -------
+        tuple of float
+            The sums of what `work` returns.
         """
 
         def share(worker: int) -> list[tuple[float, ...]]:
@@ -61,9 +72,9 @@ class Backend:
         fft.into(x, out, 1, forward, 1)
 
     def through_columns(self, x: Array, multiply: Callable[[slice], None]) -> None:
-        """DFT of each column, `multiply` (which is told the columns), inverse DFT; in place and not scaled.
+        """DFT of each column, `multiply` (called with the columns), inverse DFT; in place and not scaled.
 
-        Some columns at a time, so that they are in a core's cache all the way.
+        Some columns at a time, so that they stay in a core's cache.
         """
 
         def work(worker: int, columns: slice) -> None:
@@ -78,7 +89,7 @@ class Backend:
         fft.into(x, x, 0, forward, self.threads)
 
     def filter(self, image: Array, transfer: Array, spectrum: Array) -> None:
-        """A real image through a transfer function over its half spectrum, in place; `spectrum` is room."""
+        """Multiply a real image by a transfer function over its half spectrum, in place; `spectrum` is room."""
         fft.filter_into(image, transfer, spectrum, self.threads)
 
     def to_host(self, x: Array) -> np.ndarray:
@@ -131,7 +142,19 @@ class CupyBackend(Backend):
 def backend(name: str | None = None) -> Backend:
     """The machine's backend: CuPy where it is installed and has a GPU, else NumPy; or the one that is named.
 
-    HOLOLOOP_BACKEND in the environment names one too. Raises InputError for one that is not there.
+    Parameters
+    ----------
+    name : str or None
+        One of BACKENDS; None: the value of HOLOLOOP_BACKEND in the environment, if it is set.
+
+    Returns
+    -------
+    Backend
+
+    Raises
+    ------
+    InputError
+        For one that does not exist or cannot start.
     """
     name = name or os.environ.get("HOLOLOOP_BACKEND") or None
     if name not in (None, *BACKENDS):
@@ -142,9 +165,7 @@ def backend(name: str | None = None) -> Backend:
         found = CupyBackend()
         if found.xp.cuda.runtime.getDeviceCount() > 0:
             return found
-    except (
-        Exception
-    ) as error:  # not installed, no driver, no device: each library version says it its own way
+    except Exception as error:  # not installed, no driver, no device: library versions raise different errors
         if name == "cupy":
             raise InputError(f"the CuPy backend cannot start ({error}): use numpy") from error
     if name == "cupy":

@@ -14,10 +14,27 @@ ROWS = 16  # rounded at a time
 
 
 class DriveRange:
-    """What a light path's panel reaches.
+    """The phases that a light path's panel reaches.
 
-    levels: gray levels that may be used, from 0 on; more than the response holds are not. gapless: a whole
-    turn is covered everywhere. bounded: phases a turn apart are not alike, so a step has to stay in range.
+    Parameters
+    ----------
+    path : LightPath
+    levels : int
+        Gray levels that may be used, from 0 on; at most those that the response has.
+
+    Attributes
+    ----------
+    low, high : float or float array [H, W], rad
+        The ends of the range.
+    gapless : bool
+        A whole turn is covered everywhere.
+    bounded : bool
+        Phases a turn apart do not act the same, so a step has to stay in range.
+
+    Raises
+    ------
+    InputError
+        For a number of levels that is not from 2 to 256.
     """
 
     def __init__(self, path: LightPath, levels: int = 256) -> None:
@@ -42,7 +59,7 @@ class DriveRange:
             self.table = self._nearest(turn)
 
     def held(self, phase: np.ndarray) -> np.ndarray:
-        """Phases (rad) moved by whole turns into what the panel reaches; in a gap, to its nearer edge."""
+        """Phases (rad) moved by whole turns into the panel's range; in a gap, to its nearer edge."""
         turn = phase.dtype.type(2 * math.pi)
         above = (phase - self.low) / turn
         outside = (phase < self.low) | (phase > self.high)
@@ -51,11 +68,11 @@ class DriveRange:
         return np.where(past <= 0, phase, np.where(past <= self.low + turn - phase, self.high, self.low))
 
     def pushed_out(self, phase: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-        """Where a step down the gradient would leave the range from its very edge, bool [H, W]."""
+        """Where a phase is at an end of the range and a step down the gradient would leave it, bool [H, W]."""
         return ((phase <= self.low) & (gradient > 0)) | ((phase >= self.high) & (gradient < 0))
 
     def gray(self, phase: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Gray levels, uint8 [H, W], whose phase is nearest to `phase` (rad); written to `out` if it is given."""
+        """Gray levels, uint8 [H, W], whose phase is nearest to `phase` (rad); written to `out` where given."""
         out = np.empty(phase.shape, np.uint8) if out is None else out
         if self.table is None:
             out[...] = self._nearest(phase)

@@ -9,7 +9,7 @@ import numpy as np
 
 from runtime.lightpath.light_path import LightPath
 from runtime.solver.array_backend import Backend
-from runtime.solver.band import Band
+from runtime.solver.iris_band import Band
 
 Array = Any
 
@@ -17,8 +17,14 @@ Array = Any
 class Crosstalk:
     """The sub-pixels of a panel with crosstalk: their phases, and where they lie within the pixel.
 
-    down [sub-pixels, n, 1] and across [sub-pixels, m]: the linear phase over the band's rows and columns that
-    puts a sub-pixel at its place. The rest is room to work in.
+    Attributes
+    ----------
+    down : list of complex array [n, 1]
+        For each row of sub-pixels, the linear phase over the band's rows that puts it at its place.
+    across : list of complex array [m]
+        The same for each column of sub-pixels, over the band's columns.
+    columns, mixed, driven, one, back, room : array
+        Room to work in.
     """
 
     def __init__(self, path: LightPath, rows: Band, columns: Band, backend: Backend) -> None:

@@ -8,8 +8,8 @@ import numpy as np
 
 from runtime.lightpath.light_path import LightPath
 from runtime.solver.array_backend import Backend
-from runtime.solver.band import Band, Run
 from runtime.solver.in_place_crosstalk import Crosstalk
+from runtime.solver.iris_band import Band, Run
 
 Array = Any
 
@@ -17,10 +17,16 @@ Array = Any
 class Panel:
     """The panel's side of a light path: the DFT of source exp(j phase) + leak, over the band's columns.
 
-    spectrum [rows, columns of the band]: what `forward` fills and `adjoint` uses up. runs: where the band's
-    rows are in it. Only rows that the panel has are transformed, and only columns that the iris passes go on;
-    the pixel's aperture is in the pupil's transfer functions (`Optics`). With crosstalk, the sum over
-    sub-pixels, each at its place.
+    Only rows that the panel has are transformed, and only columns that the iris passes are kept. The pixel's
+    aperture is in the pupil's transfer functions (`Optics`). With crosstalk, the sum over sub-pixels, each at its
+    place.
+
+    Attributes
+    ----------
+    spectrum : complex array [rows, columns of the band]
+        What `forward` fills and `adjoint` uses up.
+    runs : tuple of Run
+        Where the band's rows are in it.
     """
 
     def __init__(self, path: LightPath, rows: Band, columns: Band, backend: Backend) -> None:
@@ -43,7 +49,14 @@ class Panel:
             self.runs = tuple(Run(run.band, run.band, run.image, False) for run in rows.runs)
 
     def forward(self, phase: Array, columns: bool = True) -> None:
-        """Fill `spectrum` from phase (rad) [H, W]; columns: transformed too, which a caller may do by itself."""
+        """Fill `spectrum` from a phase.
+
+        Parameters
+        ----------
+        phase : float array [H, W], rad
+        columns : bool
+            Whether the columns are transformed too; a caller may do that itself.
+        """
         mixing = self.crosstalk
         if mixing is None:
             self._rows_forward(phase, self.spectrum, None)
@@ -61,9 +74,16 @@ class Panel:
                 self.spectrum[run.band] += mixing.columns[run.panel] * down[run.band]
 
     def adjoint(self, phase: Array, gradient: Array, columns: bool = True) -> None:
-        """Gradient of a loss over phase [H, W], from its gradient over `spectrum`, which is used up.
+        """Fill the gradient of a loss over phase from its gradient over `spectrum`, which is used up.
 
-        `phase` is that of the last `forward`; columns: as there.
+        Parameters
+        ----------
+        phase : float array [H, W], rad
+            That of the last `forward`.
+        gradient : float array [H, W]
+            The result.
+        columns : bool
+            As in `forward`.
         """
         mixing = self.crosstalk
         if mixing is None:
@@ -86,7 +106,7 @@ class Panel:
             mixing.unmix_down(mixing.back, i, gradient)
 
     def field_from_spectrum(self, field: Array, columns: bool = True) -> None:
-        """Adjoint of the way from a field on the panel [H, W] (crosstalk aside) to `spectrum`, which is used up."""
+        """Fill a field on the panel [H, W] with the adjoint (without crosstalk) of `spectrum`, which is used up."""
         spectrum = self.spectrum
         if self.crosstalk:
             spectrum = self.crosstalk.columns
@@ -119,7 +139,7 @@ class Panel:
             lit *= self.source[rows]
 
     def _rows_forward(self, phase: Array, spectrum: Array, turned: Array | None) -> None:
-        """Spectra of the rows, the band's columns of them; `turned` [columns]: times this, added."""
+        """Write the rows' spectra over the band's columns, or add them times `turned` [columns]."""
         height, width = self.shape
 
         def work(worker: int, rows: slice) -> None:
@@ -141,7 +161,7 @@ class Panel:
         self.backend.over_rows(height, self.strip, work)
 
     def _row_back(self, worker: int, rows: slice, spectrum: Array, turned: Array | None) -> Array:
-        """The panel's part of rows whose spectra are given: adjoint of what `_rows_forward` does to a field."""
+        """The panel's part of rows, from their spectra: adjoint of what `_rows_forward` does to a field."""
         row = self.row[worker][: rows.stop - rows.start]
         row[:, self.columns.panel_gap] = 0
         for run in self.columns.runs:
@@ -156,7 +176,7 @@ class Panel:
         return row[:, : self.shape[1]]
 
     def _rows_adjoint(self, spectrum: Array, turned: Array | None, gradient: Array) -> None:
-        """Seed eq. 22-23, Re(-j exp(-j phase) ...), with the field that lights the panel, `lit`, in it."""
+        """Re(-j exp(-j phase) ...) with the illuminating field (Chakravarthula et al. 2020, eq. 22-23)."""
         xp = self.backend.xp
 
         def work(worker: int, rows: slice) -> None:

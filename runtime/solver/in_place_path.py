@@ -1,8 +1,11 @@
-"""A light path made ready to be gone through many times: forward and adjoint in place, nothing allocated.
+"""The light path in place: forward and adjoint for the solver's inner loop, which allocates nothing.
 
-The mathematics is that of `runtime.lightpath.light_path`, which says what each array means; here it is arranged for
-speed. Rows that are dark and columns that the iris stops are not transformed, and elementwise work is done on
-strips of rows while they are in a core's cache.
+This is the one deliberate second copy of `runtime.lightpath.light_path`, which defines the mathematics and says what
+each array means; here it is arranged for speed. Rows that are dark and columns that the iris stops are not
+transformed, and elementwise work is done on strips of rows while they are in a core's cache. A test keeps
+irradiance and gradient of the two equal to 1e-9 in double precision (`tests/runtime/test_solver_optics.py`).
+
+The panel's side is in `in_place_panel`, the image's in `in_place_image`, and the pupil between them is here.
 
 The image is sampled once a panel pixel (fine = 1) or twice (fine = 2), an axis. |z|^2 has twice the bandwidth
 of z: once a pixel carries it where the iris passes no more than half of the panel's band.
@@ -16,13 +19,12 @@ import numpy as np
 
 from firmware_iface.errors import InputError
 from runtime.lightpath.light_path import LightPath
-from runtime.lightpath.windows import ring
 from runtime.solver.array_backend import Backend
-from runtime.solver.band import band, folded
+from runtime.solver.in_place_image import ImagePlane, pixel_filter
 from runtime.solver.in_place_panel import Panel
+from runtime.solver.iris_band import band, folded
 
 Array = Any
-Window = list[tuple[slice, slice]]  # a part of the image, and where it is on the period
 
 
 def aliases(path: LightPath, fine: int) -> bool:
@@ -34,10 +36,21 @@ def aliases(path: LightPath, fine: int) -> bool:
 class Optics:
     """From phase on the panel to irradiance at the image's pixels, and the adjoint.
 
-    integrate: whether pixels integrate light over their area and the path's own irradiance filter is applied,
-    which takes two more real transforms each way; without it, `forward` gives irradiance at their centres,
-    which the fine grid is not offered for.
-    Raises InputError for a path to the far field, and for crosstalk where the image aliases.
+    Parameters
+    ----------
+    path : LightPath
+    fine : int
+        Samples a panel pixel, an axis: 1 or 2.
+    integrate : bool
+        Whether pixels integrate light over their area and the path's own irradiance filter is applied, which takes
+        two more real transforms each way. Without it, `forward` gives irradiance at their centres, which the fine
+        grid is not offered for.
+    backend : Backend
+
+    Raises
+    ------
+    InputError
+        For a path to the far field, and for crosstalk where the image aliases.
     """
 
     def __init__(self, path: LightPath, fine: int, integrate: bool, backend: Backend) -> None:
@@ -48,7 +61,6 @@ class Optics:
             raise InputError("with crosstalk and all of the panel's band open, use the fine grid")
         real, pair = path.response.dtype, path.source.dtype
         self.backend, self.shape = backend, grid.shape
-        padded = (fine * grid.padded[0], fine * grid.padded[1])
         self.rows, self.columns = (
             band(edge, n, fine * n) for edge, n in zip(grid.band, grid.padded, strict=True)
         )
@@ -58,28 +70,21 @@ class Optics:
             transfers = folded(transfers, axis, grid.band[axis - 1], to)
         self.transfers = [xp.asarray(t.astype(pair)) for t in transfers]
         self.conjugates = [t.conj() for t in self.transfers]
-        self.weights = [float(w) for w in path.weights]
         self.strongest = int(np.argmax(path.weights))
-
-        first = fine * grid.margin if integrate else 0
-        height, width = (fine * n + 2 * first for n in grid.shape)
-        self.at_pixels = tuple(slice(first, first + fine * n, fine) for n in grid.shape)
-        self.down, self.across = _window(first, height, padded[0]), _window(first, width, padded[1])
-        self.dark = slice(width - first, padded[1] - first)  # of the period: what the window leaves out
-        self.fields = [xp.zeros((height, width), pair) for _ in transfers]
         # Where one buffer can be both, the pupil multiplies in place.
         self.in_place = fine == 1 and len(transfers) == 1 and path.crosstalk is None
         self.spectrum = self.panel.spectrum
         if not self.in_place:
-            self.spectrum = xp.zeros((padded[0], len(self.columns.frequencies)), pair)
-        self.strip = min(backend.strip_rows(padded[1]), height)
-        self.row = [xp.zeros((self.strip, padded[1]), pair) for _ in range(backend.threads)]
-        self.part = [xp.empty((self.strip, width), real) for _ in range(backend.threads)]
+            self.spectrum = xp.zeros((fine * grid.padded[0], len(self.columns.frequencies)), pair)
+        margin = fine * grid.margin if integrate else 0
+        self.at_pixels = tuple(slice(margin, margin + fine * n, fine) for n in grid.shape)
+        self.image_plane = ImagePlane(path, fine, margin, self.columns, self.spectrum, backend)
+        self.strip = self.image_plane.strip
         self.image = None
         if integrate:
             transfer = xp.asarray(pixel_filter(path, fine).astype(pair))
             self.filter, self.filter_back = transfer, transfer.conj()
-            self.image = xp.zeros((height, width), real)
+            self.image = xp.zeros(self.image_plane.shape, real)
             self.half_spectrum = xp.zeros(transfer.shape, pair)
 
     def forward(self, phase: Array, light: Array) -> None:
@@ -92,16 +97,28 @@ class Optics:
             else:
                 self._through_pupil(mode)
                 self.backend.columns_fft(self.spectrum, False)
-            self._onto_image(mode, image)
+            self.image_plane.forward(mode, image)
         if self.image is not None:
             self.backend.filter(image, self.filter, self.half_spectrum)
             light[...] = image[self.at_pixels]
 
     def adjoint(self, phase: Array, slope: Array, gradient: Array) -> None:
-        """Fill `gradient` [H, W], of a loss over phase, from `slope` [H, W], its gradient over light.
+        """Fill the gradient of a loss over phase from its gradient over light.
 
-        Seed eq. 20-23: 2 z dI, back through the conjugate transfer, then the panel's part. `phase` is that of
-        the last `forward`.
+        The steps back are 2 z dI, the conjugate transfer, then the panel's part.
+
+        Parameters
+        ----------
+        phase : float array [H, W], rad
+            That of the last `forward`.
+        slope : float array [H, W]
+            Gradient over light.
+        gradient : float array [H, W]
+            The result.
+
+        References
+        ----------
+        Chakravarthula et al. 2020, eq. 20-23.
         """
         self._back(slope)
         self.panel.adjoint(phase, gradient, columns=not self.in_place)
@@ -112,19 +129,20 @@ class Optics:
         self.panel.field_from_spectrum(wave, columns=not self.in_place)
 
     def wave_at_panel(self, wave: Array) -> None:
-        """A field at the image's pixels [H, W] to the one on the panel that it comes from, in place.
+        """A field at the image's pixels [H, W] to the one on the panel that makes it, in place.
 
         The adjoint of the strongest mode: its inverse, up to a constant, where the pupil passes all.
         """
         mode = self.strongest
-        self.fields[mode][...] = 0
-        self.fields[mode][self.at_pixels] = wave
-        self._off_image(mode, None)
+        field = self.image_plane.fields[mode]
+        field[...] = 0
+        field[self.at_pixels] = wave
+        self.image_plane.adjoint(mode, None)
         self._back_through_pupil(mode, again=False)
         self.panel.field_from_spectrum(wave, columns=not self.in_place)
 
     def _back(self, slope: Array) -> None:
-        """2 slope z of every mode, back to the panel's spectrum."""
+        """Fill the panel's spectrum with 2 slope z of every mode, back through the pupil."""
         image = slope
         if self.image is not None:
             image = self.image
@@ -132,73 +150,8 @@ class Optics:
             image[self.at_pixels] = slope
             self.backend.filter(image, self.filter_back, self.half_spectrum)
         for mode in range(len(self.transfers)):
-            self._off_image(mode, image)
+            self.image_plane.adjoint(mode, image)
             self._back_through_pupil(mode, again=mode > 0)
-
-    def _onto_image(self, mode: int, image: Array) -> None:
-        """The rows' inverse DFT, the field in the window, and its weighted |z|^2 put into or added to the image."""
-        xp, weight = self.backend.xp, self.weights[mode]
-        for seen, period in self.down:
-            spectrum, fields, light = self.spectrum[period], self.fields[mode][seen], image[seen]
-
-            def work(
-                worker: int,
-                rows: slice,
-                spectrum: Array = spectrum,
-                fields: Array = fields,
-                light: Array = light,
-            ) -> None:
-                count = rows.stop - rows.start
-                row, part = self.row[worker][:count], self.part[worker][:count]
-                row[:, self.columns.image_gap] = 0
-                for run in self.columns.runs:
-                    row[:, run.image] = spectrum[rows, run.band]
-                self.backend.rows_fft(row, row, False)
-                for here, there in self.across:
-                    fields[rows, here] = row[:, there]
-                here_light = light[rows] if mode == 0 else part
-                xp.abs(fields[rows], out=here_light)
-                here_light *= here_light
-                if weight != 1:
-                    here_light *= weight
-                if mode > 0:
-                    light[rows] += part
-
-            self.backend.over_rows(len(fields), self.strip, work)
-
-    def _off_image(self, mode: int, slope: Array | None) -> None:
-        """Adjoint of `_onto_image`: 2 weight z slope (the field as it is where there is no slope) to `spectrum`."""
-        xp, twice = self.backend.xp, 2 * self.weights[mode]
-        begin = 0
-        for seen, period in sorted(self.down, key=lambda pair: pair[1].start):
-            self.spectrum[begin : period.start] = 0
-            begin = period.stop
-            spectrum, fields = self.spectrum[period], self.fields[mode][seen]
-            over = None if slope is None else slope[seen]
-
-            def work(
-                worker: int,
-                rows: slice,
-                spectrum: Array = spectrum,
-                fields: Array = fields,
-                over: Array | None = over,
-            ) -> None:
-                count = rows.stop - rows.start
-                row, part = self.row[worker][:count], self.part[worker][:count]
-                row[:, self.dark] = 0
-                if over is not None:
-                    xp.multiply(over[rows], twice, out=part)
-                for here, there in self.across:
-                    if over is None:
-                        row[:, there] = fields[rows, here]
-                    else:
-                        xp.multiply(fields[rows, here], part[:, here], out=row[:, there])
-                self.backend.rows_fft(row, row, True)
-                for run in self.columns.runs:
-                    spectrum[rows, run.band] = row[:, run.image]
-
-            self.backend.over_rows(len(fields), self.strip, work)
-        self.spectrum[begin:] = 0
 
     def _through_columns(self, transfer: Array) -> None:
         """Where one buffer is both the panel's and the image's: along the columns, and through the pupil, at once."""
@@ -258,28 +211,6 @@ class Optics:
             self.backend.over_rows(len(out), self.strip, work)
         if self.panel.crosstalk is None:
             self.panel.spectrum[self.rows.panel_gap] = 0
-
-
-def pixel_filter(path: LightPath, fine: int) -> np.ndarray:
-    """Transfer function of irradiance, the path's own and a pixel's area, over the image's half spectrum."""
-    height, width = (fine * (n + 2 * path.grid.margin) for n in path.grid.shape)
-    fy, fx = np.fft.fftfreq(height, 1 / fine), np.fft.rfftfreq(width, 1 / fine)
-    transfer = np.sinc(fy)[:, None] * np.sinc(fx)[None, :]
-    own = path.irradiance_filter
-    if own is None:
-        return transfer
-    # The same frequencies of the fine grid: the image's extent is the same.
-    rows = np.rint(fy * height / fine).astype(int)
-    return np.asarray(transfer * own[rows, : width // 2 + 1])
-
-
-def _window(first: int, count: int, period: int) -> Window:
-    """Where `count` samples that begin `first` before the panel's lie on the period: (image, period) slices."""
-    window, done = [], 0
-    for start, stop in ring(-first, count, period):
-        window.append((slice(done, done + stop - start), slice(start, stop)))
-        done += stop - start
-    return window
 
 
 def _aperture(path: LightPath) -> np.ndarray:

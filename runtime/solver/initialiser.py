@@ -1,4 +1,4 @@
-"""A first phase from a small network, so that two or three iterations suffice.
+"""A first phase from a small network, so that two or three iterations are enough.
 
 `initialiser.onnx` in a bundle: `target` [1, 1, H, W], amplitude with a mean square of 1, to `phase`
 [1, 2, H, W], cosine and sine (of any common length) at the panel.
@@ -9,16 +9,28 @@ from __future__ import annotations
 import numpy as np
 
 from firmware_iface.errors import InputError
-from runtime.networks.onnx_session import Session
+from runtime.networks.onnx_session import OnnxSession
 
 
 class Initialiser:
-    """The network for a panel of one shape (H, W). Raises InputError where it does not fit."""
+    """The network for a panel of one shape.
+
+    Parameters
+    ----------
+    model : bytes
+        ONNX.
+    shape : (int, int), pixels
+
+    Raises
+    ------
+    InputError
+        Where the network does not fit.
+    """
 
     def __init__(self, model: bytes, shape: tuple[int, int]) -> None:
         self._target = np.zeros((1, 1, *shape), np.float32)
         self._phase = np.zeros((1, 2, *shape), np.float32)
-        self._session = Session(model, "initialiser.onnx")
+        self._session = OnnxSession(model, "initialiser.onnx")
         if set(self._session.inputs) != {"target"} or self._session.outputs != ["phase"]:
             raise InputError(
                 "initialiser.onnx is not a network from target to phase: export the bundle again"

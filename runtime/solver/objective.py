@@ -1,4 +1,4 @@
-"""What is minimised: light of a phase pattern through one or several light paths, against its targets."""
+"""The objective: light of a phase pattern through one or several light paths, against its targets."""
 
 from __future__ import annotations
 
@@ -24,9 +24,21 @@ OPEN = 0.75
 class Objective:
     """Loss over phase [C, H, W] for targets [C, K, H, W]: C colours with a pattern each, K planes a colour.
 
-    A colour's planes share its pattern and its scale. fine: samples a pixel, an axis (see `Optics`). weight:
-    None, or [H, W], how much a pixel counts. approximator: None, or D, which sees all colours of the first
-    plane at once. `look` comes before `gradient`, which uses up what it left.
+    A colour's planes share its pattern and its scale. `look` comes before `gradient`, which uses up what it left.
+
+    Parameters
+    ----------
+    stacks : list of list of LightPath
+        Colours of planes.
+    fine : int
+        Samples a pixel, an axis (see `Optics`).
+    penalty : str
+        One of PENALTIES.
+    weight : array [H, W] or None
+        How much a pixel counts.
+    approximator : Approximator or None
+        D, which takes all colours of the first plane at once.
+    backend : Backend
     """
 
     def __init__(
@@ -63,7 +75,7 @@ class Objective:
         self.loss, self.squared_error, self.peak = math.inf, math.inf, 1.0
 
     def aim(self, targets: np.ndarray) -> None:
-        """Take other targets, irradiance [C, K, H, W] of any scale, none of them dark."""
+        """Change to other targets, irradiance [C, K, H, W] of any scale, none of them dark."""
         xp = self.backend.xp
         bare = isinstance(self.penalty, Irradiance)
         for c in range(self.shape[0]):
@@ -102,7 +114,7 @@ class Objective:
         return self.loss
 
     def gradient(self, phase: Array, out: Array) -> None:
-        """Gradient over the phase last looked at, of the loss's sum over pixels: [C, H, W] written to `out`."""
+        """Gradient of the loss's sum over pixels, over the phase of the last `look`: [C, H, W] written to `out`."""
         for c, stack in enumerate(self.optics):
             for k, optics in enumerate(stack):
                 optics.adjoint(phase[c], self.light[c, k], self.room if k else out[c])
@@ -110,7 +122,7 @@ class Objective:
                     out[c] += self.room
 
     def constrain(self, colour: int) -> None:
-        """For Gerchberg-Saxton, in place of a slope: half of what each field has to be multiplied by."""
+        """For Gerchberg-Saxton, in place of a slope: half of the factor that constrains each field."""
         for light in self.light[colour]:  # dLoss / dI = c^2 (1 - wanted / (c sqrt(I))), where it counts
             light *= -0.5 / self.scale[colour] ** 2
             light += 0.5
@@ -121,7 +133,7 @@ class Objective:
         return 20 * math.log10(self.peak / max(math.sqrt(self.squared_error), 1e-15))
 
     def curvature(self, colour: int) -> float:
-        """About the loss's second derivative over a pixel's phase, for a path that loses no light."""
+        """The loss's approximate second derivative over a pixel's phase, for a path that loses no light."""
         if self.approximator is not None:
             return self.power[colour] / self.mean_light[colour]
         rms = math.sqrt(self.squared_error)
@@ -148,7 +160,7 @@ class Objective:
         return self.backend.over_rows(len(light), self.strip, work)
 
     def _look_through(self, d: Approximator, first: bool) -> float:
-        """The loss of what D makes of the light, mean over pixels."""
+        """The loss of the light after D, mean over pixels."""
         xp = self.backend.xp
         for c in range(self.shape[0]):
             light, wanted = self.light[c, 0], self.wanted[c, 0]
@@ -175,7 +187,7 @@ class Objective:
 
 
 def needs_fine_grid(stacks: Sequence[Sequence[LightPath]]) -> bool:
-    """Whether once a pixel hides too much of the light of any of these paths: see `OPEN`."""
+    """Whether irradiance once a pixel is too coarse for any of these paths: see `OPEN`."""
     return any(path.grid.band_share > OPEN for stack in stacks for path in stack)
 
 

@@ -1,6 +1,6 @@
 """Penalties: how far light is from a target, and the slope of that, with the scale in closed form.
 
-The light is compared up to one scale c, which is eliminated: at each pattern it has its best value. A penalty
+The light is compared up to one scale c, which is eliminated: for each pattern it has its best value. A penalty
 works on strips, in place. `measure` prepares `light` and returns the sums from which `scale` finds c; `slope`
 then turns it into the loss's gradient over light and returns (loss, squared error of amplitude).
 
@@ -19,7 +19,7 @@ ROUNDING = 1e-2  # of the root mean square amplitude: below it, l1 is rounded of
 
 
 class Amplitude:
-    """sum w (c sqrt(I) - sqrt(t))^2: the seed's eq. 14 with f the squared error of amplitude."""
+    """sum w (c sqrt(I) - sqrt(t))^2: Chakravarthula et al. 2020, eq. 14, with f the squared error of amplitude."""
 
     def __init__(self, xp: Any) -> None:
         self.xp = xp
@@ -51,15 +51,28 @@ class Amplitude:
 
     @staticmethod
     def curvature(scale: float, light: float, rms_error: float) -> float:
-        """About the second derivative over a pixel's phase, which a first step is divided by; light: its mean.
+        """Approximate second derivative over a pixel's phase, which a first step is divided by.
 
         A change of phase moves the field sideways as often as along itself, so it is half of that over |z|.
+
+        Parameters
+        ----------
+        scale : float
+            c.
+        light : float
+            Mean irradiance.
+        rms_error : float
+            Of amplitude.
+
+        Returns
+        -------
+        float
         """
         return scale**2
 
 
-class Smooth(Amplitude):
-    """sum w |c sqrt(I) - sqrt(t)|, rounded off at the bottom so that it has a slope everywhere: l1."""
+class SmoothL1(Amplitude):
+    """sum w |c sqrt(I) - sqrt(t)|, rounded off near zero so that it has a slope everywhere."""
 
     def slope(self, root: Array, wanted: Array, weight: Array | None, scale: float, error: Array) -> Sums:
         xp = self.xp
@@ -106,7 +119,7 @@ class Irradiance(Amplitude):
         return 4 * scale**2 * light
 
 
-PENALTIES: dict[str, type[Amplitude]] = {"amplitude": Amplitude, "irradiance": Irradiance, "l1": Smooth}
+PENALTIES: dict[str, type[Amplitude]] = {"amplitude": Amplitude, "irradiance": Irradiance, "l1": SmoothL1}
 
 
 def _dots(xp: Any, a: Array, b: Array, weight: Array | None) -> Sums:

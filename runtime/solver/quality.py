@@ -1,21 +1,29 @@
-"""How near what is shown is to what was wanted, always through the whole linear light path on the fine grid."""
+"""How near what is shown is to its target, always through the whole linear light path on the fine grid."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from runtime.lightpath.light_path import LightPath, irradiance, panel_phase, pixel_irradiance
+from runtime.networks.onnx_approximator import Approximator
 
 
 @dataclass(frozen=True)
 class Quality:
     """How near irradiance is to a target, up to one scale.
 
-    psnr_db: of amplitude, the target's brightest as the peak. nrmse: root mean squared error of irradiance
-    over the target's standard deviation. scale: irradiance a unit of target.
+    Attributes
+    ----------
+    psnr_db : float, dB
+        Of amplitude, the target's brightest as the peak.
+    nrmse : float
+        Root mean squared error of irradiance over the target's standard deviation.
+    scale : float
+        Irradiance a unit of target.
     """
 
     psnr_db: float
@@ -40,9 +48,18 @@ def quality_of(
 
 
 def quality(light: np.ndarray, target: np.ndarray, region: np.ndarray | None = None) -> Quality:
-    """How near irradiance is to a target, both [H, W], each error with its own best scale.
+    """How near irradiance is to a target, each error with its own best scale.
 
-    region: bool [H, W], the pixels that count; none: all.
+    Parameters
+    ----------
+    light, target : float array [H, W]
+        Irradiance.
+    region : bool array [H, W] or None
+        The pixels that count; None: all.
+
+    Returns
+    -------
+    Quality
     """
     if region is not None:
         light, target = light[region], target[region]
@@ -50,8 +67,49 @@ def quality(light: np.ndarray, target: np.ndarray, region: np.ndarray | None = N
     wanted = np.sqrt(target, dtype=np.float64)
     residual = root * (float(np.vdot(root, wanted)) / max(float(np.vdot(root, root)), 1e-300)) - wanted
     psnr = 20 * math.log10(wanted.max() / max(float(np.sqrt(np.mean(residual**2))), 1e-150))
-    shown, asked = light.astype(np.float64), target.astype(np.float64)
-    scale = float(np.vdot(shown, asked)) / max(float(np.vdot(asked, asked)), 1e-300)
-    fitted = shown * (float(np.vdot(shown, asked)) / max(float(np.vdot(shown, shown)), 1e-300))
+    given, asked = light.astype(np.float64), target.astype(np.float64)
+    scale = float(np.vdot(given, asked)) / max(float(np.vdot(asked, asked)), 1e-300)
+    fitted = given * (float(np.vdot(given, asked)) / max(float(np.vdot(given, given)), 1e-300))
     spread = max(float(asked.std()), 1e-6 * float(asked.max()))
     return Quality(psnr, float(np.sqrt(np.mean((fitted - asked) ** 2))) / spread, scale)
+
+
+def qualities_of(
+    stacks: Sequence[Sequence[LightPath]],
+    patterns: np.ndarray,
+    targets: np.ndarray,
+    weight: np.ndarray | None,
+    approximator: Approximator | None,
+) -> tuple[Quality, ...]:
+    """Qualities of patterns, a colour and plane each.
+
+    Parameters
+    ----------
+    stacks : list of list of LightPath
+        Colours of planes.
+    patterns : uint8 array [C, H, W]
+        Gray levels.
+    targets : float array [C, K, H, W]
+        Irradiance.
+    weight : float array [H, W] or None
+        The pixels above zero count; None: all.
+    approximator : Approximator or None
+        Corrects the light of the first plane; its arrays are written again.
+
+    Returns
+    -------
+    tuple of Quality
+        Planes of the first colour first.
+    """
+    light = np.stack(
+        [[shown(path, gray) for path in stack] for stack, gray in zip(stacks, patterns, strict=True)]
+    )
+    if approximator is not None:
+        for c in range(len(light)):
+            approximator.irradiance[c] = light[c, 0] / light[c, 0].mean()
+        approximator.correct()
+        light[:, 0] = approximator.corrected
+    region = None if weight is None else weight > 0
+    shape = patterns.shape[1:]
+    pairs = zip(light.reshape(-1, *shape), targets.reshape(-1, *shape), strict=True)
+    return tuple(quality(one, target, region) for one, target in pairs)

@@ -1,4 +1,4 @@
-"""What a solve gives back."""
+"""What a solve returns."""
 
 from __future__ import annotations
 
@@ -15,10 +15,18 @@ from runtime.solver.quality import Quality
 class Solution:
     """Patterns for the colours of one picture; one colour has no axis of its own.
 
-    gray: uint8 [C, H, W] or [H, W]. phase: what was asked of the panel before rounding, rad. psnr_db: amplitude PSNR
-    before rounding, at the start and after each iteration, on the solver's own grid. milliseconds: from the
-    target to the gray levels. Both arrays are the solver's own: `gray` is written again by its second next
-    solve, `phase` by the next.
+    Both arrays belong to the solver: its second next solve writes `gray` again, its next solve writes `phase` again.
+
+    Attributes
+    ----------
+    gray : uint8 array [C, H, W] or [H, W]
+        Gray levels to send to the panel.
+    phase : float array [C, H, W] or [H, W], rad
+        What was asked of the panel, before rounding.
+    psnr_db : tuple of float, dB
+        Amplitude PSNR before rounding, at the start and after each iteration, on the solver's own grid.
+    milliseconds : float, ms
+        From the target to the gray levels.
     """
 
     gray: np.ndarray
@@ -34,14 +42,19 @@ class Solution:
 
     @property
     def expected_psnr_db(self) -> float:
-        """The pattern's error as the solver saw it, known at once: the best of `psnr_db`."""
+        """The pattern's PSNR on the solver's own grid, known at once: the best of `psnr_db`."""
         return max(self.psnr_db)
 
     @cached_property
     def qualities(self) -> tuple[Quality, ...]:
         """Of the gray levels, through the whole padded light path on the fine grid, a colour and plane each.
 
-        Computed when first asked for. Raises InputError where the arrays have been written again by then.
+        Computed when first asked for.
+
+        Raises
+        ------
+        InputError
+            Where the arrays have been written again by then.
         """
         return self._judge()
 

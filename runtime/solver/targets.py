@@ -1,4 +1,4 @@
-"""Pictures to be shown, as linear irradiance.
+"""Pictures to show, as linear irradiance.
 
 Everywhere in hololoop a target is linear: twice the number is twice the light. Colour channels are called
 "red", "green" and "blue", in that order where they are stacked.
@@ -35,24 +35,39 @@ def read_target(
     *,
     fit: bool = False,
 ) -> np.ndarray:
-    """Read a picture as float32 linear irradiance: [H, W], or [C, H, W] for several channels.
+    """Read a picture as linear irradiance.
 
-    `channels` is 1 (a colour picture gives its luminance), 3 (red, green, blue) or a sequence of those
-    names, one plane each, in its order. A gray picture is the same in every channel.
-
-    PNG, 8 or 16 bits: sRGB whatever its colour profile says, decoded to linear, white = 1.
+    PNG, 8 or 16 bits: sRGB (its colour profile is ignored), decoded to linear, white = 1.
     EXR: linear as it is, from R, G, B or from Y. Needs the OpenEXR library.
     NPY: linear as it is, [H, W] or [3, H, W].
 
-    With `shape` (height, width), a picture of another size is an InputError, or with `fit` is cropped about
-    its centre to that aspect and resized by area: each pixel gets the mean of the light that falls on it.
+    Parameters
+    ----------
+    path : path
+    shape : (int, int) or None, pixels
+        Height, width that the picture must have.
+    channels : int or sequence of str
+        1 (a colour picture gives its luminance), 3 (red, green, blue) or a sequence of those names, one plane each,
+        in its order. A gray picture is the same in every channel.
+    fit : bool
+        Crop a picture of another size about its centre to the aspect of `shape` and resize it by area: each pixel
+        gets the mean of the light that falls on it.
+
+    Returns
+    -------
+    float32 array [H, W], or [C, H, W] for several channels
+
+    Raises
+    ------
+    InputError
+        For a file that cannot be read as a picture, and for another size without `fit`.
     """
     names = _channel_names(channels)
     path = Path(path)
     readers = {".png": _read_png, ".exr": _read_exr, ".npy": _read_npy}
     reader = readers.get(path.suffix.lower())
     if reader is None:
-        raise InputError(f"{path} is not a kind of picture that is read here; give PNG, EXR or NPY")
+        raise InputError(f"{path} is not a type of picture that is read here; give PNG, EXR or NPY")
     if not path.is_file():
         raise InputError(f"{path} is missing" if not path.exists() else f"{path} is not a file")
     planes = reader(path)  # [1, H, W] or [3, H, W], linear
@@ -79,7 +94,7 @@ def read_target(
 def fit_area(picture: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """Crop [..., H, W] about its centre to the aspect of `shape`, and resize it to `shape` by area.
 
-    The mean over the crop is kept, whatever the two sizes: nothing rings, brightens or goes below zero.
+    The mean over the crop is kept for all sizes; no value overshoots, and none goes below zero.
     """
     height, width = picture.shape[-2:]
     scale = min(height / shape[0], width / shape[1])  # pixels of the picture per pixel of the result
@@ -87,7 +102,7 @@ def fit_area(picture: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 
 def encode_srgb(linear: np.ndarray) -> np.ndarray:
-    """Linear irradiance, clipped to 0..1, to sRGB in 0..1: what a file or a screen wants."""
+    """Linear irradiance, clipped to 0..1, to sRGB in 0..1, as files and screens have it."""
     linear = np.clip(linear, 0, 1)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.power(linear, 1 / 2.4) - 0.055)
 
@@ -116,7 +131,7 @@ def _read_png(path: Path) -> np.ndarray:
     with path.open("rb") as file:
         header = file.read(26)
     if len(header) < 26 or header[:8] != b"\x89PNG\r\n\x1a\n" or header[12:16] != b"IHDR":
-        raise InputError(f"{path} is not a PNG, whatever its name says")
+        raise InputError(f"{path} is not a PNG, although its name says so")
     depth, colour_type = header[24], header[25]
     try:
         with warnings.catch_warnings():

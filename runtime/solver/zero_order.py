@@ -1,4 +1,4 @@
-"""Keeping what the panel does not modulate out of the picture: a ramp on the pattern and an iris beside the axis."""
+"""Keeps light that the panel does not modulate out of the picture: an iris off the axis and a ramp on the pattern."""
 
 from __future__ import annotations
 
@@ -16,10 +16,15 @@ def beside_zero_order(path: LightPath) -> LightPath:
     """The path with its iris closed below the axis and up to a guard above it.
 
     Undiffracted light (leak, gaps between pixels) comes to a focus on the axis of the iris's plane and stops
-    there; so do the ghosts that mirror the picture about it. The pattern's ramp, which brings the light to
-    the opening's middle, is that of the solver's start, and is found from the path. The bench's iris has to be
-    moved alike: its opening, in cycles/mm, is from GUARD / (2 pitch) up to where the path's own ends. Half of
-    the light's bandwidth down the picture is lost. Raises InputError for an iris that leaves no such room.
+    there; so do the ghosts that mirror the picture about it. The solver's start finds the pattern's ramp, which
+    brings the light to the opening's middle, from the path. The bench's iris has to be moved in the same way: its
+    opening, in cycles/mm, is from GUARD / (2 pitch) up to where the path's own ends. Half of the light's bandwidth
+    down the picture is lost.
+
+    Raises
+    ------
+    InputError
+        For an iris that leaves no such opening.
     """
     cycles = np.asarray(path.grid.frequency_index(0)) / path.grid.padded[0]
     kept = cycles >= GUARD / 2

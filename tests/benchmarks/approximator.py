@@ -21,7 +21,7 @@ import torch
 from runtime.benchmark.measure import DISTANCE, IRIS, PITCH, WAVELENGTH
 from runtime.bundle.bundle_folder import ADAPTERS, APPROXIMATOR, GRADIENT
 from runtime.lightpath import fft
-from runtime.lightpath.light_path import grid_for
+from runtime.lightpath.grid import grid_for
 from runtime.networks.onnx_approximator import Approximator
 from trainer.networks.approximator import Approximator as Network
 from trainer.networks.approximator import Architecture

@@ -1,4 +1,4 @@
-"""Light paths for tests, drawn at random or written out, that need neither a bench file nor the trainer."""
+"""Light paths for tests, random or in closed form, that need neither a bench file nor the trainer."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def ideal_path(
 def random_path(
     shape: tuple[int, int] = (24, 30), half_width: float = 0.8, dtype: type = np.float64, **without: None
 ) -> LightPath:
-    """Gain, crosstalk, leak, three modes, an irradiance filter, all at once; less what `without` names."""
+    """Gain, crosstalk, leak, three modes and an irradiance filter at once, without those that `without` names."""
     rng = np.random.default_rng(3)
     path = ideal_path(shape, 0.005, half_width)
     grid = path.grid

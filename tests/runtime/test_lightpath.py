@@ -8,24 +8,19 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from runtime.lightpath.crosstalk import mix_neighbours
+from runtime.lightpath.grid import FINE, at_pixels, grid_for
 from runtime.lightpath.light_path import (
-    FINE,
     LightPath,
-    at_pixels,
-    back_propagated,
-    grid_for,
     image_field,
     irradiance,
-    irradiance_and_pullback,
     mode_irradiance,
     panel_phase,
     panel_spectrum,
-    phase_gradient,
     pixel_irradiance,
-    pixel_irradiance_adjoint,
 )
-from runtime.lightpath.neighbours import mix_neighbours
-from runtime.lightpath.windows import put, ring, take
+from runtime.lightpath.light_path_adjoint import irradiance_and_pullback, pixel_irradiance_adjoint
+from runtime.lightpath.periodic_axis import put, ring, take
 from tests.runtime.benches import PITCH, converted, ideal_path, padded_irradiance, random_path, torch_path
 
 torch = pytest.importorskip("torch")
@@ -45,6 +40,11 @@ def phases(path: LightPath, *batch: int, seed: int = 1) -> np.ndarray:
     return np.random.default_rng(seed).normal(0, 2, (*batch, *path.grid.shape))
 
 
+def phase_gradient(path: LightPath, phase: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    """Gradient of a loss over phase, from its gradient over irradiance."""
+    return irradiance_and_pullback(path, phase)[1](gradient)
+
+
 def close(a: np.ndarray, b: np.ndarray) -> float:
     """Largest difference over the largest value."""
     return float(np.abs(np.asarray(a) - np.asarray(b)).max() / np.abs(np.asarray(b)).max())
@@ -60,9 +60,7 @@ def relative(a: np.ndarray, b: np.ndarray) -> float:
 def test_agrees_with_a_padded_propagation_of_the_panel_drawn_on_subpixels(
     distance: float, grain: float, most: float
 ) -> None:
-    """Share of the variance that differs; where light fills the band, what a bin of the iris's edge holds is
-    seen.
-    """
+    """Share of the variance that differs; where light fills the band, a bin of the iris's edge counts in it."""
     path = ideal_path((48, 64), distance)
     phase = gaussian_filter(np.random.default_rng(5).normal(size=(48, 64)), grain)
     phase *= 2 / phase.std()
@@ -170,9 +168,7 @@ def test_neighbours_mix_towards_the_side_that_the_taps_say() -> None:
 
 @pytest.mark.parametrize("name", PATHS)
 def test_the_gradient_is_the_adjoint_of_the_derivative(name: str) -> None:
-    """<G, J d> = <J* G, d>, with J d by forward-mode differentiation, which shares nothing with the hand's
-    adjoint.
-    """
+    """<G, J d> = <J* G, d>, with J d by forward-mode differentiation, which shares no code with our adjoint."""
     path = PATHS[name]
     phase, direction = phases(path, 2), phases(path, 2, seed=4)
     gradient = np.random.default_rng(6).normal(size=(2, *path.grid.image_shape))
@@ -251,30 +247,6 @@ def test_pixels_adjoint() -> None:
     image, gradient = rng.normal(size=(2, *path.grid.image_shape)), rng.normal(size=(2, *path.grid.shape))
     forward = np.sum(pixel_irradiance(path, image) * gradient)
     assert forward == pytest.approx(np.sum(image * pixel_irradiance_adjoint(path, gradient)), rel=1e-10)
-
-
-def test_back_propagation_is_the_adjoint_of_the_way_there() -> None:
-    path = replace(PATHS["no_crosstalk"], leak=None)
-    rng = np.random.default_rng(9)
-    z = rng.normal(size=path.grid.image_shape) + 1j * rng.normal(size=path.grid.image_shape)
-    phase = phases(path)
-    index = [np.arange(n) - FINE * path.grid.margin for n in path.grid.image_shape]
-    cycles = [b / (FINE * n) * i for b, n, i in zip(path.grid.band, path.grid.padded, index, strict=True)]
-    ramp = np.exp(2j * np.pi * (cycles[0][:, None] + cycles[1][None, :]))
-    for mode in range(3):
-        there = np.vdot(z * ramp, image_field(path, panel_spectrum(path, phase), mode))
-        field = path.source * np.exp(1j * phase)
-        assert there == pytest.approx(np.vdot(back_propagated(path, z, mode), field), rel=1e-10)
-
-
-def test_back_propagated_light_makes_the_picture() -> None:
-    """A smooth picture of flat phase, far from the border: taken to the panel as a field, and shown."""
-    path = ideal_path((64, 80), 0.006)
-    y, x = (np.arange(n) / FINE - path.grid.margin for n in path.grid.image_shape)
-    spot = np.exp(-((y[:, None] - 30) ** 2) / 120 - ((x[None, :] - 44) ** 2) / 150)
-    field = back_propagated(path, spot.astype(complex)) / FINE**2
-    light = irradiance(replace(path, source=field), np.zeros((64, 80)))
-    np.testing.assert_allclose(light, spot**2, atol=0.02)
 
 
 def test_light_does_not_come_back_on_the_other_side() -> None:

@@ -138,6 +138,11 @@ def test_a_deadline_names_of_solvers_and_an_iris_beside_the_axis(
     assert len(patterns) == len(
         kinds
     )  # Gerchberg-Saxton finds nothing better than the double phase it begins with
+    same = set()
+    for name in ("bfgs", "default"):  # the older spelling
+        solved(capsys, green, picture, "--out", out, "--iterations", 4, "--solver", name)
+        same.add(out.read_bytes())
+    assert len(same) == 1
 
 
 def test_several_pictures_go_to_a_folder(

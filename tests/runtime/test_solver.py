@@ -1,4 +1,4 @@
-"""Patterns: judged by an independent propagation, through paths with every fault, rounded to gray levels."""
+"""Patterns: tested by an independent propagation, through paths with every defect, rounded to gray levels."""
 
 from __future__ import annotations
 
@@ -21,14 +21,15 @@ def ideal() -> LightPath:
     return ideal_path(SHAPE, DISTANCE, dtype=np.float32)
 
 
-def test_beats_double_phase_as_an_independent_propagation_sees_it(ideal: LightPath) -> None:
+def test_beats_double_phase_by_an_independent_propagation(ideal: LightPath) -> None:
     target = scene(SHAPE)
     solution = solve(ideal, target, 30)
     seen = quality(padded_irradiance(2 * np.pi * solution.gray / 256, DISTANCE), target)
     start = quality(padded_irradiance(solve(ideal, target, 0).phase, DISTANCE), target)
     assert seen.psnr_db > start.psnr_db + 6
     assert seen.psnr_db > 24
-    assert seen.psnr_db == pytest.approx(solution.quality.psnr_db, abs=3)  # what an iris bin holds
+    # They differ by the light in the frequency bin at the iris's edge.
+    assert seen.psnr_db == pytest.approx(solution.quality.psnr_db, abs=3)
 
 
 def test_double_phase_shows_the_picture_where_the_iris_stops_its_chequerboard() -> None:
@@ -51,7 +52,7 @@ def test_more_iterations_never_give_a_worse_pattern(ideal: LightPath) -> None:
     "name", ["leak", "beam", "lines", "filter", "gain", "short_drive", "long_drive", "backwards"]
 )
 def test_compensates_what_the_ideal_pattern_suffers_from(ideal: LightPath, name: str) -> None:
-    """What the true path shows of a pattern computed for it, against one computed for the ideal path."""
+    """A pattern computed for the true path, against one computed for the ideal path, both through the true one."""
     y, x = np.meshgrid(np.linspace(-1, 1, SHAPE[0]), np.linspace(-1, 1, SHAPE[1]), indexing="ij")
     grid, level = ideal.grid, np.arange(256) / 256
     transfer = ideal.transfers[0]
@@ -71,21 +72,21 @@ def test_compensates_what_the_ideal_pattern_suffers_from(ideal: LightPath, name:
     }
     true = converted(replace(ideal, **changes[name]), np.float32)
     target = scene(SHAPE, 1)
-    told = solve(true, target, 50)
-    untold = quality_of(true, solve(ideal, target, 50).gray, target)
-    assert told.quality.psnr_db > untold.psnr_db + 2
-    assert told.quality.nrmse < 0.8 * untold.nrmse
+    aware = solve(true, target, 50)
+    unaware = quality_of(true, solve(ideal, target, 50).gray, target)
+    assert aware.quality.psnr_db > unaware.psnr_db + 2
+    assert aware.quality.nrmse < 0.8 * unaware.nrmse
 
 
-def test_crosstalk_is_reckoned_with(ideal: LightPath) -> None:
+def test_crosstalk_is_compensated(ideal: LightPath) -> None:
     taps = np.array([[0.25, 0.75, 0.0], [0.03, 0.94, 0.03], [0.0, 0.75, 0.25]])
     true = converted(replace(ideal, crosstalk=(taps, taps)), np.float32)
     target = scene(SHAPE, 1)
-    told = solve(true, target, 30)
-    untold = quality_of(true, solve(ideal, target, 30).gray, target)
-    assert told.quality.psnr_db > untold.psnr_db + 3
-    assert told.phase.min() >= -1e-5
-    assert told.phase.max() <= true.response[-1] + 1e-5  # mixed phases are not the same after a whole turn
+    aware = solve(true, target, 30)
+    unaware = quality_of(true, solve(ideal, target, 30).gray, target)
+    assert aware.quality.psnr_db > unaware.psnr_db + 3
+    assert aware.phase.min() >= -1e-5
+    assert aware.phase.max() <= true.response[-1] + 1e-5  # mixed phases are not the same after a whole turn
 
 
 def test_the_quality_reported_is_that_of_the_gray_levels(ideal: LightPath) -> None:
@@ -133,15 +134,17 @@ def test_the_gray_level_is_the_one_whose_phase_is_nearest_on_the_circle(
         assert np.mean(chosen <= nearest + 1e-9) > 0.95
 
 
-def test_a_start_may_be_given_and_progress_is_told(ideal: LightPath) -> None:
+def test_a_start_may_be_given_and_progress_is_reported(ideal: LightPath) -> None:
     target = scene(SHAPE)
     first = solve(ideal, target, 15)
-    told: list[tuple[int, float]] = []
-    again = solve(ideal, target, 5, start=first.phase, progress=lambda done, psnr: told.append((done, psnr)))
+    reports: list[tuple[int, float]] = []
+    again = solve(
+        ideal, target, 5, start=first.phase, progress=lambda done, psnr: reports.append((done, psnr))
+    )
     assert again.psnr_db[0] == pytest.approx(max(first.psnr_db), abs=1e-3)
     assert again.quality.psnr_db > first.quality.psnr_db
-    assert [done for done, _ in told] == list(range(6))
-    assert [psnr for _, psnr in told] == sorted(psnr for _, psnr in told)
+    assert [done for done, _ in reports] == list(range(6))
+    assert [psnr for _, psnr in reports] == sorted(psnr for _, psnr in reports)
 
 
 def test_everything_at_once_and_double_precision() -> None:
@@ -187,7 +190,7 @@ def test_counts_out_of_range_are_refused(ideal: LightPath) -> None:
             solve(ideal, scene(SHAPE), 1, levels=levels)
 
 
-def test_a_flat_or_lonely_target_is_no_trouble(ideal: LightPath) -> None:
+def test_a_flat_target_and_one_of_few_pixels_are_solved(ideal: LightPath) -> None:
     for target in (np.ones(SHAPE), np.eye(*SHAPE) * 1e-9, np.eye(*SHAPE, k=20) * 1e9):
         solution = solve(ideal, target, 3)
         assert np.isfinite(solution.phase).all()

@@ -11,8 +11,8 @@ import pytest
 
 from firmware_iface.errors import InputError
 from runtime.lightpath.light_path import LightPath
-from runtime.solver import Solver, beside_zero_order, motion_between, quality, quality_of, solve
-from runtime.solver.pace import Pace
+from runtime.solver import METHODS, Solver, beside_zero_order, motion_between, quality, quality_of, solve
+from runtime.solver.deadline import Deadline, Pace
 from tests.runtime.benches import ideal_path, padded_irradiance, scene
 
 SHAPE, DISTANCE = (96, 128), 0.015
@@ -25,7 +25,7 @@ def half() -> LightPath:
 
 
 class Clock:
-    """Time that passes only where it is told to."""
+    """Time that passes only where a test lets it pass."""
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -63,8 +63,8 @@ def test_the_deadline_is_kept_and_used(half: LightPath, monkeypatch: pytest.Monk
         assert solution.milliseconds <= deadline
         assert (
             solution.milliseconds > deadline - 2 * 1.05 * 17
-        )  # no time for one more, reckoned at its slowest
-        assert solution.iterations == len(solution.psnr_db) - 1
+        )  # no time for one more, planned at its slowest
+        assert solution.iterations > 0
 
 
 def test_a_machine_that_slows_down_is_noticed(half: LightPath, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -98,7 +98,7 @@ def test_a_real_deadline_is_kept(half: LightPath) -> None:
     assert sorted(took)[3] < 165  # the median: a busy machine may take a core away at any time
 
 
-def test_a_slow_iteration_is_reckoned_with(half: LightPath) -> None:
+def test_a_slow_iteration_is_planned_for() -> None:
     pace = Pace()
     assert not pace.known
     for took in (10.0, 30.0, 11.0):
@@ -110,6 +110,16 @@ def test_a_slow_iteration_is_reckoned_with(half: LightPath) -> None:
     assert pace.expected < 12
 
 
+def test_another_iteration_fits_only_before_the_deadline() -> None:
+    iteration, rounding = Pace(), Pace()
+    iteration.took(10.0)
+    rounding.took(4.0)
+    deadline = Deadline(50.0, iteration, rounding)
+    assert deadline.allows_another(50 - 1.05 * 14 - 0.01)
+    assert not deadline.allows_another(50 - 1.05 * 14 + 0.01)
+    assert Deadline(None, iteration, rounding).allows_another(1e9)
+
+
 def test_iterations_and_deadline_whichever_is_first(half: LightPath) -> None:
     solver, target = Solver(half), scene(SHAPE)
     assert solver.solve(target, 3, deadline_ms=60_000).iterations == 3
@@ -119,7 +129,7 @@ def test_iterations_and_deadline_whichever_is_first(half: LightPath) -> None:
             solver.solve(target, deadline_ms=wrong)
 
 
-@pytest.mark.parametrize("method", ["gerchberg_saxton", "adam", "default"])
+@pytest.mark.parametrize("method", ["gerchberg_saxton", "adam", "bfgs"])
 def test_every_solver_improves_and_keeps_its_best(half: LightPath, method: str) -> None:
     target = scene(SHAPE, 2)
     start = np.random.default_rng(0).uniform(0, 2 * np.pi, SHAPE)
@@ -136,12 +146,16 @@ def test_double_phase_alone_takes_no_iterations(half: LightPath) -> None:
     assert solution.quality.psnr_db > 19
 
 
-def test_the_default_beats_the_others_for_the_same_iterations(half: LightPath) -> None:
+def test_bfgs_beats_the_others_for_the_same_iterations(half: LightPath) -> None:
     target = scene(SHAPE)
     reached = {
-        m: solve(half, target, 15, method=m).quality.psnr_db for m in ("default", "gerchberg_saxton", "adam")
+        m: solve(half, target, 15, method=m).quality.psnr_db for m in ("bfgs", "gerchberg_saxton", "adam")
     }
-    assert reached["default"] > max(reached["gerchberg_saxton"], reached["adam"]) + 1
+    assert reached["bfgs"] > max(reached["gerchberg_saxton"], reached["adam"]) + 1
+
+
+def test_default_is_an_older_spelling_of_bfgs(half: LightPath) -> None:
+    assert type(Solver(half, method="default").method) is type(Solver(half).method) is METHODS["bfgs"]
 
 
 def test_each_penalty_lowers_what_it_measures(half: LightPath) -> None:
@@ -235,7 +249,7 @@ def test_a_long_pan_does_not_decay() -> None:
 
 
 def test_the_start_lights_an_even_picture_evenly_to_its_edges() -> None:
-    """Where the panel ends, light from beyond is missing; the start makes up for it, judged by a padded propagation."""
+    """Where the panel ends, light is missing; the start compensates for it, judged by a padded propagation."""
     shape = (160, 200)
     path = ideal_path(shape, 0.01, 0.5, np.float32)
     light = padded_irradiance(solve(path, np.ones(shape), 0).phase, 0.01, oversampling=2, iris=0.5)

@@ -48,7 +48,7 @@ def test_srgb_is_the_standards() -> None:
 
 
 @given(st.floats(0, 1))
-def test_srgb_goes_there_and_back(value: float) -> None:
+def test_srgb_survives_a_round_trip(value: float) -> None:
     assert float(encode_srgb(decode_srgb(np.array(value)))) == pytest.approx(value, abs=1e-6)
 
 

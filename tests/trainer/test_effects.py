@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from runtime.lightpath.fft import irfft2
+from runtime.lightpath.grid import FINE
 from runtime.lightpath.legendre import legendre_maps
-from runtime.lightpath.light_path import FINE
 from trainer.captures.bench_file import Bench, read_bench
 from trainer.effects import effect_catalogue as catalogue
 from trainer.effects.zernike import zernike_maps

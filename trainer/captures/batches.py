@@ -16,7 +16,7 @@ from torch import Tensor
 
 from firmware_iface.errors import InputError
 from runtime.excess import PredictionErrors, prediction_errors
-from runtime.lightpath.light_path import MARGIN
+from runtime.lightpath.grid import MARGIN
 from trainer.captures.bench_file import Bench
 from trainer.captures.capture_set import Capture, CaptureSet
 from trainer.captures.held_out import scenes

@@ -21,7 +21,7 @@ from PIL import Image
 
 from firmware_iface.errors import InputError
 from runtime.camera.registration import dot_pattern
-from runtime.lightpath.light_path import grid_for
+from runtime.lightpath.grid import grid_for
 from runtime.lightpath.propagation import band_limit, transfer_function
 from trainer.captures.bench_file import Bench
 

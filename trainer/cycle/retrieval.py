@@ -31,9 +31,9 @@ from trainer.prediction.predict import light_path
 SOLVERS = {
     "double_phase": "double_phase",
     "gerchberg_saxton": "gerchberg_saxton",
-    "wirtinger": "default",
-    "wirtinger_no_zero_order": "default",
-    "hardware_in_the_loop": "default",
+    "wirtinger": "bfgs",
+    "wirtinger_no_zero_order": "bfgs",
+    "hardware_in_the_loop": "bfgs",
 }
 METHODS = tuple(SOLVERS)
 ITERATIONS = 60
@@ -97,9 +97,9 @@ def retrieve(
         model = beside_zero_order(model)
     if method != "hardware_in_the_loop":
         network = None
-    if SOLVERS[method] != "default":
+    if SOLVERS[method] != "bfgs":
         start = None
-    if network is not None or (len(wanted.planes_mm) > 1 and SOLVERS[method] == "default"):
+    if network is not None or (len(wanted.planes_mm) > 1 and SOLVERS[method] == "bfgs"):
         return _through(model, wanted, network, iterations, progress, start)
     if len(wanted.planes_mm) > 1:
         raise InputError(

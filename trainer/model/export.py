@@ -18,7 +18,8 @@ from torch import Tensor
 from firmware_iface.errors import InputError
 from runtime.bundle.bundle_folder import write_bundle
 from runtime.bundle.light_path_arrays import pack_light_paths
-from runtime.lightpath.light_path import Grid, LightPath
+from runtime.lightpath.grid import Grid
+from runtime.lightpath.light_path import LightPath
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import scenes
 from trainer.effects.definition import Effect

@@ -15,14 +15,8 @@ from torch import Tensor
 
 from runtime.camera.sampling import finer_picture, pixel_area, sample_places, spline_filter, spline_samples
 from runtime.lightpath.fft import irfft2, rfft2
-from runtime.lightpath.light_path import (
-    FINE,
-    LightPath,
-    at_pixels,
-    mode_irradiance,
-    panel_phase,
-    panel_spectrum,
-)
+from runtime.lightpath.grid import FINE, at_pixels
+from runtime.lightpath.light_path import LightPath, mode_irradiance, panel_phase, panel_spectrum
 from runtime.lightpath.propagation import (
     band_limit,
     far_field_matrix,

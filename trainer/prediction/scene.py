@@ -13,7 +13,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from runtime.lightpath.light_path import Grid, band_frequencies, grid_for, image_frequencies
+from runtime.lightpath.grid import Grid, band_frequencies, grid_for, image_frequencies
 from runtime.lightpath.propagation import Aperture, check_sampling
 from trainer.captures.bench_file import Bench
 from trainer.prediction.stages import Drive, Panel, Pupil, Sensor

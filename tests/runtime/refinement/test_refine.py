@@ -168,8 +168,9 @@ def test_it_never_moves_the_laser(approximator: Approximator, path: LightPath, s
 def test_where_camera_and_model_agree_the_gradient_is_the_models(
     approximator: Approximator, path: LightPath, start: np.ndarray
 ) -> None:
-    """With the simulated picture as the captured one, the step is plain gradient descent."""
-    from runtime.lightpath.light_path import irradiance, irradiance_and_pullback, pixel_irradiance
+    """The captured picture takes the place of the simulated one: given the simulated one, it is plain descent."""
+    from runtime.lightpath.light_path import irradiance, pixel_irradiance
+    from runtime.lightpath.light_path_adjoint import irradiance_and_pullback
     from runtime.refinement.picture_refinement import STEP, _amplitude, _matched
 
     target = scene(SHAPE)[None]

@@ -1,4 +1,4 @@
-"""Pixels that hear their neighbours: weighted sums along an axis, and their adjoint, by the array API."""
+"""Crosstalk between pixels: weighted sums of neighbours along an axis, and their adjoint, by the array API."""
 
 from __future__ import annotations
 

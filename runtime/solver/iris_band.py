@@ -9,9 +9,14 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Run:
-    """Frequencies that lie side by side in all three orders, as slices: the panel's DFT, the band, the image's DFT.
+    """Frequencies that are consecutive in the panel's DFT, in the band and in the image's DFT, as slices.
 
-    again: an earlier run has read the same part of the panel's DFT, which repeats itself.
+    Attributes
+    ----------
+    panel, band, image : slice
+        Where they are in each.
+    again : bool
+        An earlier run has read the same part of the panel's DFT, which is periodic.
     """
 
     panel: slice
@@ -22,9 +27,15 @@ class Run:
 
 @dataclass(frozen=True)
 class Band:
-    """One axis of the band: `frequencies` [n] (DFT indices, those from 0 on first) and their runs.
+    """One axis of the band.
 
-    panel_gap, image_gap: the part of either DFT that the band leaves out.
+    Attributes
+    ----------
+    frequencies : int array [n]
+        DFT indices, those from 0 on first.
+    runs : tuple of Run
+    panel_gap, image_gap : slice
+        The part of either DFT that the band leaves out.
     """
 
     frequencies: np.ndarray
@@ -39,19 +50,19 @@ def band(edge: int, panel_period: int, image_period: int) -> Band:
     negative = count // 2 if count == image_period else edge
     frequencies = np.concatenate((np.arange(count - negative), np.arange(-negative, 0)))
     places = [(int(k) % panel_period, int(k) % image_period) for k in frequencies]
-    seen: set[int] = set()
+    used: set[int] = set()
     runs: list[Run] = []
     start = 0
     for i in range(1, count + 1):
         here, before = places[i] if i < count else (-1, -1), places[i - 1]
-        again = places[start][0] in seen
-        joined = here[0] == before[0] + 1 and here[1] == before[1] + 1 and (here[0] in seen) == again
+        again = places[start][0] in used
+        joined = here[0] == before[0] + 1 and here[1] == before[1] + 1 and (here[0] in used) == again
         if not joined:
             (panel, image), length = places[start], i - start
             runs.append(
                 Run(slice(panel, panel + length), slice(start, i), slice(image, image + length), again)
             )
-            seen.update(p for p, _ in places[start:i])
+            used.update(p for p, _ in places[start:i])
             start = i
     gaps = (slice(count - negative, max(n - negative, 0)) for n in (panel_period, image_period))
     return Band(frequencies, tuple(runs), *gaps)

@@ -1,8 +1,8 @@
-"""Solvers by name: how the next phase comes from the one that was just looked at.
+"""Methods of phase retrieval by name: how the next phase comes from the one whose light was just computed.
 
-A method has `begin(objective)`, called for each picture, and `step(phase, out)`, which writes the phase that
-follows [C, H, W] to `out`. All are in place. What they have in common (the start, the best pattern met, the
-deadline) is in `runtime.solver.solver`.
+Memoryless BFGS, Adam and Gerchberg-Saxton. A method has `begin()`, called for each picture, and
+`step(phase, out)`, which writes the phase that follows [C, H, W] to `out`. All are in place. What they have in
+common (the start, the best pattern met, the deadline) is in `runtime.solver.solver`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ LONGEST = 0.5  # step of a pixel, rad, where its range has ends
 
 
 class Method(Protocol):
-    """One way to improve a pattern."""
+    """A way to improve a pattern."""
 
     def begin(self) -> None:
         """Forget the picture before."""
@@ -29,12 +29,15 @@ class Method(Protocol):
         """The next phase, after `Objective.look(phase)`."""
 
 
-class QuasiNewton:
-    """Memoryless BFGS (Shanno 1978; L-BFGS with one pair), one gradient a step and no line search.
+class MemorylessBfgs:
+    """Memoryless BFGS (L-BFGS with one pair), one gradient a step and no line search.
 
-    Where phases a turn apart are not alike (crosstalk mixes them; a drive of less than a turn lacks some),
-    steps are projected onto the panel's range, and pixels that are pushed out of it stay out of the curvature
-    (Bertsekas 1982).
+    Where phases a turn apart do not act the same (crosstalk mixes them; a drive of less than a turn lacks some),
+    steps are projected onto the panel's range, and pixels that are pushed out of it stay out of the curvature.
+
+    References
+    ----------
+    Shanno 1978; Bertsekas 1982.
     """
 
     def __init__(self, objective: Objective, drives: Sequence[DriveRange]) -> None:
@@ -61,7 +64,7 @@ class QuasiNewton:
         self.first = False
 
     def _coefficients(self) -> tuple[list[float], float, float]:
-        """Of the gradient (a colour), the one before and the move before."""
+        """Factors of the gradient (a colour each), of the one before and of the move before."""
         steepest = [-1 / self.objective.curvature(c) for c in range(len(self.gradient))]
         if self.first:
             return steepest, 0.0, 0.0
@@ -107,7 +110,7 @@ class QuasiNewton:
             xp.subtract(out, phase, out=move)
 
     def _hold(self, phase: Array) -> None:
-        """Leave pixels that are pushed out of the panel's range out of this step."""
+        """Set the step of pixels that are pushed out of the panel's range to zero."""
         xp = self.backend.xp
         for colour, drive in enumerate(self.drives):
             free = xp.asarray(
@@ -122,9 +125,20 @@ class QuasiNewton:
 
 
 class Adam:
-    """Gradient descent with Adam (Kingma and Ba 2015), by default with the rate that the field publishes.
+    """Gradient descent with Adam.
 
-    rate: rad. The gradient is of the mean squared error, as the field's loops have it; Adam does not care.
+    Parameters
+    ----------
+    objective : Objective
+    drives : list of DriveRange
+        Of the colours.
+    rate : float, rad
+        By default the one that the field publishes.
+    betas : (float, float)
+
+    References
+    ----------
+    Kingma and Ba 2015.
     """
 
     def __init__(
@@ -183,9 +197,14 @@ class Adam:
 
 
 class GerchbergSaxton:
-    """Gerchberg and Saxton 1972: the target's amplitude with the image's phase, back to the panel, whose phase is kept.
+    """Gerchberg-Saxton: the target's amplitude with the image's phase, back to the panel, where the phase is kept.
 
-    Where pixels do not count, the image stays as it is. Several modes and planes: the sum of what each sends back.
+    Where pixels do not count, the image stays as it is. With several modes and planes, their fields at the panel
+    are added.
+
+    References
+    ----------
+    Gerchberg and Saxton 1972.
     """
 
     def __init__(self, objective: Objective, drives: Sequence[DriveRange]) -> None:
@@ -195,10 +214,10 @@ class GerchbergSaxton:
         self.wave, self.other = (xp.zeros(objective.shape[1:], pair) for _ in range(2))
 
     def begin(self) -> None:
-        """Nothing is remembered."""
+        """This method keeps nothing between steps."""
 
     def step(self, phase: Array, out: Array) -> None:
-        """The phase of what the constrained image sends back."""
+        """The phase at the panel of the constrained image."""
         xp = self.backend.xp
         for c, stack in enumerate(self.objective.optics):
             self.objective.constrain(c)
@@ -218,8 +237,9 @@ class GerchbergSaxton:
 
 
 METHODS: dict[str, Any] = {
-    "default": QuasiNewton,
+    "bfgs": MemorylessBfgs,
     "adam": Adam,
     "gerchberg_saxton": GerchbergSaxton,
     "double_phase": None,  # the start alone
 }
+OLDER_NAMES = {"default": "bfgs"}  # still accepted

@@ -1,6 +1,6 @@
-"""Parts of a periodic axis: taken out, and put back as the adjoint. Against the array API.
+"""Windows on a periodic axis: samples taken out, and put back as the adjoint. Against the array API.
 
-A run is (start, stop) within one period; a window that goes past the period's end is several runs, and one
+A run is (start, stop) within one period. A window that goes past the period's end is several runs, and one
 that is longer than the period has samples in more than one of them.
 """
 
@@ -27,7 +27,7 @@ def ring(first: int, count: int, period: int) -> list[tuple[int, int]]:
 def take(x: Array, runs: list[tuple[int, int]], axis: int) -> Array:
     """The samples of `runs` of an axis, one after the other."""
     xp = array_namespace(x)
-    parts = [along(x, start, stop, axis) for start, stop in runs]
+    parts = [_along(x, start, stop, axis) for start, stop in runs]
     return parts[0] if len(parts) == 1 else xp.concat(parts, axis=axis)
 
 
@@ -39,13 +39,13 @@ def put(x: Array, runs: list[tuple[int, int]], axis: int, period: int) -> Array:
     whole = xp.zeros(tuple(shape), dtype=x.dtype)
     done = 0
     for start, stop in runs:
-        part = along(whole, start, stop, axis)
-        part += along(x, done, done + stop - start, axis)
+        part = _along(whole, start, stop, axis)
+        part += _along(x, done, done + stop - start, axis)
         done += stop - start
     return whole
 
 
-def along(x: Array, start: int, stop: int, axis: int) -> Array:
+def _along(x: Array, start: int, stop: int, axis: int) -> Array:
     """A view of samples start .. stop of an axis."""
     inside: list[Any] = [slice(None)] * x.ndim
     inside[axis] = slice(start, stop)

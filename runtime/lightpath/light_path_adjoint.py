@@ -1,0 +1,136 @@
+"""The adjoint of the light path: from a loss's gradient over irradiance to the one over phase on the panel.
+
+Every linear operator of `runtime.lightpath.light_path` is replaced by its adjoint (Chakravarthula et al. 2020,
+eq. 20-23). Written against the array API, without automatic differentiation: the headset has none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from array_api_compat import array_namespace
+
+from runtime.lightpath.crosstalk import mix_neighbours, mix_neighbours_adjoint
+from runtime.lightpath.fft import fft, ifft, irfft2, rfft2
+from runtime.lightpath.grid import FINE, Grid, band_window, image_window, pixel_slices
+from runtime.lightpath.light_path import (
+    LightPath,
+    aperture_spectrum,
+    filter_irradiance,
+    image_field,
+    panel_field,
+    panel_spectrum,
+    pixel_area_spectrum,
+    sub_pixel_offset,
+    sum_modes,
+)
+from runtime.lightpath.periodic_axis import put
+
+Array = Any
+
+
+def irradiance_and_pullback(
+    path: LightPath, phase: Array, factor: bool = False
+) -> tuple[Array, Callable[[Array], Array]]:
+    """`irradiance`, and the function from a loss's gradient over it to the gradient over phase.
+
+    The steps back are 2 z dI, the conjugate transfer, Re(-j e^{-j phi} ...). The fields of the forward pass are
+    kept, so the way back costs no second one.
+
+    Parameters
+    ----------
+    path : LightPath
+    phase : float array [..., H, W], rad
+    factor : bool
+        Instead of the gradient over phase, give the one over a factor on the field that leaves the panel, complex
+        [..., H, W]: its real part is over the factor's logarithm, its imaginary part over its phase (rad).
+
+    Returns
+    -------
+    irradiance : float array [..., *grid.image_shape]
+    pullback : callable
+        Takes a gradient of that shape and returns [..., H, W].
+
+    References
+    ----------
+    Chakravarthula et al. 2020, eq. 20-23.
+    """
+    spectrum = panel_spectrum(path, phase)
+    fields = [image_field(path, spectrum, mode) for mode in range(path.transfers.shape[0])]
+
+    def pullback(gradient: Array) -> Array:
+        xp = array_namespace(gradient)
+        if path.irradiance_filter is not None:
+            gradient = irfft2(rfft2(gradient) * xp.conj(path.irradiance_filter), path.grid.image_shape)
+        back = 0
+        for mode, z in enumerate(fields):
+            back = back + _image_field_adjoint(path, 2 * path.weights[mode] * gradient * z, mode)
+        return _panel_spectrum_adjoint(path, phase, back, factor)
+
+    return filter_irradiance(path, sum_modes(path, fields)), pullback
+
+
+def pixel_irradiance_adjoint(path: LightPath, gradient: Array) -> Array:
+    """Adjoint of `pixel_irradiance`: [..., H, W] to [..., *grid.image_shape]."""
+    grid = path.grid
+    xp = array_namespace(gradient)
+    fine = xp.zeros((*gradient.shape[:-2], *grid.image_shape), dtype=gradient.dtype)
+    rows, columns = pixel_slices(grid)
+    fine[..., rows, columns] = gradient
+    return irfft2(rfft2(fine) * pixel_area_spectrum(grid, gradient), grid.image_shape)
+
+
+def _image_field_adjoint(path: LightPath, z: Array, mode: int) -> Array:
+    xp = array_namespace(z)
+    if path.far_field is not None:
+        onto_rows, onto_columns = path.far_field
+        back = xp.conj(xp.matrix_transpose(onto_rows)) @ z @ xp.conj(onto_columns)
+        return xp.conj(path.transfers[mode, ...]) * back
+    grid = path.grid
+    rows, columns = image_window(grid)
+    height, width = (FINE * n for n in grid.padded)
+    spectrum = fft(put(z, rows, -2, height), axis=-2)[..., : 2 * grid.band[0] + 1, :]
+    spectrum = fft(put(spectrum, columns, -1, width), axis=-1)[..., :, : 2 * grid.band[1] + 1]
+    return xp.conj(path.transfers[mode, ...]) * spectrum * (FINE**2 / (height * width))
+
+
+def _panel_spectrum_adjoint(path: LightPath, phase: Array, spectrum: Array, factor: bool = False) -> Array:
+    """Adjoint of `panel_spectrum` over phase, or over a factor on the field that leaves the panel."""
+    xp = array_namespace(phase)
+
+    def here(field_gradient: Array, driven: Array) -> Array:
+        if factor:
+            return xp.conj(panel_field(path, driven)) * field_gradient
+        turned = xp.conj(path.source) * field_gradient
+        return xp.cos(driven) * xp.imag(turned) - xp.sin(driven) * xp.real(turned)
+
+    if path.crosstalk is None:
+        back = _column_spectrum_adjoint(path.grid, aperture_spectrum(path, phase, (1, 1)) * spectrum)
+        return here(_row_spectrum_adjoint(path.grid, back), phase)
+    ky, kx = path.crosstalk
+    sub = (ky.shape[0], kx.shape[0])
+    spectrum = aperture_spectrum(path, phase, sub) * spectrum / (sub[0] * sub[1])
+    total = 0
+    for i in range(sub[0]):
+        mixed_rows = mix_neighbours(phase, ky[i, :], -2)
+        row_gradient = 0
+        down = xp.conj(sub_pixel_offset(path, phase, sub, i, 0))
+        rows_back = _column_spectrum_adjoint(path.grid, down * spectrum)
+        for j in range(sub[1]):
+            driven = mix_neighbours(mixed_rows, kx[j, :], -1)
+            across = xp.conj(sub_pixel_offset(path, phase, sub, j, 1))
+            own = here(_row_spectrum_adjoint(path.grid, across * rows_back), driven)
+            row_gradient = row_gradient + (own if factor else mix_neighbours_adjoint(own, kx[j, :], -1))
+        total = total + (row_gradient if factor else mix_neighbours_adjoint(row_gradient, ky[i, :], -2))
+    return total
+
+
+def _row_spectrum_adjoint(grid: Grid, spectrum: Array) -> Array:
+    padded = grid.padded[1]
+    return padded * ifft(put(spectrum, band_window(grid)[1], -1, padded), axis=-1)[..., :, : grid.shape[1]]
+
+
+def _column_spectrum_adjoint(grid: Grid, spectrum: Array) -> Array:
+    padded = grid.padded[0]
+    return padded * ifft(put(spectrum, band_window(grid)[0], -2, padded), axis=-2)[..., : grid.shape[0], :]
