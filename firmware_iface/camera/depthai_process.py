@@ -16,7 +16,7 @@ import sys
 import time
 from typing import Any
 
-from firmware_iface.camera.pipe import Frame, frame_message, state_message
+from firmware_iface.camera.process_messages import Frame, frame_message, state_message
 
 LOST, STARVED, FAILED = 11, 12, 13  # exit codes
 

@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.camera.depthai_process import FAILED, LOST, STARVED
-from firmware_iface.camera.pipe import Frame, Messages
-from firmware_iface.camera.pixels import BIT_DEPTHS, unpack
+from firmware_iface.camera.pixel_unpacking import BIT_DEPTHS, unpack
+from firmware_iface.camera.process_messages import Frame, Messages
 from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
 
 _WHY = {LOST: "the link was lost", STARVED: "frames stayed out", FAILED: "the library refused"}

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from firmware_iface.errors import InputError
 from firmware_iface.lasers.mcp4728 import VOLTS_PER_CODE
-from firmware_iface.virtual.tables import check_instance, parameter
+from firmware_iface.toml_tables import check_instance, parameter
 
 MA_PER_V = 50.0  # of the laser-diode controllers' modulation inputs
 PHOTODIODE_FULL_V = 1.0

@@ -26,11 +26,11 @@ import numpy as np
 
 from firmware_iface.errors import DeviceError, InputError
 from firmware_iface.lasers.channels import LaserChannel
-from firmware_iface.lasers.eye_safety import ALL_IN_ONE_SPOT, exposure
+from firmware_iface.lasers.i2c_transfers import open_bus
+from firmware_iface.lasers.laser_board import LaserBoard
+from firmware_iface.lasers.light_budget import LightBudget
 from firmware_iface.lasers.mcp4728 import VOLTS_PER_CODE
-from firmware_iface.lasers.parts import Parts
 from firmware_iface.lasers.safety_controller import Command, Input, State
-from firmware_iface.lasers.wire import open_bus
 
 if TYPE_CHECKING:
     from smbus2 import SMBus
@@ -78,18 +78,17 @@ class Lasers:
         self._bus, self._clock, self._wait = bus, clock, wait
         self._lasers = tuple(channels)
         self.channels = tuple(c.name for c in channels)
-        self._wavelengths = {c.name: c.wavelength_nm for c in channels}
-        self.parts = Parts(bus)
+        self._budget = LightBudget(channels)
+        self.board = LaserBoard(bus)
         self._fractions = [0.0] * len(channels)
         self._codes = [0] * len(channels)
-        self._shares: dict[str, tuple[float, ...]] = {}
         self._token = 0
         self._beat_at = self._changed_at = self._selected_at = -math.inf
         self._selected, self._ramping = 0, False
         self._closed = False
         with self._dark_on_failure():
-            self.parts.set_up(self._lasers)
-            self._token = self.parts.controller.token()
+            self.board.set_up(self._lasers)
+            self._token = self.board.controller.token()
             self._select(0)
         _open.add(self)
 
@@ -115,8 +114,8 @@ class Lasers:
         """
         self._forget()
         with self._dark_on_failure():
-            self.parts.dac.dark()
-            now, _ = self.parts.dac.read()
+            self.board.dac.dark()
+            now, _ = self.board.dac.read()
             if not all(output.dark for output in now):
                 raise DeviceError(
                     "the DAC did not go dark when told to, so the lasers were switched off otherwise."
@@ -129,9 +128,9 @@ class Lasers:
         """First act after a fault: forget it. Raises DeviceError that says what holds it."""
         self._forget()
         with self._dark_on_failure():
-            self.parts.dac.dark()
-            self.parts.controller.command(Command.CLEAR)
-            held = self.parts.controller.state() is State.FAULT
+            self.board.dac.dark()
+            self.board.controller.command(Command.CLEAR)
+            held = self.board.controller.state() is State.FAULT
             needed = Input.INTERLOCK | Input.DARK | Input.COOL | Input.QUIET
             missing = self._missing(needed) if held else ""
         if held:
@@ -140,15 +139,15 @@ class Lasers:
     def arm(self) -> None:
         """Second act: arm the board, dark. Raises DeviceError that says what is missing."""
         with self._dark_on_failure():
-            state = self.parts.controller.state()
+            state = self.board.controller.state()
             if state is State.OFF:
                 self._forget()
-                self.parts.dac.dark()
-                self.parts.expander.enable((1 << len(self._lasers)) - 1)
+                self.board.dac.dark()
+                self.board.expander.enable((1 << len(self._lasers)) - 1)
                 self._beat()
-                self.parts.controller.command(Command.ARM_FIRST)
-                self.parts.controller.command(Command.ARM_SECOND)
-                state = self.parts.controller.state()
+                self.board.controller.command(Command.ARM_FIRST)
+                self.board.controller.command(Command.ARM_SECOND)
+                state = self.board.controller.state()
             latched, missing = self._latched(), self._missing(Input(0x7F))
         if state is State.FAULT:
             raise DeviceError(f"a fault is latched ({latched}); find its cause, then clear() and arm().")
@@ -180,9 +179,7 @@ class Lasers:
             or not 0 <= fraction <= 1
         ):
             raise InputError(f"power {fraction!r} of laser '{channel}' is not a fraction; give 0 to 1.")
-        self._check_budget(
-            {**dict(zip(self.channels, self._fractions, strict=True)), channel: float(fraction)}
-        )
+        self._budget.check(self._powers() | {channel: float(fraction)})
         start, end = self._codes[k], self._lasers[k].code(fraction)
         if end <= start:
             with self._dark_on_failure():
@@ -191,7 +188,7 @@ class Lasers:
             return
         with self._dark_on_failure():
             self._raise_latched()
-            armed = self.parts.controller.state() in (State.ARMED, State.EMIT)
+            armed = self.board.controller.state() in (State.ARMED, State.EMIT)
             self._select(k)
         if not armed:
             raise DeviceError("the lasers are not armed; arm() them first.")
@@ -218,23 +215,30 @@ class Lasers:
     # --- the Class 1 budget
 
     def expect(self, shares: Mapping[str, Sequence[float]] | None) -> float:
-        """Say what the next pattern is predicted to make, before it is shown (None: unknown, all in one spot).
+        """Take the prediction for the next pattern, before it is shown.
 
-        shares : by channel, from eye_safety.spot_shares
-        Lowers every laser by one factor, at once, where the pattern's brightest spots would exceed the budget, and
-        returns that factor (1: nothing changed). Powers do not rise again by themselves.
+        Lowers every laser by one factor, at once, where the pattern's brightest spots would exceed the budget.
+        Powers do not rise again by themselves.
+
+        Parameters
+        ----------
+        shares : mapping of channel to sequence of float, or None
+            From `eye_safety.spot_shares`. None: nothing is known, all light counts as one spot.
+
+        Returns
+        -------
+        float
+            The factor; 1 where nothing changed.
+
+        Raises
+        ------
+        InputError
+            Where a channel is unknown or the shares are not those of `spot_shares`.
+        DeviceError
+            Where the lasers could not be lowered; they are dark then.
         """
-        found = dict(shares or {})
-        for channel, values in found.items():
-            self._index(channel)
-            values = tuple(float(v) for v in values)
-            if len(values) != len(ALL_IN_ONE_SPOT) or not all(0 < v <= 1 for v in values):
-                raise InputError(
-                    f"the shares of '{channel}' are not what spot_shares gives; use it to make them."
-                )
-            found[channel] = values
-        self._shares = {c: tuple(v) for c, v in found.items()}
-        worst = self._exposure(dict(zip(self.channels, self._fractions, strict=True)))["worst"]
+        self._budget.expect(shares)
+        worst = self._budget.exposure(self._powers()).worst
         factor = min(1.0, 1 / worst) if worst > 0 else 1.0
         if factor < 1:
             self._fractions = [f * factor for f in self._fractions]
@@ -243,38 +247,26 @@ class Lasers:
                     self._put(k, laser.code(self._fractions[k]))
         return factor
 
-    def _check_budget(self, fractions: dict[str, float]) -> None:
-        worst = self._exposure(fractions)["worst"]
-        if worst > 1 + 1e-9:
-            raise InputError(
-                f"the lasers together would make {worst:.2f} of the Class 1 limit of a point source; lower one, or "
-                "say with expect() what the pattern is predicted to make."
-            )
-
-    def _exposure(self, fractions: Mapping[str, float]) -> dict[str, float]:
-        found = exposure(self._power_uw(fractions), self._wavelengths, self._shares)
-        return {"thermal": found.thermal, "photochemical": found.photochemical, "worst": found.worst}
-
-    def _power_uw(self, fractions: Mapping[str, float]) -> dict[str, float]:
-        return {c.name: c.full_power_uw * fractions[c.name] for c in self._lasers}
+    def _powers(self) -> dict[str, float]:
+        """Fraction of full power, by channel."""
+        return dict(zip(self.channels, self._fractions, strict=True))
 
     # --- what is seen
 
     def status(self) -> dict[str, Any]:
         """What the board says of itself, ready for JSON. Raises DeviceError (dark by then) where it does not answer."""
         with self._dark_on_failure():
-            inputs = self.parts.controller.inputs()
-            fractions = dict(zip(self.channels, self._fractions, strict=True))
+            inputs = self.board.controller.inputs()
+            fractions = self._powers()
+            used = self._budget.exposure(fractions)
             return {
-                "state": self.parts.controller.state().name.lower(),
-                "faults": [f.name.lower() for f in self.parts.controller.faults() if f.name],
+                "state": self.board.controller.state().name.lower(),
+                "faults": [f.name.lower() for f in self.board.controller.faults() if f.name],
                 "holds": {i.name.lower(): bool(inputs & i) for i in Input if i.name},
                 "power": fractions,
-                "celsius": round(self.parts.thermometer.celsius(), 2),
-                "class1": self._exposure(fractions),
-                "class1_at_full_power": exposure(
-                    self._power_uw(dict.fromkeys(self.channels, 1.0)), self._wavelengths
-                ).worst,
+                "celsius": round(self.board.thermometer.celsius(), 2),
+                "class1": {"thermal": used.thermal, "photochemical": used.photochemical, "worst": used.worst},
+                "class1_at_full_power": self._budget.exposure_at_full_power().worst,
             }
 
     def _look(self) -> None:
@@ -282,7 +274,7 @@ class Lasers:
         if self._clock() - max(self._changed_at, self._selected_at) < RAMP_S / RAMP_STEPS - 1e-6:
             return
         k = self._selected
-        seen_v = self.parts.converter.volts()
+        seen_v = self.board.converter.volts()
         expected_v = self._lasers[k].photodiode_v(self._codes[k] * VOLTS_PER_CODE)
         if abs(seen_v - expected_v) <= TOLERANCE * expected_v + FLOOR_V:
             return
@@ -294,14 +286,14 @@ class Lasers:
         )
 
     def _raise_latched(self) -> None:
-        if self.parts.controller.state() is State.FAULT:
+        if self.board.controller.state() is State.FAULT:
             raise LatchedError(f"the safety controller has switched the lasers off: {self._latched()}.")
 
     def _latched(self) -> str:
-        return ", ".join(f.name.lower() for f in self.parts.controller.faults() if f.name)
+        return ", ".join(f.name.lower() for f in self.board.controller.faults() if f.name)
 
     def _missing(self, wanted: Input) -> str:
-        inputs = self.parts.controller.inputs()
+        inputs = self.board.controller.inputs()
         return "; ".join(MISSING[i] for i in wanted if not inputs & i) or "it gives no reason; try again"
 
     # --- what is done
@@ -315,16 +307,16 @@ class Lasers:
         if self._clock() - self._beat_at < SOONEST_BEAT_S:
             return
         self._token = (self._token + 1) % 256
-        self.parts.controller.beat(self._token)
+        self.board.controller.beat(self._token)
         self._beat_at = self._clock()
 
     def _put(self, k: int, code: int) -> None:
         self._codes[k] = code
-        self.parts.dac.set_code(k, code)
+        self.board.dac.set_code(k, code)
         self._changed_at = self._clock()
 
     def _select(self, k: int) -> None:
-        self.parts.converter.select(k)
+        self.board.converter.select(k)
         self._selected, self._selected_at = k, self._clock()
 
     @contextmanager
@@ -350,7 +342,7 @@ class Lasers:
 
     def _go_dark(self, command: Command = Command.FAULT) -> None:
         self._forget()
-        self.parts.go_dark(command)
+        self.board.go_dark(command)
 
     def _forget(self) -> None:
         self._fractions = [0.0] * len(self._lasers)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from firmware_iface.errors import DeviceError
-from firmware_iface.lasers.wire import read, write
+from firmware_iface.lasers.i2c_transfers import read, write
 
 if TYPE_CHECKING:
     from smbus2 import SMBus

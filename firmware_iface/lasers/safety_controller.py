@@ -6,7 +6,7 @@ from enum import IntEnum, IntFlag
 from typing import TYPE_CHECKING
 
 from firmware_iface.errors import DeviceError
-from firmware_iface.lasers.wire import write, write_read
+from firmware_iface.lasers.i2c_transfers import write, write_read
 
 if TYPE_CHECKING:
     from smbus2 import SMBus

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from firmware_iface.lasers.wire import write, write_read
+from firmware_iface.lasers.i2c_transfers import write, write_read
 
 if TYPE_CHECKING:
     from smbus2 import SMBus

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.errors import DeviceError, InputError
-from firmware_iface.panel import erle
-from firmware_iface.panel.mirrored import MirroredDisplay
+from firmware_iface.panel.mirrored_display import MirroredDisplay
 from firmware_iface.panel.panel import Gray, Panel
-from firmware_iface.panel.plm import P47, Modulator, bit_plane
+from firmware_iface.panel.phase_light_modulator import P47, Modulator, bit_plane
+from firmware_iface.panel.run_length_encoding import encode
 from firmware_iface.usb_link import UsbLink
 
 VENDOR, PRODUCT = 0x0451, 0xC900
@@ -238,7 +238,7 @@ class PatternUpload:
         """The control part lets go of the link that both use."""
 
     def _load(self, index: int, image: NDArray[np.uint32]) -> None:
-        data = erle.encode(image)
+        data = encode(image)
         self._control.command(IMAGE_BEGIN[index], struct.pack("<HI", 0, len(data)))
         for at in range(0, len(data), LONGEST_DATA):
             part = data[at : at + LONGEST_DATA]

@@ -1,15 +1,16 @@
 """A virtual headset: devices with a simulated bench behind them, whose defects are hidden."""
 
+from firmware_iface.virtual.bench_description import BenchDescription, read_bench
+from firmware_iface.virtual.bench_loading import load_bench
 from firmware_iface.virtual.defects import CATALOGUE_KINDS, DEFECT_KINDS, Defect, make_defect
-from firmware_iface.virtual.description import BenchDescription, load_bench, read_bench
-from firmware_iface.virtual.headset import (
+from firmware_iface.virtual.named_benches import named_benches
+from firmware_iface.virtual.virtual_headset import (
     VirtualCamera,
     VirtualHeadset,
     VirtualLasers,
     VirtualPanel,
     open_headset,
 )
-from firmware_iface.virtual.named import named_benches
 
 __all__ = [
     "CATALOGUE_KINDS",

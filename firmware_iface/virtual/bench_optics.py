@@ -13,8 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_iface.virtual import defects
-from firmware_iface.virtual.description import BenchDescription
+from firmware_iface.virtual.bench_description import BenchDescription
+from firmware_iface.virtual.defects import (
+    Convention,
+    Distance,
+    Iris,
+    PupilAberration,
+    SpatialCoherence,
+    TemporalCoherence,
+)
 from firmware_iface.virtual.simulated_panel import Drive, Surface, tilt_factor
 from firmware_iface.virtual.subpixel_propagation import Band, walk_px
 
@@ -37,11 +44,11 @@ class Path:
 
     def __init__(self, bench: BenchDescription, channel: str, plane_mm: float) -> None:
         wavelength = bench.channel(channel).wavelength_nm
-        offset, convention = bench.defect(defects.Distance), bench.defect(defects.Convention)
+        offset, convention = bench.defect(Distance), bench.defect(Convention)
         distance = plane_mm + (offset.offset_mm if offset else 0.0)
         if convention:
             distance *= convention.distance_sign
-        iris = bench.defect(defects.Iris)
+        iris = bench.defect(Iris)
         half = iris.half_width if iris else bench.iris.half_width
         centre = (iris.centre_y_share, iris.centre_x_share) if iris else (0.0, 0.0)
         half_band = 0.5 * (half + max(abs(centre[0]), abs(centre[1])))
@@ -49,7 +56,7 @@ class Path:
         border = 16 + bench.simulation.padding * walk_px(wavelength, pitch, distance, half_band)
         self.band = Band((bench.panel.height, bench.panel.width), q, border, half_band)
         passed = iris_mask(self.band, bench.iris.shape, half, centre)
-        delay = relay_path_nm(bench.defect(defects.PupilAberration), self.band)
+        delay = relay_path_nm(bench.defect(PupilAberration), self.band)
         self.lines = [
             Line(
                 wl,
@@ -58,10 +65,10 @@ class Path:
                     np.complex64
                 ),
             )
-            for wl, share in spectral_lines(wavelength, bench.defect(defects.TemporalCoherence))
+            for wl, share in spectral_lines(wavelength, bench.defect(TemporalCoherence))
         ]
         to_cycles = pitch / wavelength  # 1 mrad in cycles a pixel
-        points = source_points(bench.defect(defects.SpatialCoherence))
+        points = source_points(bench.defect(SpatialCoherence))
         self.tilts = [(fy * to_cycles, fx * to_cycles) for fy, fx in points]
         self.wavelength_nm = wavelength
 
@@ -75,7 +82,7 @@ def iris_mask(band: Band, shape: str, half_width: float, centre: tuple[float, fl
     return np.asarray((y <= limit) & (x <= limit))
 
 
-def relay_path_nm(d: defects.PupilAberration | None, band: Band) -> NDArray[np.float64]:
+def relay_path_nm(d: PupilAberration | None, band: Band) -> NDArray[np.float64]:
     """Path difference of the relay over the pupil, nm, [Fy, Fx]; radius 1 is the edge of the panel's band."""
     y, x = 2 * band.fy[:, None], 2 * band.fx[None, :]
     if d is None:
@@ -91,7 +98,7 @@ def relay_path_nm(d: defects.PupilAberration | None, band: Band) -> NDArray[np.f
     )
 
 
-def spectral_lines(wavelength_nm: float, d: defects.TemporalCoherence | None) -> list[tuple[float, float]]:
+def spectral_lines(wavelength_nm: float, d: TemporalCoherence | None) -> list[tuple[float, float]]:
     """(wavelength nm, share of the power) of the lines that stand for a Gaussian line, out to 2.5 sigma."""
     if d is None or d.lines == 1 or d.linewidth_nm == 0:
         return [(wavelength_nm, 1.0)]
@@ -102,7 +109,7 @@ def spectral_lines(wavelength_nm: float, d: defects.TemporalCoherence | None) ->
     return [(wavelength_nm + float(a) * sigma, float(s)) for a, s in zip(at, shares, strict=True)]
 
 
-def source_points(d: defects.SpatialCoherence | None) -> list[tuple[float, float]]:
+def source_points(d: SpatialCoherence | None) -> list[tuple[float, float]]:
     """Directions (y, x) in mrad of equally bright points that fill the source's disc evenly."""
     if d is None or d.radius_mrad == 0:
         return [(0.0, 0.0)]

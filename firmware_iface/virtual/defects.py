@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from firmware_iface.errors import InputError, nearest
-from firmware_iface.virtual.tables import parameter, read_table
+from firmware_iface.toml_tables import parameter, read_table
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_iface.virtual import defects
-from firmware_iface.virtual.description import BenchDescription
+from firmware_iface.virtual.bench_description import BenchDescription
+from firmware_iface.virtual.defects import (
+    Convention,
+    Crosstalk,
+    Illumination,
+    PanelWavefront,
+    PhaseNonuniformity,
+    PhaseResponse,
+    Specks,
+    Stripes,
+    ZeroOrder,
+)
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
@@ -34,16 +44,16 @@ class Drive:
         panel = bench.panel
         self.q = bench.simulation.subpixels
         self.levels = panel.levels
-        convention = bench.defect(defects.Convention)
+        convention = bench.defect(Convention)
         self.sign = panel.phase_sign * (convention.phase_sign if convention else 1)
-        self._curve = bench.defect(defects.PhaseResponse)
+        self._curve = bench.defect(PhaseResponse)
         self._full = 2 * np.pi
         if self._curve:
             self._full *= (
                 self._curve.gain * (self._curve.reference_nm / wavelength_nm) ** self._curve.dispersion
             )
-        self._map = _thickness_map(bench.defect(defects.PhaseNonuniformity), panel.height, panel.width)
-        crosstalk = bench.defect(defects.Crosstalk)
+        self._map = _thickness_map(bench.defect(PhaseNonuniformity), panel.height, panel.width)
+        crosstalk = bench.defect(Crosstalk)
         self._smear_y = self._smear_x = None
         if crosstalk:
             self._smear_y = smear_weights(crosstalk.width_y_px, crosstalk.asymmetry_y, self.q)
@@ -116,7 +126,7 @@ class Drive:
         return np.float32(self.sign) * out
 
 
-def _thickness_map(d: defects.PhaseNonuniformity | None, height: int, width: int) -> Array:
+def _thickness_map(d: PhaseNonuniformity | None, height: int, width: int) -> Array:
     if d is None:
         return np.ones((1, 1))
     y, x = share_grid(height, width)
@@ -183,16 +193,14 @@ class Surface:
 
     def __init__(self, bench: BenchDescription, wavelength_nm: float) -> None:
         h, w, q = bench.panel.height, bench.panel.width, bench.simulation.subpixels
-        leak = bench.defect(defects.ZeroOrder)
-        beam = beam_amplitude(bench.defect(defects.Illumination), h * q, w * q)
+        leak = bench.defect(ZeroOrder)
+        beam = beam_amplitude(bench.defect(Illumination), h * q, w * q)
         fill = leak.fill_factor if leak else bench.panel.fill_factor
         active = active_area(fill, q)
         covered = np.tile(active, (h, w))
-        map_ = beam * _stripes(bench.defect(defects.Stripes), w, q)
-        path = panel_path_nm(bench.defect(defects.PanelWavefront), h * q, w * q, w / h)
-        surface = (
-            map_ * np.exp(2j * np.pi * path / wavelength_nm) * _dust(bench.defect(defects.Specks), h, w, q)
-        )
+        map_ = beam * _stripes(bench.defect(Stripes), w, q)
+        path = panel_path_nm(bench.defect(PanelWavefront), h * q, w * q, w / h)
+        surface = map_ * np.exp(2j * np.pi * path / wavelength_nm) * _dust(bench.defect(Specks), h, w, q)
         self.lit: Complex = (surface * covered).astype(np.complex64)
         self.dark = leak is None
         self.unlit: Complex = np.zeros((1, 1), np.complex64)
@@ -222,7 +230,7 @@ def tilt_factor(shape: tuple[int, int], q: int, cycles_a_pixel: tuple[float, flo
     return turn_y * turn_x
 
 
-def beam_amplitude(d: defects.Illumination | None, height: int, width: int) -> Array:
+def beam_amplitude(d: Illumination | None, height: int, width: int) -> Array:
     """Amplitude of the beam over the panel; its mean square is 1."""
     if d is None:
         return np.ones((1, 1))
@@ -232,7 +240,7 @@ def beam_amplitude(d: defects.Illumination | None, height: int, width: int) -> A
     return amplitude / np.sqrt(np.mean(amplitude**2))
 
 
-def panel_path_nm(d: defects.PanelWavefront | None, height: int, width: int, aspect: float) -> Array:
+def panel_path_nm(d: PanelWavefront | None, height: int, width: int, aspect: float) -> Array:
     """Path difference over the panel, nm, [height, width]: a saddle, a bend, a trefoil and a dent."""
     if d is None:
         return np.zeros((1, 1))
@@ -245,14 +253,14 @@ def panel_path_nm(d: defects.PanelWavefront | None, height: int, width: int, asp
     return d.peak_to_valley_nm * path / np.ptp(path)
 
 
-def _stripes(d: defects.Stripes | None, width: int, q: int) -> Array:
+def _stripes(d: Stripes | None, width: int, q: int) -> Array:
     if d is None:
         return np.ones((1, 1))
     columns = 1 + d.rms * np.random.default_rng([d.places, 17]).standard_normal(width)
     return np.repeat(np.clip(columns, 0, None), q)[None, :]
 
 
-def _dust(d: defects.Specks | None, height: int, width: int, q: int) -> Complex128:
+def _dust(d: Specks | None, height: int, width: int, q: int) -> Complex128:
     if d is None:
         return np.ones((1, 1), np.complex128)
     rng = np.random.default_rng([d.places, 29])

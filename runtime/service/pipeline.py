@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from firmware_iface.assembled import open_panel
+from firmware_iface.configured_devices import open_panel
 from firmware_iface.errors import InputError
 from runtime.service import inside, protocol
 from runtime.service.children import Child

@@ -15,7 +15,7 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from firmware_iface.assembled import laser_power, open_lasers
+from firmware_iface.configured_devices import laser_power, open_lasers
 from firmware_iface.errors import InputError
 from runtime.service import protocol
 from runtime.service.camera_client import Eye

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_iface.virtual.served import Remote, running
+from firmware_iface.virtual.remote_hardware import RemoteHardware, running
 from runtime.bundle.bundle_folder import write_bundle
 from runtime.bundle.light_path_arrays import pack_light_paths
 from runtime.service.client import Client, connect
@@ -96,7 +96,7 @@ def write_configuration(
 
 
 @contextmanager
-def hardware(folder: Path, seed: int = 0, oak: str | None = None) -> Iterator[Remote]:
+def hardware(folder: Path, seed: int = 0, oak: str | None = None) -> Iterator[RemoteHardware]:
     """Emulated hardware for the configuration in `folder`, in a process of its own."""
     with ExitStack() as stack:
         with urgent():

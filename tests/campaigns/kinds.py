@@ -37,7 +37,7 @@ def _part(part: str, kind: str, weight: float, dark: bool, count: int | None = 1
         weight,
         lambda lane: lane.remote.break_part(part, kind, count),
         dark,
-        lambda lane: lane.remote.mend(part),
+        lambda lane: lane.remote.repair(part),
         shows=not (part == "lasers" and lasting),
     )
 

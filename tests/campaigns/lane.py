@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_iface.virtual.served import Remote, i2c_bus
+from firmware_iface.virtual.remote_hardware import RemoteHardware, i2c_bus
 from runtime.service.client import Client, Lost, RefusedError
 from runtime.service.protocol import Lasers, Part, Shown
 from tests.campaigns.headset import ENVIRONMENT, connected, hardware, picture, urgent, write_configuration
@@ -44,7 +44,7 @@ class Lane:
         self.outcomes: list[Shown | Lost] = []
         self.latest = self.stored = 0
         self._stack = ExitStack()
-        self.remote: Remote = self._stack.enter_context(hardware(folder, seed, oak))
+        self.remote: RemoteHardware = self._stack.enter_context(hardware(folder, seed, oak))
         self.service = self.start_service()
         self.client: Client = connected(self.file)
         self.pictures = [picture(self.client, k) for k in range(PICTURES)]

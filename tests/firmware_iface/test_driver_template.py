@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from firmware_iface.driver_template import Thermometer, parse_temperature
 from firmware_iface.errors import DeviceError, DeviceGoneError
 from firmware_iface.virtual.usb import UsbModel, VirtualUsb
-from firmware_iface.virtual.usb.device import (
+from firmware_iface.virtual.usb.usb_model import (
     Stall,
     configuration_descriptor,
     device_descriptor,

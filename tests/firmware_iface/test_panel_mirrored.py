@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
-from firmware_iface.panel import MirroredDisplay, Panel, dlpc900, open_dlpc900, plm
+from firmware_iface.panel import MirroredDisplay, Panel, dlpc900, open_dlpc900
+from firmware_iface.panel import phase_light_modulator as plm
 from firmware_iface.virtual.usb import Dlpc900Model, VirtualUsb
 
 SHAPE = (6, 10)

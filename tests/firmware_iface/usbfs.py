@@ -21,13 +21,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from firmware_iface.virtual.usb import UsbModel
-from firmware_iface.virtual.usb.device import Gone, Nak, Stall
+from firmware_iface.virtual.usb.usb_model import Nak, NoDevice, Stall
 
 _WORDS = struct.Struct("<QQQ")
 _IOCTL, _DONE, _READ_MEMORY, _WRITE_MEMORY = 1, 3, 5, 6
 _URB = struct.Struct("<BB2xiI4xQii")  # type, endpoint, status, flags, buffer, length, done
 _CONTROL = 2
-_MEANINGS = {Stall: errno.EPIPE, Gone: errno.ENODEV, Nak: errno.ENOENT}
+_MEANINGS = {Stall: errno.EPIPE, NoDevice: errno.ENODEV, Nak: errno.ENOENT}
 
 
 class _Fails(Exception):
@@ -243,7 +243,7 @@ class UsbFs:
         status, done, reply = 0, 0, b""
         try:
             done, reply = act()
-        except (Stall, Gone, Nak) as cause:
+        except (Stall, NoDevice, Nak) as cause:
             status = -_MEANINGS[type(cause)]
         with opened.lock:
             opened.finished.append((urb, status, done, reply))

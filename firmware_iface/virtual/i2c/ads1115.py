@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from firmware_iface.virtual.i2c.words import WordRegisters, signed
+from firmware_iface.virtual.i2c.word_registers import WordRegisters, signed
 
 CONVERSION, CONFIG, LOW, HIGH = range(4)
 FULL_SCALE_V = (6.144, 4.096, 2.048, 1.024, 0.512, 0.256, 0.256, 0.256)

@@ -163,7 +163,7 @@ class LaserBoard:
         self.settle()
 
     def break_photodiode(self, laser: int, broken: bool = True) -> None:
-        """Cut (or mend) a photodiode's wire: it then shows no light."""
+        """Cut (or repair) a photodiode's wire: it then shows no light."""
         self.settle()
         self._photodiode_broken[laser] = broken
         self.settle()

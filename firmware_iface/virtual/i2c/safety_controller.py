@@ -7,7 +7,7 @@ from enum import IntEnum, IntFlag
 from typing import Protocol
 
 from firmware_iface.virtual.i2c.bus import NackError
-from firmware_iface.virtual.i2c.pec import pec
+from firmware_iface.virtual.i2c.packet_error_code import pec
 
 ADDRESS = 0x36
 WINDOW_S, SOONEST_S, ARM_WITHIN_S = 0.100, 0.005, 1.0

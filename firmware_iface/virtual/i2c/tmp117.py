@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from firmware_iface.virtual.i2c.words import WordRegisters, signed
+from firmware_iface.virtual.i2c.word_registers import WordRegisters, signed
 
 TEMPERATURE, CONFIG, HIGH, LOW, OFFSET, IDENTITY = 0, 1, 2, 3, 7, 0xF
 STEP_C = 7.8125e-3

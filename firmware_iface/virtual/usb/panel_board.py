@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.virtual.fault_injection import Faults
-from firmware_iface.virtual.usb.device import (
+from firmware_iface.virtual.usb.usb_model import (
     BULK,
     Nak,
     Stall,

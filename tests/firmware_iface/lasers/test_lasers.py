@@ -52,7 +52,7 @@ def test_the_controllers_limiter_ramps_even_for_a_host_that_jumps(bench: Bench) 
     lasers = bench.armed()
     bench.seen.clear()
     began = bench.now
-    lasers.parts.dac.set_code(0, 3000)
+    lasers.board.dac.set_code(0, 3000)
     bench.pass_time(0.080)
     full = next(t for t, p in bench.seen if p["red"] == pytest.approx(120))
     assert 0.049 <= full - began <= 0.052
@@ -66,7 +66,7 @@ def test_no_code_of_the_dac_passes_the_ceiling(bench: Bench) -> None:
             bench.bus.i2c_rdwr(smbus2.i2c_msg.write(0x60, [0x40 | k << 1, vref | 0x0F, 0xFF]))
         for _ in range(4):
             bench.pass_time(0.03)
-            lasers.parts.controller.beat(lasers._token + 1)
+            lasers.board.controller.beat(lasers._token + 1)
             lasers._token += 1
     for channel in VIRTUAL_CHANNELS:
         assert max(p[channel.name] for _, p in bench.seen) == pytest.approx(channel.full_power_uw)
@@ -94,7 +94,7 @@ def test_the_same_token_again_is_no_heartbeat(bench: Bench) -> None:
     lasers = bench.armed()
     lasers.set_power("green", 1.0)
     bench.pass_time(0.02)
-    lasers.parts.controller.beat(lasers._token)
+    lasers.board.controller.beat(lasers._token)
     assert bench.light_uw == 0
     with pytest.raises(DeviceError, match="heartbeat"):
         lasers.heartbeat()
@@ -108,7 +108,7 @@ def test_a_token_too_soon_is_a_loop_run_wild(bench: Bench) -> None:
     bench.pass_time(0.003)
     lasers.heartbeat()  # the driver itself never does it
     assert bench.light_uw > 0
-    lasers.parts.controller.beat(lasers._token + 1)
+    lasers.board.controller.beat(lasers._token + 1)
     assert bench.light_uw == 0
 
 
@@ -117,7 +117,7 @@ def test_key_and_interlock_latch_and_it_takes_two_acts_to_see_light_again(
     bench: Bench, condition: str
 ) -> None:
     lasers = bench.armed()
-    lasers.parts.controller.command(0)  # type: ignore[arg-type]
+    lasers.board.controller.command(0)  # type: ignore[arg-type]
     with pytest.raises(DeviceError, match="not armed"):
         lasers.set_power("green", 1.0)
     lasers.arm()  # asking too early is no fault
@@ -161,7 +161,7 @@ def test_the_second_arming_word_counts_only_right_after_the_first(bench: Bench) 
     from firmware_iface.lasers.safety_controller import Command, State
 
     bench.ready()
-    controller = (lasers := bench.open()).parts.controller
+    controller = (lasers := bench.open()).board.controller
     for between in (lambda: controller.command(Command.OFF), lambda: bench.pass_time(1.001)):
         lasers.heartbeat()
         controller.command(Command.ARM_FIRST)
@@ -245,8 +245,8 @@ def test_the_ceilings_can_be_written_once_and_only_lowered_from_what_the_board_w
     lasers = Lasers(bench.bus, (replace(RED, full_power_uw=60.0),), lambda: bench.now, bench.pass_time)
     for drive_v in (1.0, 1.5):
         with pytest.raises(OSError, match="Remote I/O"):
-            lasers.parts.controller.set_ceilings(0, drive_v, 1.2)
-    assert lasers.parts.controller.ceilings_v(0)[0] == pytest.approx(1.2)
+            lasers.board.controller.set_ceilings(0, drive_v, 1.2)
+    assert lasers.board.controller.ceilings_v(0)[0] == pytest.approx(1.2)
     with pytest.raises(DeviceError, match="config"):
         lasers.heartbeat()
     with pytest.raises(DeviceError, match=r"holds ceilings of 1\.2000 .* switch the board off and on"):
@@ -259,8 +259,8 @@ def test_lasers_that_are_not_there_get_a_ceiling_of_0(bench: Bench) -> None:
     bench.ready()
     lasers = Lasers(bench.bus, (RED,), lambda: bench.now, bench.pass_time)
     lasers.arm()
-    lasers.parts.expander.enable(0b111)
-    lasers.parts.dac.set_code(2, 1800)
+    lasers.board.expander.enable(0b111)
+    lasers.board.dac.set_code(2, 1800)
     bench.pass_time(0.08)
     assert bench.light_uw == 0
 
@@ -468,8 +468,8 @@ def test_every_part_is_told_to_go_dark_whatever_the_others_do(
     def fails(*given: object) -> None:
         raise TypeError("not even an error of the bus")
 
-    monkeypatch.setattr(lasers.parts.controller, "command", fails)
-    monkeypatch.setattr(lasers.parts.dac, "dark", fails)
+    monkeypatch.setattr(lasers.board.controller, "command", fails)
+    monkeypatch.setattr(lasers.board.dac, "dark", fails)
     lasers.trip()
     assert bench.light_uw == 0 and bench.board.expander.pins() & 0b111 == 0
 

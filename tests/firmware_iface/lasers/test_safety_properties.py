@@ -420,7 +420,7 @@ class FailingBus(RuleBasedStateMachine):
         self.bench.board.key, self.bench.board.interlock, self.bench.board.celsius = key, interlock, celsius
 
     @rule()
-    def mend(self) -> None:
+    def repair(self) -> None:
         self.bench.board.bus.faults.clear()
         self.surroundings(True, True, 25.0)
 

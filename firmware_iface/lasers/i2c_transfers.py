@@ -16,7 +16,7 @@ def open_bus(bus: str) -> SMBus:
     from smbus2 import SMBus
 
     if bus.startswith("virtual:"):
-        from firmware_iface.virtual.i2c.server import connect
+        from firmware_iface.virtual.i2c.bus_server import connect
 
         return SMBus(connect(bus.removeprefix("virtual:")))
     return SMBus(bus)

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from firmware_iface.virtual.i2c.bus import Message, failure
-from firmware_iface.virtual.i2c.kernel import attach
 from firmware_iface.virtual.i2c.laser_board import LaserBoard
+from firmware_iface.virtual.i2c.smbus2_ioctls import attach
 
 TICK_S = 0.002
 PACKET = 65536

@@ -13,7 +13,7 @@ import tempfile
 from typing import Any
 
 from firmware_iface.virtual.i2c.bus import Message, Transferring, failure
-from firmware_iface.virtual.i2c.pec import pec
+from firmware_iface.virtual.i2c.packet_error_code import pec
 
 # I2C | SMBUS_EMUL (which has PEC), as <linux/i2c.h> numbers them
 FUNCTIONS = 0x00000001 | 0x0EFF0008

@@ -17,9 +17,11 @@ from numpy.typing import NDArray
 
 from firmware_iface.errors import InputError
 from firmware_iface.panel.panel import Gray, checked_gray
-from firmware_iface.virtual import defects, oracle
+from firmware_iface.virtual.bench_description import BenchDescription
+from firmware_iface.virtual.bench_loading import load_bench
 from firmware_iface.virtual.bench_optics import BenchOptics
-from firmware_iface.virtual.description import BenchDescription, load_bench
+from firmware_iface.virtual.defects import LaserDrift
+from firmware_iface.virtual.oracle_pattern import descend
 from firmware_iface.virtual.simulated_sensor import Drift, Integrator, Sensor
 
 
@@ -125,7 +127,7 @@ class VirtualHeadset:
         self.captures = 0
         self._optics = BenchOptics(description)
         self._sensor = Sensor(description)
-        self._drift = Drift(description.defect(defects.LaserDrift), seed)
+        self._drift = Drift(description.defect(LaserDrift), seed)
         self._seen: dict[str, tuple[Gray, float, NDArray[np.float64]]] = {}
         self._integrators: OrderedDict[tuple[int, int, int], Integrator] = OrderedDict()
 
@@ -197,7 +199,7 @@ class VirtualHeadset:
             )
         first = None if start is None else checked_gray(start, self.panel.shape).astype(np.float64)
         plane = self._plane(plane_mm)
-        return oracle.descend(
+        return descend(
             self._optics,
             self._integrator(channel, plane),
             target,

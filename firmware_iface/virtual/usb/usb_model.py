@@ -30,7 +30,7 @@ class Nak(Exception):
     """The device has nothing to say or no room yet; raised to the front end once it has given up."""
 
 
-class Gone(Exception):
+class NoDevice(Exception):
     """The cable is out."""
 
 
@@ -147,11 +147,11 @@ class UsbModel:
     def _struck(self, give_up: GiveUp, *kinds: str) -> str | None:
         fault = self.faults.take("unplug", "hang", "timeout", "late", *kinds)
         if fault == "unplug":
-            raise Gone
+            raise NoDevice
         if fault in ("hang", "timeout"):
             while not give_up():
                 if not self.present:
-                    raise Gone
+                    raise NoDevice
                 time.sleep(0.001)
             raise Nak
         if fault == "late":
@@ -167,7 +167,7 @@ class UsbModel:
         while True:
             with self._lock:
                 if not self.present:
-                    raise Gone
+                    raise NoDevice
                 if fault == "stall":
                     self.halted.add(endpoint)
                 if endpoint in self.halted or not self.configured:

@@ -15,18 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
-from firmware_iface.virtual.description import load_bench
+from firmware_iface.virtual.bench_loading import load_bench
 from firmware_iface.virtual.fault_injection import Faults
-from firmware_iface.virtual.headset import VirtualHeadset
 from firmware_iface.virtual.i2c import LaserBoard
-from firmware_iface.virtual.oak import OakModel, looking_at
+from firmware_iface.virtual.oak import OakModel, expose_bench
 from firmware_iface.virtual.usb.panel_board import BoardModel
+from firmware_iface.virtual.virtual_headset import VirtualHeadset
 
 TICK_S = 0.001
 REMEMBERED = 20000  # changes of light
 
 
-class Hardware:
+class EmulatedHardware:
     """Panel board, laser board and camera around one simulated bench; key on, interlock closed.
 
     bench : as `virtual.headset.open_headset` takes it
@@ -106,7 +106,7 @@ class Hardware:
     def attach_oak(self, address: str) -> None:
         """Let an emulated OAK camera look at the bench, at a loopback address; its faults are the camera's."""
         self.oak = OakModel(
-            looking_at(self.exposed, self.headset.description.camera),
+            expose_bench(self.exposed, self.headset.description.camera),
             self.headset.camera.shape,
             address,
             frames_per_s=120.0,

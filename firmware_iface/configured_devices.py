@@ -41,7 +41,7 @@ from firmware_iface.errors import InputError, nearest
 from firmware_iface.lasers import VIRTUAL_CHANNELS, LaserChannel
 from firmware_iface.lasers.eye_safety import exposure
 from firmware_iface.own_device import check_kind, open_own
-from firmware_iface.virtual.tables import parameter, read_table
+from firmware_iface.toml_tables import parameter, read_table
 
 Table = Mapping[str, Any]
 
@@ -86,8 +86,9 @@ class CameraTable:
 
 def open_panel(table: Table) -> Any:
     """The panel of a configuration's [panel]. Raises InputError or DeviceError."""
-    from firmware_iface.panel import open_board, open_dlpc900, open_mirrored, plm
-    from firmware_iface.panel.board import Timing
+    from firmware_iface.panel import open_board, open_dlpc900, open_mirrored
+    from firmware_iface.panel.panel_board_messages import Timing
+    from firmware_iface.panel.phase_light_modulator import P47, P67
 
     asked = _panel_table(table)
     if asked.kind not in KINDS["panel"]:
@@ -97,7 +98,7 @@ def open_panel(table: Table) -> Any:
     if asked.kind == "dlpc900":
         return open_dlpc900(
             None if asked.display < 0 else asked.display,
-            modulator={"p47": plm.P47, "p67": plm.P67}[asked.modulator],
+            modulator={"p47": P47, "p67": P67}[asked.modulator],
             serial=asked.serial or None,
             timeout_s=asked.timeout_ms / 1000,
         )
@@ -105,7 +106,7 @@ def open_panel(table: Table) -> Any:
     timing = Timing(period_us, light_delay_us=period_us // 4, light_width_us=period_us // 2)
     backend = None
     if asked.bus.startswith("virtual:"):
-        from firmware_iface.virtual.served import usb_backend
+        from firmware_iface.virtual.remote_hardware import usb_backend
 
         backend = usb_backend(asked.bus)
     return open_board(asked.serial or None, backend=backend, timing=timing, timeout_s=asked.timeout_ms / 1000)
@@ -114,7 +115,7 @@ def open_panel(table: Table) -> Any:
 def open_lasers(table: Table) -> Any:
     """The lasers of a configuration's [lasers], dark. Raises InputError or DeviceError."""
     from firmware_iface.lasers import open_lasers as open_board
-    from firmware_iface.virtual.served import i2c_bus
+    from firmware_iface.virtual.remote_hardware import i2c_bus
 
     asked = _lasers_table(table)
     bus = i2c_bus(asked.bus) if asked.bus.startswith("virtual:") else asked.bus
@@ -136,7 +137,7 @@ def open_camera(table: Table) -> Any:
             timeout_s=1.0,
             starved_s=0.5,
         )
-    from firmware_iface.virtual.served import RemoteCamera, reach
+    from firmware_iface.virtual.remote_hardware import RemoteCamera, reach
 
     camera = RemoteCamera(reach(asked.bus))
     camera.exposure_ms = asked.exposure_ms

@@ -5,8 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 from firmware_iface.errors import InputError, nearest
+from firmware_iface.virtual.bench_description import (
+    BenchDescription,
+    ChannelDescription,
+    SimulationDescription,
+)
 from firmware_iface.virtual.defects import CATALOGUE_KINDS, make_defect
-from firmware_iface.virtual.description import BenchDescription, ChannelDescription, SimulationDescription
 
 _RGB = (
     ChannelDescription("red", 638.0),

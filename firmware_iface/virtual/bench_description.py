@@ -5,15 +5,13 @@ The TOML form is bench.toml of a capture set plus `[[defect]]` tables and an opt
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
 from typing import Any, TypeVar
 
 from firmware_iface.errors import InputError, nearest
+from firmware_iface.toml_tables import check_instance, parameter, read_table
 from firmware_iface.virtual.defects import Defect, read_defect
-from firmware_iface.virtual.tables import check_instance, parameter, read_table
 
 D = TypeVar("D", bound=Defect)
 
@@ -218,20 +216,3 @@ def read_bench(tables: Mapping[str, Any], where: str) -> BenchDescription:
             read_defect(d, f"[[defect]] {i} of {where}") for i, d in enumerate(tables.get("defect", []))
         ),
     )
-
-
-def load_bench(spec: str) -> BenchDescription:
-    """A bench from `virtual:NAME` (see `named_benches`) or a TOML file's path. Raises InputError."""
-    from firmware_iface.virtual.named import named_bench
-
-    if spec.startswith("virtual:"):
-        return named_bench(spec.removeprefix("virtual:"))
-    path = Path(spec)
-    if not path.is_file():
-        raise InputError(f"there is no bench '{spec}'; give virtual:NAME or the path of a TOML file.")
-    try:
-        with path.open("rb") as file:
-            tables = tomllib.load(file)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path.name} is not TOML ({error}); correct that place.") from error
-    return read_bench(tables, path.name)

@@ -7,13 +7,13 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_iface.virtual.description import CameraDescription
+from firmware_iface.virtual.bench_description import CameraDescription
 from firmware_iface.virtual.oak.oak_model import Expose
 
 BITS = 10
 
 
-def looking_at(capture: Callable[[float], NDArray[np.uint16]], camera: CameraDescription) -> Expose:
+def expose_bench(capture: Callable[[float], NDArray[np.uint16]], camera: CameraDescription) -> Expose:
     """What the emulated sensor reads where the bench's camera stands.
 
     capture : a picture of the bench's camera, counts [h, w], at unit gain and the exposure given in ms

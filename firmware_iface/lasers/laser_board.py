@@ -22,7 +22,7 @@ TRIP_V = 1.2  # of every photodiode, whose amplifier gives 1 V at full power
 HOT_CELSIUS, COOL_CELSIUS = 45.0, 40.0
 
 
-class Parts:
+class LaserBoard:
     """DAC, expander, converter, thermometer and safety controller on one bus.
 
     bus : an open smbus2.SMBus
