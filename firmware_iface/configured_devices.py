@@ -85,7 +85,13 @@ class CameraTable:
 
 
 def open_panel(table: Table) -> Any:
-    """The panel of a configuration's [panel]. Raises InputError or DeviceError."""
+    """The panel of a configuration's [panel].
+
+    Raises
+    ------
+    InputError
+    DeviceError
+    """
     from firmware_iface.panel import open_board, open_dlpc900, open_mirrored
     from firmware_iface.panel.panel_board_messages import Timing
     from firmware_iface.panel.phase_light_modulator import P47, P67
@@ -113,7 +119,13 @@ def open_panel(table: Table) -> Any:
 
 
 def open_lasers(table: Table) -> Any:
-    """The lasers of a configuration's [lasers], dark. Raises InputError or DeviceError."""
+    """The lasers of a configuration's [lasers], dark.
+
+    Raises
+    ------
+    InputError
+    DeviceError
+    """
     from firmware_iface.lasers import open_lasers as open_board
     from firmware_iface.virtual.remote_hardware import i2c_bus
 
@@ -123,7 +135,13 @@ def open_lasers(table: Table) -> Any:
 
 
 def open_camera(table: Table) -> Any:
-    """The camera of a configuration's [camera]. Raises InputError or DeviceError."""
+    """The camera of a configuration's [camera].
+
+    Raises
+    ------
+    InputError
+    DeviceError
+    """
     asked = _camera_table(table)
     if asked.kind not in KINDS["camera"]:
         return open_own(asked.kind, "camera", exposure_ms=asked.exposure_ms)
@@ -145,7 +163,12 @@ def open_camera(table: Table) -> Any:
 
 
 def check_tables(tables: Mapping[str, Table]) -> None:
-    """Check [panel], [lasers] and [camera] without opening anything. Raises InputError."""
+    """Check [panel], [lasers] and [camera] without opening anything.
+
+    Raises
+    ------
+    InputError
+    """
     if "panel" in tables:
         _panel_table(tables["panel"])
     if "camera" in tables:
@@ -192,7 +215,12 @@ def mrad_per_pixel(table: Table) -> float:
 
 
 def laser_channels(table: Table) -> Sequence[LaserChannel]:
-    """The lasers of [[lasers.channel]]; on an emulated board, where there are none, its own. Raises InputError."""
+    """The lasers of [[lasers.channel]]; on an emulated board, where there are none, its own.
+
+    Raises
+    ------
+    InputError
+    """
     given = table.get("channel", [])
     if not given and str(table.get("bus")).startswith("virtual:"):
         return VIRTUAL_CHANNELS
@@ -202,7 +230,12 @@ def laser_channels(table: Table) -> Sequence[LaserChannel]:
 
 
 def laser_power(table: Table) -> dict[str, float]:
-    """The power of each channel while something is shown, fraction of full. Raises InputError."""
+    """The power of each channel while something is shown, fraction of full.
+
+    Raises
+    ------
+    InputError
+    """
     power = table.get("power")
     if not isinstance(power, Mapping) or not power:
         raise InputError(

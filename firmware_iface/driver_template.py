@@ -25,7 +25,13 @@ READ_TEMPERATURE = 1
 
 
 def parse_temperature(reply: bytes) -> float:
-    """°C from i16 in 0.01 °C and its complement; ValueError where these are not four such bytes."""
+    """°C from i16 in 0.01 °C and its complement.
+
+    Raises
+    ------
+    ValueError
+        Where these are not four such bytes.
+    """
     value, complement = struct.unpack("<hh", reply) if len(reply) == 4 else (0, 0)
     if value != ~complement:
         raise ValueError("the reply is garbled")
@@ -35,7 +41,10 @@ def parse_temperature(reply: bytes) -> float:
 class Thermometer:
     """The device. Opening takes the bus, so that it runs on an emulated one.
 
-    backend : a pyusb backend; None is the system's libusb
+    Parameters
+    ----------
+    backend : object
+        A pyusb backend; None is the system's libusb.
     """
 
     def __init__(self, backend: Any = None, timeout_s: float = 0.5) -> None:
@@ -43,14 +52,24 @@ class Thermometer:
         self._link.open()
 
     def temperature_c(self) -> float:
-        """Temperature, °C; raises DeviceError."""
+        """Temperature, °C.
+
+        Raises
+        ------
+        DeviceError
+        """
         try:
             return parse_temperature(self._link.control_in(READ_TEMPERATURE, 4))
         except ValueError as error:
             raise DeviceError(f"the thermometer: {error}; check its cable.") from error
 
     def status(self) -> dict[str, Any]:
-        """What the device says of itself; raises DeviceError."""
+        """What the device says of itself.
+
+        Raises
+        ------
+        DeviceError
+        """
         return {"temperature_c": self.temperature_c()}
 
     def close(self) -> None:

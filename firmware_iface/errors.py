@@ -13,8 +13,16 @@ class InputError(ValueError):
 def nearest(word: str, known: Iterable[str]) -> str:
     """A hint that names the known word nearest to `word`, or lists all known words when none is near.
 
-    word : str, what was written
-    known : iterable of str, what could have been written
+    Parameters
+    ----------
+    word : str
+        What was written.
+    known : sequence of str
+        Iterable of str, what could have been written.
+
+    Returns
+    -------
+    str
     """
     names = list(known)
     close = difflib.get_close_matches(str(word), names, n=1, cutoff=0.5)

@@ -43,8 +43,22 @@ def check_kind(kind: str, part: str, known: Collection[str]) -> None:
 def open_own(kind: str, part: str, **settings: Any) -> Any:
     """What the function of kind = "MODULE:FUNCTION" returns; modules of the current folder are found, too.
 
-    part : "panel" or "camera", which say what it has to have (see NEEDED). settings : attributes that are set then.
-    Raises InputError where it cannot be called or returns something else, DeviceError where it fails.
+    Parameters
+    ----------
+    part : str
+        "panel" or "camera", which say what it has to have (see NEEDED). settings : attributes that are
+        set then.
+
+    Returns
+    -------
+    object
+
+    Raises
+    ------
+    InputError
+        Where it cannot be called or returns something else.
+    DeviceError
+        Where it fails.
     """
     function = _imported(kind, part)
     try:

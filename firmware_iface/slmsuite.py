@@ -21,7 +21,11 @@ class SlmsuitePanel:
     Gray levels go to it as they are, as display values: slmsuite's own wavefront correction and its sign of
     phase do not touch them. On a panel of more than 8 bits, gray is scaled to its range.
 
-    Attributes: slm, shape ((H, W), pixels).
+    Attributes
+    ----------
+    slm : object
+    shape : (int, int)
+        (H, W), pixels.
     """
 
     def __init__(self, slm: Any) -> None:
@@ -53,7 +57,12 @@ class SlmsuitePanel:
 class SlmsuiteCamera:
     """A camera behind an slmsuite camera object.
 
-    Attributes: camera, shape ((h, w), pixels), bit_depth.
+    Attributes
+    ----------
+    camera : object
+    shape : (int, int)
+        (h, w), pixels.
+    bit_depth
     """
 
     def __init__(self, camera: Any) -> None:
@@ -63,7 +72,13 @@ class SlmsuiteCamera:
 
     @property
     def exposure_ms(self) -> float:
-        """Exposure time, ms; setting it raises InputError where the camera does not take it."""
+        """Exposure time, ms.
+
+        Raises
+        ------
+        InputError
+            On setting, where the camera does not take it.
+        """
         return float(self.camera.get_exposure()) * 1000
 
     @exposure_ms.setter

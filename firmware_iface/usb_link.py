@@ -22,12 +22,22 @@ TO_HOST, TO_DEVICE = 0xC0, 0x40  # vendor requests to the device
 class UsbLink:
     """A device by vendor and product ID, with interface 0 claimed while it is open; for one thread at a time.
 
-    name : what messages call it
-    serial : serial number, where several are attached
-    backend : a pyusb backend; None is the system's libusb
-    timeout_s : longest wait for one transfer
+    Parameters
+    ----------
+    name : str
+        What messages call it.
+    serial : str or None
+        Serial number, where several are attached.
+    backend : object
+        A pyusb backend; None is the system's libusb.
+    timeout_s : float, s
+        Longest wait for one transfer.
 
-    Attribute: opened, functions that are called each time the device was found, to set it up.
+    Attributes
+    ----------
+    opened : list of callable
+    functions that are called each time the device was found
+    to set it up
     """
 
     def __init__(
@@ -52,7 +62,13 @@ class UsbLink:
         return self._device is not None
 
     def open(self) -> None:
-        """Find and set up the device unless it is open; raises DeviceGoneError where it is not attached."""
+        """Find and set up the device unless it is open.
+
+        Raises
+        ------
+        DeviceGoneError
+            Where it is not attached.
+        """
         if self._device is not None:
             return
         self._device = self._find()
@@ -74,7 +90,13 @@ class UsbLink:
                 usb.util.dispose_resources(device)
 
     def control_in(self, request: int, length: int, value: int = 0) -> bytes:
-        """The reply to a vendor request; DeviceError where it is not of this length."""
+        """The reply to a vendor request.
+
+        Raises
+        ------
+        DeviceError
+            Where it is not of this length.
+        """
         reply = bytes(self._do(lambda d: d.ctrl_transfer(TO_HOST, request, value, 0, length, self._ms)))
         if len(reply) != length:
             raise DeviceError(
@@ -88,7 +110,13 @@ class UsbLink:
         self._do(lambda d: d.ctrl_transfer(TO_DEVICE, request, value, 0, data, self._ms))
 
     def write(self, endpoint: int, data: bytes) -> None:
-        """One transfer to an endpoint; DeviceError where not all of it was taken."""
+        """One transfer to an endpoint.
+
+        Raises
+        ------
+        DeviceError
+            Where not all of it was taken.
+        """
         taken = self._do(lambda d: d.write(endpoint, data, self._ms))
         if taken != len(data):
             raise DeviceError(

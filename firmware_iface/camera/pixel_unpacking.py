@@ -11,10 +11,22 @@ BIT_DEPTHS = {"raw10": 10, "gray8": 8}
 def unpack(data: bytes, encoding: str, height: int, width: int, stride: int) -> NDArray[np.uint16]:
     """Counts, uint16 [height, width].
 
-    encoding : "raw10" (MIPI: four pixels in five bytes, the fifth holds their low two bits, first pixel
-        lowest) or "gray8"
-    stride : bytes from the start of one row to the next
-    Raises ValueError where the data does not hold such a picture.
+    Parameters
+    ----------
+    encoding : str
+        "raw10" (MIPI: four pixels in five bytes, the fifth holds their low two bits, first pixel
+        lowest) or "gray8".
+    stride : int
+        Bytes from the start of one row to the next.
+
+    Returns
+    -------
+    uint16 array [height, width]
+
+    Raises
+    ------
+    ValueError
+        Where the data does not hold such a picture.
     """
     if encoding not in BIT_DEPTHS:
         raise ValueError(f"pixels of encoding '{encoding}' are not known")

@@ -54,7 +54,13 @@ class Messages:
         self._rest = bytearray()
 
     def feed(self, data: bytes) -> Iterator[str | Frame]:
-        """States and frames that are complete with `data`; ValueError where it is no such stream."""
+        """States and frames that are complete with `data`.
+
+        Raises
+        ------
+        ValueError
+            Where it is no such stream.
+        """
         self._rest += data
         while len(self._rest) >= _HEADER.size:
             magic, kind, length, *numbers = _HEADER.unpack_from(self._rest)

@@ -14,10 +14,15 @@ PHOTODIODE_FULL_V = 1.0
 
 @dataclass(frozen=True)
 class LaserChannel:
-    """One laser and its calibration. Raises InputError for a value out of range.
+    """One laser and its calibration.
 
     The laser-diode controller's own set point must be 0 (its modulation input adds to it), and its hardware limit set
     to what the diode bears. The photodiode's amplifier is set to 1 V at full power.
+
+    Raises
+    ------
+    InputError
+        For a value out of range.
     """
 
     name: str = parameter(about="name of the colour")

@@ -50,9 +50,23 @@ def photochemical_limit_uw(wavelength_nm: float) -> float:
 def spot_shares(irradiance: NDArray[np.floating], mrad_per_pixel: float) -> tuple[float, ...]:
     """The largest share of a picture's light in any square of each of SIZES_MRAD.
 
-    irradiance : [H, W], predicted in the image plane, any unit, not negative
-    mrad_per_pixel : angle that a pixel takes at the eye
-    Raises InputError where the picture cannot be one. A square is rounded up to whole pixels, so is never too small.
+    A square is rounded up to whole pixels, so is never too small.
+
+    Parameters
+    ----------
+    irradiance : float array [H, W]
+        Predicted in the image plane, any unit, not negative.
+    mrad_per_pixel : float, mrad
+        Angle that a pixel takes at the eye.
+
+    Returns
+    -------
+    tuple of float
+
+    Raises
+    ------
+    InputError
+        Where the picture cannot be one.
     """
     picture = np.asarray(irradiance, np.float64)
     if picture.ndim != 2 or not np.isfinite(picture).all() or picture.size == 0 or picture.min() < 0:
@@ -93,10 +107,19 @@ def exposure(
 ) -> Exposure:
     """What these lasers use of the Class 1 limits.
 
-    power_uw : by channel, through a 7 mm aperture at the exit pupil
-    wavelength_nm : by channel, 400 to 700
-    shares : by channel, from `spot_shares`; channels without: all their light in one spot. The brightest spots of
-        all channels are taken to fall on one another.
+    Parameters
+    ----------
+    power_uw : mapping, µW
+        By channel, through a 7 mm aperture at the exit pupil.
+    wavelength_nm : mapping, nm
+        By channel, 400 to 700.
+    shares : mapping or None
+        By channel, from `spot_shares`; channels without: all their light in one spot. The brightest
+        spots of all channels are taken to fall on one another.
+
+    Returns
+    -------
+    Exposure
     """
     photochemical = sum(p / photochemical_limit_uw(wavelength_nm[c]) for c, p in power_uw.items())
     found = {c: (shares or {}).get(c, ALL_IN_ONE_SPOT) for c in power_uw}

@@ -86,7 +86,13 @@ class GuardedLasers:
         self._ask("arm")
 
     def heartbeat(self) -> None:
-        """Say that the caller is alive; raises DeviceError where the lasers have been switched off."""
+        """Say that the caller is alive.
+
+        Raises
+        ------
+        DeviceError
+            Where the lasers have been switched off.
+        """
         self._ask("beat")
 
     def expect(self, shares: Mapping[str, Sequence[float]] | None) -> float:
@@ -160,5 +166,11 @@ class GuardedLasers:
 
 
 def open_guarded_lasers(bus: str, channels: Sequence[LaserChannel]) -> GuardedLasers:
-    """Open the lasers on a bus (see wire.open_bus) in a guard process. Raises InputError, DeviceError."""
+    """Open the lasers on a bus (see wire.open_bus) in a guard process.
+
+    Raises
+    ------
+    InputError
+    DeviceError
+    """
     return GuardedLasers(bus, channels)

@@ -11,7 +11,10 @@ if TYPE_CHECKING:
 def open_bus(bus: str) -> SMBus:
     """Open a bus: a path such as `/dev/i2c-1`, or `virtual:SOCKET` for a board that another process emulates.
 
-    Raises OSError where it cannot be opened.
+    Raises
+    ------
+    OSError
+        Where it cannot be opened.
     """
     from smbus2 import SMBus
 
@@ -23,14 +26,25 @@ def open_bus(bus: str) -> SMBus:
 
 
 def write(bus: SMBus, address: int, data: bytes) -> None:
-    """One write message. Raises OSError where the part or the adapter does not do it."""
+    """One write message.
+
+    Raises
+    ------
+    OSError
+        Where the part or the adapter does not do it.
+    """
     from smbus2 import i2c_msg
 
     bus.i2c_rdwr(i2c_msg.write(address, data))
 
 
 def read(bus: SMBus, address: int, length: int) -> bytes:
-    """One read message of `length` bytes. Raises OSError."""
+    """One read message of `length` bytes.
+
+    Raises
+    ------
+    OSError
+    """
     from smbus2 import i2c_msg
 
     message = i2c_msg.read(address, length)
@@ -39,7 +53,12 @@ def read(bus: SMBus, address: int, length: int) -> bytes:
 
 
 def write_read(bus: SMBus, address: int, data: bytes, length: int) -> bytes:
-    """Write, then read `length` bytes after a repeated START. Raises OSError."""
+    """Write, then read `length` bytes after a repeated START.
+
+    Raises
+    ------
+    OSError
+    """
     from smbus2 import i2c_msg
 
     message = i2c_msg.read(address, length)

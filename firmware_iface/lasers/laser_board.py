@@ -25,7 +25,10 @@ HOT_CELSIUS, COOL_CELSIUS = 45.0, 40.0
 class LaserBoard:
     """DAC, expander, converter, thermometer and safety controller on one bus.
 
-    bus : an open smbus2.SMBus
+    Parameters
+    ----------
+    bus : SMBus
+        An open smbus2.SMBus.
     """
 
     def __init__(self, bus: SMBus) -> None:
@@ -36,9 +39,19 @@ class LaserBoard:
     def set_up(self, lasers: Sequence[LaserChannel]) -> None:
         """Make everything dark, verify that it is and would be at power-on, and set every limit.
 
-        lasers : one to three, in the order of the DAC's outputs
-        Raises InputError where the board was not built for these lasers, DeviceError where a part is not what it
-        should be, and OSError where one does not answer.
+        Parameters
+        ----------
+        lasers : sequence of LaserChannel
+            One to three, in the order of the DAC's outputs.
+
+        Raises
+        ------
+        InputError
+            Where the board was not built for these lasers.
+        DeviceError
+            Where a part is not what it should be.
+        OSError
+            Where one does not answer.
         """
         self.controller.check_identity()
         self.controller.command(Command.OFF)
@@ -89,7 +102,10 @@ class LaserBoard:
     def go_dark(self, command: Command) -> None:
         """Tell every part to go dark, each by itself, whatever happens to the others. Raises nothing.
 
-        command : what the safety controller is told, OFF or FAULT
+        Parameters
+        ----------
+        command : Command
+            What the safety controller is told, OFF or FAULT.
         """
         acts: tuple[Callable[[], None], ...] = (
             lambda: self.controller.command(command),

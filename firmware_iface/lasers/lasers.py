@@ -57,11 +57,21 @@ class LatchedError(DeviceError):
 class Lasers:
     """The lasers of one board, opened dark and not armed.
 
-    bus : an open smbus2.SMBus, which is closed with the lasers
-    channels : one to three, in the order of the DAC's outputs
-    clock, wait : seconds, and sleeping; tests give their own
-    Raises InputError where the channels do not fit the board, DeviceError where a part fails or the DAC would not be
-    dark at power-on.
+    Parameters
+    ----------
+    bus : SMBus
+        An open smbus2.SMBus, which is closed with the lasers.
+    channels : sequence of LaserChannel
+        One to three, in the order of the DAC's outputs.
+    clock, wait : callable
+        Seconds, and sleeping; tests give their own.
+
+    Raises
+    ------
+    InputError
+        Where the channels do not fit the board.
+    DeviceError
+        Where a part fails or the DAC would not be dark at power-on.
     """
 
     def __init__(
@@ -95,14 +105,24 @@ class Lasers:
     # --- the headset's interface
 
     def power(self, channel: str) -> float:
-        """A laser's power, fraction of full; raises InputError for an unknown one."""
+        """A laser's power, fraction of full.
+
+        Raises
+        ------
+        InputError
+            For an unknown one.
+        """
         return self._fractions[self._index(channel)]
 
     def set_power(self, channel: str, fraction: float) -> None:
         """Set a laser to a fraction of full power: down at once, up over 100 ms with the photodiode watched.
 
-        Raises InputError where either is unknown or the lasers together would exceed the Class 1 budget, and
-        DeviceError (dark by then) where a part fails or the photodiode does not follow.
+        Raises
+        ------
+        InputError
+            Where either is unknown or the lasers together would exceed the Class 1 budget.
+        DeviceError
+            Where a part fails or the photodiode does not follow (dark by then).
         """
         for _ in self.ramp(channel, fraction):
             self._wait(RAMP_S / RAMP_STEPS)
@@ -110,7 +130,10 @@ class Lasers:
     def off(self) -> None:
         """Every laser to 0, at once, and read back; the board stays armed.
 
-        Raises DeviceError where the DAC does not do it; everything has then been told to go dark.
+        Raises
+        ------
+        DeviceError
+            Where the DAC does not do it; everything has then been told to go dark.
         """
         self._forget()
         with self._dark_on_failure():
@@ -125,7 +148,13 @@ class Lasers:
     # --- arming and staying alive
 
     def clear(self) -> None:
-        """First act after a fault: forget it. Raises DeviceError that says what holds it."""
+        """First act after a fault: forget it.
+
+        Raises
+        ------
+        DeviceError
+            That says what holds it.
+        """
         self._forget()
         with self._dark_on_failure():
             self.board.dac.dark()
@@ -137,7 +166,13 @@ class Lasers:
             raise DeviceError(f"the fault cannot be cleared: {missing}.")
 
     def arm(self) -> None:
-        """Second act: arm the board, dark. Raises DeviceError that says what is missing."""
+        """Second act: arm the board, dark.
+
+        Raises
+        ------
+        DeviceError
+            That says what is missing.
+        """
         with self._dark_on_failure():
             state = self.board.controller.state()
             if state is State.OFF:
@@ -157,8 +192,13 @@ class Lasers:
     def heartbeat(self) -> None:
         """Say that the caller is alive, at least every 50 ms; looks at one photodiode each time.
 
-        Raises DeviceError (dark by then) where a fault is latched, a photodiode shows what it should not, or a part
-        does not answer. No token is written sooner than 6 ms after the last.
+        No token is written sooner than 6 ms after the last.
+
+        Raises
+        ------
+        DeviceError
+            Where a fault is latched, a photodiode shows what it should not, or a part does not answer (dark
+            by then).
         """
         with self._dark_on_failure():
             self._beat()
@@ -254,7 +294,13 @@ class Lasers:
     # --- what is seen
 
     def status(self) -> dict[str, Any]:
-        """What the board says of itself, ready for JSON. Raises DeviceError (dark by then) where it does not answer."""
+        """What the board says of itself, ready for JSON.
+
+        Raises
+        ------
+        DeviceError
+            Where it does not answer (dark by then).
+        """
         with self._dark_on_failure():
             inputs = self.board.controller.inputs()
             fractions = self._powers()
@@ -376,7 +422,13 @@ def _close_all() -> None:
 
 
 def open_lasers(bus: str, channels: Sequence[LaserChannel]) -> Lasers:
-    """Open the lasers on a bus (see wire.open_bus). Raises InputError, DeviceError."""
+    """Open the lasers on a bus (see wire.open_bus).
+
+    Raises
+    ------
+    InputError
+    DeviceError
+    """
     try:
         opened = open_bus(bus)
     except OSError as error:

@@ -20,17 +20,26 @@ KEY, INTERLOCK, NO_OVER_POWER = 1 << 4, 1 << 5, 1 << 6
 class Mcp23008:
     """The expander.
 
-    bus : an open smbus2.SMBus
+    Parameters
+    ----------
+    bus : smbus2.SMBus
+        Open.
+    address : int
+
+    Raises
+    ------
+    OSError
+        From every method, where the bus does not carry a message.
     """
 
     def __init__(self, bus: SMBus, address: int = 0x20) -> None:
         self._bus, self._address = bus, address
 
     def enable(self, lasers: int) -> None:
-        """Enable the lasers whose bits are set, disable the others. Raises OSError."""
+        """Enable the lasers whose bits are set, disable the others."""
         write(self._bus, self._address, bytes([OLAT, lasers & ENABLES]))
         write(self._bus, self._address, bytes([IODIR, ~ENABLES & 0xFF]))
 
     def pins(self) -> int:
-        """Levels of the eight pins, bit by bit. Raises OSError."""
+        """Levels of the eight pins, bit by bit."""
         return write_read(self._bus, self._address, bytes([GPIO]), 1)[0]

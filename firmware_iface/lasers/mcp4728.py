@@ -37,10 +37,14 @@ class Output:
 
 
 def decode(reply: bytes) -> tuple[list[Output], list[Output]]:
-    """(outputs now, outputs after power-on) from the 24 bytes that the part sends; raises DeviceError.
+    """(outputs now, outputs after power-on) from the 24 bytes that the part sends.
 
     Each channel is status, two bytes of the register, status, two bytes of the EEPROM; bits 5 and 4 of the status
     count the channels.
+
+    Raises
+    ------
+    DeviceError
     """
     if len(reply) != 6 * CHANNELS or any(reply[3 * i] >> 4 & 3 != i // 2 for i in range(2 * CHANNELS)):
         raise DeviceError(
@@ -58,29 +62,43 @@ def decode(reply: bytes) -> tuple[list[Output], list[Output]]:
 class Mcp4728:
     """The DAC.
 
-    bus : an open smbus2.SMBus
+    Parameters
+    ----------
+    bus : smbus2.SMBus
+        Open.
+    address : int
+
+    Raises
+    ------
+    OSError
+        From every method, where the bus does not carry a message.
     """
 
     def __init__(self, bus: SMBus, address: int = 0x60) -> None:
         self._bus, self._address = bus, address
 
     def read(self) -> tuple[list[Output], list[Output]]:
-        """(outputs now, outputs after power-on), A to D. Raises DeviceError, OSError."""
+        """(outputs now, outputs after power-on), A to D.
+
+        Raises
+        ------
+        DeviceError
+            Where the reply is garbled.
+        """
         return decode(read(self._bus, self._address, 6 * CHANNELS))
 
     def set_code(self, channel: int, code: int) -> None:
-        """Put out `code`, 0 to 4095, on channel 0 (A) to 3 (D), at once. Raises OSError."""
+        """Put out `code`, 0 to 4095, on channel 0 (A) to 3 (D), at once."""
         high, low = INTERNAL_REFERENCE | code >> 8, code & 0xFF
         write(self._bus, self._address, bytes([MULTI_WRITE | channel << 1, high, low]))
 
     def dark(self) -> None:
-        """Code 0 on every channel, in one message (fast write). Raises OSError."""
+        """Code 0 on every channel, in one message (fast write)."""
         write(self._bus, self._address, bytes(2 * CHANNELS))
 
     def store_dark(self) -> None:
-        """Make power-on dark: every channel off in the EEPROM, and now. It takes 50 ms. Raises OSError.
+        """Make power-on dark: every channel off in the EEPROM, and now. It takes 50 ms.
 
-        The EEPROM bears a million writes: do this when a board is made, not when it is opened.
-        """
+        The EEPROM bears a million writes: do this when a board is made, not when it is opened."""
         off = bytes([INTERNAL_REFERENCE | OFF_500K, 0])
         write(self._bus, self._address, bytes([SEQUENTIAL_WRITE]) + CHANNELS * off)

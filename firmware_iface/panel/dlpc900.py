@@ -55,8 +55,12 @@ _READ, _REPLY, _FAILED = 0x80, 0x40, 0x20
 class Dlpc900Control:
     """Commands of the controller: power, mode, status, errors.
 
-    receiver : "hdmi" or "displayport" for frames that come over that link, "off" for uploaded ones
-    exposure_us : of each pattern
+    Parameters
+    ----------
+    receiver : str
+        "hdmi" or "displayport" for frames that come over that link, "off" for uploaded ones.
+    exposure_us : int, µs
+        Of each pattern.
     """
 
     def __init__(self, link: UsbLink, receiver: str = "off", exposure_us: int = 16667) -> None:
@@ -189,7 +193,13 @@ class Dlpc900Control:
 
 
 def parse_answer(packet: bytes) -> tuple[int, int, bytes]:
-    """(flags, sequence, data) of an answer; ValueError where it is none."""
+    """(flags, sequence, data) of an answer.
+
+    Raises
+    ------
+    ValueError
+        Where it is none.
+    """
     if len(packet) < 4:
         raise ValueError(f"its answer has {len(packet)} bytes")
     flags, sequence, length = struct.unpack_from("<BBH", packet)
@@ -265,11 +275,27 @@ def open_dlpc900(
 ) -> Panel:
     """Open a phase light modulator.
 
-    display : N of /dev/fbN that it is the screen of; None uploads frames over USB, slowly
-    receiver : how that screen is connected, "hdmi" or "displayport"
-    backend : a pyusb backend; None is the system's libusb
-    exposure_us : of a pattern, less than a frame of the display
-    Raises DeviceGoneError where it is not attached, DeviceError where it does not answer as it should.
+    Parameters
+    ----------
+    display : int or None
+        N of /dev/fbN that it is the screen of; None uploads frames over USB, slowly.
+    receiver : str
+        How that screen is connected, "hdmi" or "displayport".
+    backend : object
+        A pyusb backend; None is the system's libusb.
+    exposure_us : int, µs
+        Of a pattern, less than a frame of the display.
+
+    Returns
+    -------
+    Panel
+
+    Raises
+    ------
+    DeviceGoneError
+        Where it is not attached.
+    DeviceError
+        Where it does not answer as it should.
     """
     link = UsbLink(
         VENDOR, PRODUCT, "the phase light modulator", serial=serial, backend=backend, timeout_s=timeout_s

@@ -21,11 +21,19 @@ from firmware_iface.panel.panel import Gray, Panel
 class MirroredDisplay:
     """A frame buffer whose screen the panel mirrors, gray levels in all colours.
 
-    number : N of /dev/fbN
-    shape : (H, W), the panel's pixels; they are drawn at the screen's top left
-    settle_s : from the start of a frame on the link until the panel has followed
-    draw : makes the screen's pixels, uint8 [rows, columns], of gray levels [H, W]; none: they are the same
-    devices, settings : where the kernel shows frame buffers; tests give folders of their own
+    Parameters
+    ----------
+    number : int
+        N of /dev/fbN.
+    shape : (int, int)
+        (H, W), the panel's pixels; they are drawn at the screen's top left.
+    settle_s : float, s
+        From the start of a frame on the link until the panel has followed.
+    draw : callable
+        Makes the screen's pixels, uint8 [rows, columns], of gray levels [H, W]; none: they are the
+        same.
+    devices, settings : Path
+        Where the kernel shows frame buffers; tests give folders of their own.
     """
 
     def __init__(
@@ -75,7 +83,13 @@ class MirroredDisplay:
         time.sleep(max(0.0, self._shown_s - time.monotonic()))
 
     def status(self) -> dict[str, Any]:
-        """Mode of the screen; raises DeviceGoneError where it is off the link."""
+        """Mode of the screen.
+
+        Raises
+        ------
+        DeviceGoneError
+            Where it is off the link.
+        """
         return {"mode": self._get("mode"), "pan": self._get("pan"), "bits_per_pixel": 8 * self._bytes}
 
     def close(self) -> None:

@@ -16,7 +16,12 @@ class Control(Protocol):
     """What every panel's control part offers."""
 
     def status(self) -> dict[str, Any]:
-        """What the panel says of itself, by name; raises DeviceError."""
+        """What the panel says of itself, by name.
+
+        Raises
+        ------
+        DeviceError
+        """
 
     def close(self) -> None:
         """Leave the panel dark where it can be, and let go of it."""
@@ -30,10 +35,21 @@ class Frames(Protocol):
         """(H, W), pixels."""
 
     def send(self, gray: Gray) -> int:
-        """Hand one whole frame over and return its sequence number; raises DeviceError."""
+        """Hand one whole frame over and return its sequence number.
+
+        Raises
+        ------
+        DeviceError
+        """
 
     def wait(self, sequence: int) -> None:
-        """Return when this frame is what is displayed; DeviceError where it was lost or does not come."""
+        """Return when this frame is what is displayed.
+
+        Raises
+        ------
+        DeviceError
+            Where it was lost or does not come.
+        """
 
     def close(self) -> None:
         """Let go of the link."""
@@ -42,7 +58,12 @@ class Frames(Protocol):
 class Panel:
     """A phase panel.
 
-    Attributes: control, frames, shape ((H, W), pixels).
+    Attributes
+    ----------
+    control : Control
+    frames : Frames
+    shape
+        (H, W), pixels.
     """
 
     def __init__(self, control: Control, frames: Frames) -> None:
@@ -52,12 +73,22 @@ class Panel:
     def show(self, gray: NDArray[np.generic]) -> None:
         """Show gray levels, uint8 [H, W], and return when they are displayed.
 
-        Raises InputError for another type or size, DeviceError where the panel does not show them.
+        Raises
+        ------
+        InputError
+            For another type or size.
+        DeviceError
+            Where the panel does not show them.
         """
         self.frames.wait(self.frames.send(checked_gray(gray, self.shape)))
 
     def status(self) -> dict[str, Any]:
-        """What the panel says of itself; raises DeviceError."""
+        """What the panel says of itself.
+
+        Raises
+        ------
+        DeviceError
+        """
         return self.control.status()
 
     def close(self) -> None:
@@ -69,7 +100,12 @@ class Panel:
 
 
 def checked_gray(gray: NDArray[np.generic], shape: tuple[int, int]) -> Gray:
-    """`gray` if it is uint8 of this shape; raises InputError."""
+    """`gray` if it is uint8 of this shape.
+
+    Raises
+    ------
+    InputError
+    """
     if not isinstance(gray, np.ndarray) or gray.dtype != np.uint8:
         found = gray.dtype if isinstance(gray, np.ndarray) else type(gray).__name__
         raise InputError(f"the pattern is {found}; give the panel uint8 gray levels.")

@@ -34,9 +34,14 @@ FRAMES_OUT = 0x01
 class BoardControl:
     """Identity, mode, timing and status of a board.
 
-    timing : set each time the board was found, and checked by reading it back
+    Parameters
+    ----------
+    timing : Timing or None
+        Set each time the board was found, and checked by reading it back.
 
-    Attribute: identity.
+    Attributes
+    ----------
+    identity : Identity or None
     """
 
     def __init__(self, link: UsbLink, timing: Timing | None = None) -> None:
@@ -48,7 +53,13 @@ class BoardControl:
 
     @property
     def timing(self) -> Timing:
-        """What the board is set to; assign to change it. InputError where the board cannot do it."""
+        """What the board is set to; assign to change it.
+
+        Raises
+        ------
+        InputError
+            Where the board cannot do it.
+        """
         return self._timing
 
     @timing.setter
@@ -64,7 +75,12 @@ class BoardControl:
         self._link.control_out(MODE, value=MODES.index(mode))
 
     def read_status(self) -> Status:
-        """The board's status; raises DeviceError."""
+        """The board's status.
+
+        Raises
+        ------
+        DeviceError
+        """
         return self._ask(STATUS, STATUS_BYTES, parse_status)
 
     def status(self) -> dict[str, Any]:
@@ -193,9 +209,23 @@ def open_board(
 ) -> Panel:
     """Open the panel board, or that of this serial number.
 
-    backend : a pyusb backend; None is the system's libusb
-    timeout_s : longest wait for one transfer
-    Raises DeviceGoneError where it is not attached, DeviceError where it does not answer as it should.
+    Parameters
+    ----------
+    backend : object
+        A pyusb backend; None is the system's libusb.
+    timeout_s : float, s
+        Longest wait for one transfer.
+
+    Returns
+    -------
+    Panel
+
+    Raises
+    ------
+    DeviceGoneError
+        Where it is not attached.
+    DeviceError
+        Where it does not answer as it should.
     """
     link = UsbLink(VENDOR, PRODUCT, "the panel board", serial=serial, backend=backend, timeout_s=timeout_s)
     control = BoardControl(link, timing)

@@ -25,10 +25,16 @@ MEMORY = (3, 2, 1, 7, 0, 6, 5, 4, 11, 10, 9, 8, 15, 14, 13, 12)
 class Modulator:
     """One device.
 
-    shape : (H, W), mirrors
-    electrodes : which memory bit lies where under a mirror, 2 x 2
-    mirrored : whether the memory's columns run the other way
-    controllers : 1, or 2 where a second one has the right half
+    Attributes
+    ----------
+    shape : (int, int)
+        (H, W), mirrors.
+    electrodes : (tuple[int, int], tuple[int, int])
+        Which memory bit lies where under a mirror, 2 x 2.
+    mirrored : bool
+        Whether the memory's columns run the other way.
+    controllers : int
+        1, or 2 where a second one has the right half.
     """
 
     shape: tuple[int, int]

@@ -132,7 +132,13 @@ class BenchDescription:
         return next((d for d in self.defects if isinstance(d, cls)), None)
 
     def channel(self, name: str) -> ChannelDescription:
-        """The channel of this name; raises InputError that suggests the nearest."""
+        """The channel of this name.
+
+        Raises
+        ------
+        InputError
+            That suggests the nearest.
+        """
         for c in self.channels:
             if c.name == name:
                 return c
@@ -174,7 +180,12 @@ class BenchDescription:
 
 
 def read_bench(tables: Mapping[str, Any], where: str) -> BenchDescription:
-    """A bench from parsed TOML; tables that are left out take their defaults. Raises InputError."""
+    """A bench from parsed TOML; tables that are left out take their defaults.
+
+    Raises
+    ------
+    InputError
+    """
     known = ("schema", "name", "panel", "channel", "propagation", "iris", "camera", "simulation", "defect")
     for key in tables:
         if key not in known:

@@ -313,14 +313,24 @@ DEFECT_KINDS: dict[str, type[Defect]] = {c.kind: c for c in _CATALOGUE + _OUTSID
 
 
 def make_defect(kind: str, where: str = "a defect", **parameters: Any) -> Defect:
-    """A defect by name; parameters that are not given take their defaults. Raises InputError."""
+    """A defect by name; parameters that are not given take their defaults.
+
+    Raises
+    ------
+    InputError
+    """
     if kind not in DEFECT_KINDS:
         raise InputError(f"{where} has an unknown kind '{kind}'; {nearest(kind, DEFECT_KINDS)}")
     return read_table(DEFECT_KINDS[kind], parameters, f"{where} (kind '{kind}')")
 
 
 def read_defect(table: Mapping[str, Any], where: str) -> Defect:
-    """A defect from one `[[defect]]` table, whose `kind` names it. Raises InputError."""
+    """A defect from one `[[defect]]` table, whose `kind` names it.
+
+    Raises
+    ------
+    InputError
+    """
     if not isinstance(table, Mapping) or "kind" not in table:
         raise InputError(f"{where} lacks the key 'kind'; add kind = \"...\" with a kind of defect.")
     return make_defect(str(table["kind"]), where, **{k: v for k, v in table.items() if k != "kind"})

@@ -29,10 +29,24 @@ REMEMBERED = 20000  # changes of light
 class EmulatedHardware:
     """Panel board, laser board and camera around one simulated bench; key on, interlock closed.
 
-    bench : as `virtual.headset.open_headset` takes it
+    Parameters
+    ----------
+    bench : str
+        As `virtual.headset.open_headset` takes it.
 
-    Attributes: headset, board (of the panel), lasers (their board), faults (script of each part),
-    light ((time s, µW of all lasers) at each change), whole (CRC-32 of each pattern that the panel displayed).
+    Attributes
+    ----------
+    headset
+    board
+        Of the panel.
+    lasers
+        Their board.
+    faults
+        Script of each part.
+    light : deque[tuple[float, float]]
+        (time s, µW of all lasers) at each change.
+    whole : dict[int, int]
+        CRC-32 of each pattern that the panel displayed.
     """
 
     def __init__(self, bench: str, seed: int = 0) -> None:
@@ -61,7 +75,13 @@ class EmulatedHardware:
             time.sleep(TICK_S)
 
     def capture(self, exposure_ms: float) -> NDArray[np.uint16]:
-        """What the camera sees, uint16 counts [h, w]. Raises DeviceError as its faults say."""
+        """What the camera sees, uint16 counts [h, w].
+
+        Raises
+        ------
+        DeviceError
+            As its faults say.
+        """
         faults = self.faults["camera"]
         fault = faults.take("unplug", "hang", "timeout", "late", "garbage", "die")
         if fault == "unplug":
@@ -90,7 +110,14 @@ class EmulatedHardware:
 
     def set_to(self, name: str, value: Any) -> None:
         """Do something to the laser board: key or interlock (bool), celsius, photodiodes (False: cut), efficiency
-        (of every diode; 1: as calibrated). Raises InputError for another name."""
+
+        (of every diode; 1: as calibrated).
+
+        Raises
+        ------
+        InputError
+            For another name.
+        """
         if name in ("key", "interlock", "celsius"):
             setattr(self.lasers, name, value)
             return

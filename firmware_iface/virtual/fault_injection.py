@@ -32,10 +32,16 @@ KINDS = {
 class Faults:
     """The faults of one model. Safe to arm from one thread while another drives the model.
 
-    seed : fixes the random bytes of "garbage"
+    Parameters
+    ----------
+    seed : int
+        Fixes the random bytes of "garbage".
 
-    Attributes: late_s (how late a late answer is, s), struck and ended (Counters: how often each kind took
-    effect, and how often it was over, by count or cleared, after it had been due).
+    Attributes
+    ----------
+    late_s : s
+        How late a late answer is, s.
+    struck and ended (Counters: how often each kind took effect, and how often it was over, by count or cleared, after it had been due)
     """
 
     def __init__(self, seed: int = 0) -> None:
@@ -51,8 +57,15 @@ class Faults:
 
         "unplug" always lasts until it is cleared.
 
-        after : transfers to spare first
-        Raises InputError for an unknown kind or a number out of range.
+        Parameters
+        ----------
+        after : int
+            Transfers to spare first.
+
+        Raises
+        ------
+        InputError
+            For an unknown kind or a number out of range.
         """
         if kind not in KINDS:
             raise InputError(f"there is no fault '{kind}'; {nearest(kind, KINDS)}")

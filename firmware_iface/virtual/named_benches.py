@@ -65,7 +65,13 @@ def named_benches() -> list[str]:
 
 
 def named_bench(name: str) -> BenchDescription:
-    """The bench of this name; raises InputError that suggests the nearest."""
+    """The bench of this name.
+
+    Raises
+    ------
+    InputError
+        That suggests the nearest.
+    """
     benches = _benches()
     if name not in benches:
         raise InputError(f"there is no virtual bench '{name}'; {nearest(name, benches)}")

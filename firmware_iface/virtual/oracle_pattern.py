@@ -68,9 +68,18 @@ def descend(
 ) -> NDArray[np.uint8]:
     """Gray levels [H, W] whose irradiance on panel pixels is nearest to `target` in amplitude, up to scale.
 
-    target : irradiance wanted, [H, W], any unit
-    start : gray levels to better, in small steps; none: a smooth random phase at the image, in long ones
-    progress : called with the iteration and the loss
+    Parameters
+    ----------
+    target : float64 array
+        Irradiance wanted, [H, W], any unit.
+    start : float64 array or None
+        Gray levels to better, in small steps; none: a smooth random phase at the image, in long ones.
+    progress : callable or None
+        Called with the iteration and the loss.
+
+    Returns
+    -------
+    uint8 array [H, W]
     """
     drive = optics.drive(channel)
     gray = ideal_start(optics, target, channel, plane_mm, seed) if start is None else start.astype(np.float64)

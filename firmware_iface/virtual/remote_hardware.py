@@ -35,7 +35,10 @@ USB_FAILURES = {failure.__name__: failure for failure in (NoDevice, Nak, Stall)}
 class RemoteHardware:
     """A connection to emulated hardware; for one thread at a time, others wait.
 
-    Raises OSError where it is not there.
+    Raises
+    ------
+    OSError
+        Where it is not there.
     """
 
     def __init__(self, path: str) -> None:
@@ -144,7 +147,12 @@ class RemoteCamera:
         self.shape = (height, width)
 
     def capture(self) -> NDArray[np.uint16]:
-        """One picture, uint16 counts [h, w]. Raises DeviceError."""
+        """One picture, uint16 counts [h, w].
+
+        Raises
+        ------
+        DeviceError
+        """
         _, counts = self._remote.ask({"camera": "capture", "exposure_ms": self.exposure_ms})
         return np.frombuffer(counts, np.uint16).reshape(self.shape)
 
@@ -158,7 +166,13 @@ class RemoteCamera:
 
 
 def reach(bus: str) -> RemoteHardware:
-    """Connect to the hardware of `virtual:SOCKET`. Raises DeviceGoneError where there is none."""
+    """Connect to the hardware of `virtual:SOCKET`.
+
+    Raises
+    ------
+    DeviceGoneError
+        Where there is none.
+    """
     try:
         return RemoteHardware(bus.removeprefix(PREFIX))
     except OSError as error:
@@ -172,7 +186,10 @@ def reach(bus: str) -> RemoteHardware:
 def running(path: Path, bench: str, seed: int = 0, oak: str | None = None) -> Iterator[RemoteHardware]:
     """Emulated hardware in a process of its own, listening at `path`, while the block lasts.
 
-    oak : a loopback address to emulate an OAK camera at. Raises DeviceGoneError where it does not start.
+    Parameters
+    ----------
+    oak : str or None
+        A loopback address to emulate an OAK camera at. Raises DeviceGoneError where it does not start.
     """
     command = [
         sys.executable,
@@ -208,7 +225,12 @@ _backends: dict[
 
 
 def usb_backend(bus: str) -> VirtualUsb:
-    """A pyusb backend with the panel board of `virtual:SOCKET` on it. Raises DeviceGoneError."""
+    """A pyusb backend with the panel board of `virtual:SOCKET` on it.
+
+    Raises
+    ------
+    DeviceGoneError
+    """
     known = _backends.get(bus)
     if known is not None:
         try:

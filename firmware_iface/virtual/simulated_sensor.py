@@ -31,8 +31,12 @@ Complex = NDArray[np.complex64]
 class Integrator:
     """Camera pixels, and the picture that the eye would see on the panel's own grid.
 
-    samples : (sY, sX), shape of the irradiance samples
-    oversampling : s, samples a panel pixel
+    Parameters
+    ----------
+    samples : (int, int)
+        (sY, sX), shape of the irradiance samples.
+    oversampling : int
+        S, samples a panel pixel.
     """
 
     def __init__(self, bench: BenchDescription, samples: tuple[int, int], oversampling: int) -> None:
@@ -164,7 +168,14 @@ class Sensor:
     def electrons(self, irradiance: Array, dose: float) -> Array:
         """Mean electrons, [h, w], of irradiance on camera pixels.
 
-        dose : power as a share of full power, times exposure over 10 ms
+        Parameters
+        ----------
+        dose : float
+            Power as a share of full power, times exposure over 10 ms.
+
+        Returns
+        -------
+        float64 array [h, w]
         """
         d = self._convention
         if d and d.mirror_x:

@@ -28,7 +28,10 @@ from firmware_iface.virtual.simulated_sensor import Drift, Integrator, Sensor
 class VirtualPanel:
     """The phase panel. It shows gray 0 until told otherwise.
 
-    shape : (H, W), pixels
+    Parameters
+    ----------
+    shape : (int, int)
+        (H, W), pixels.
     """
 
     def __init__(self, shape: tuple[int, int]) -> None:
@@ -41,14 +44,23 @@ class VirtualPanel:
         return self._gray.copy()
 
     def show(self, gray: NDArray[np.generic]) -> None:
-        """Show gray levels, uint8 [H, W]; raises InputError for another type or size."""
+        """Show gray levels, uint8 [H, W].
+
+        Raises
+        ------
+        InputError
+            For another type or size.
+        """
         self._gray = checked_gray(gray, self.shape).copy()
 
 
 class VirtualLasers:
     """The lasers, all off at first.
 
-    channels : names
+    Parameters
+    ----------
+    channels : tuple of str
+        Names.
     """
 
     def __init__(self, channels: tuple[str, ...]) -> None:
@@ -56,7 +68,13 @@ class VirtualLasers:
         self._power = dict.fromkeys(channels, 0.0)
 
     def set_power(self, channel: str, fraction: float) -> None:
-        """Set a laser to a fraction of full power, 0 to 1; raises InputError where either is unknown."""
+        """Set a laser to a fraction of full power, 0 to 1.
+
+        Raises
+        ------
+        InputError
+            Where either is unknown.
+        """
         if channel not in self._power:
             raise InputError(f"there is no laser '{channel}'; use one of {', '.join(self.channels)}.")
         if not (isinstance(fraction, int | float | np.floating) and 0 <= fraction <= 1):
@@ -77,8 +95,12 @@ class VirtualLasers:
 class VirtualCamera:
     """The camera; 10 ms at first.
 
-    shape : (h, w), pixels
-    bit_depth : bits of a count
+    Parameters
+    ----------
+    shape : (int, int)
+        (h, w), pixels.
+    bit_depth : int
+        Bits of a count.
     """
 
     def __init__(
@@ -92,7 +114,13 @@ class VirtualCamera:
 
     @property
     def exposure_ms(self) -> float:
-        """Exposure time, ms; setting it raises InputError unless above 0 and at most 10 s."""
+        """Exposure time, ms.
+
+        Raises
+        ------
+        InputError
+            On setting, unless above 0 and at most 10 s.
+        """
         return self._exposure_ms
 
     @exposure_ms.setter
@@ -109,11 +137,24 @@ class VirtualCamera:
 class VirtualHeadset:
     """All devices of one headset and the simulated bench they stand on.
 
-    description : the bench
-    seed : fixes noise and drift; a capture's noise depends on the seed and on how many captures came before
+    Parameters
+    ----------
+    description : BenchDescription
+        The bench.
+    seed : int
+        Fixes noise and drift; a capture's noise depends on the seed and on how many captures came
+        before.
 
-    Attributes: panel, lasers, camera, plane_mm (where the camera focuses), time_s (clock; runs on with each
-    capture), captures (how many were taken). The focus is the bench's distance at first.
+    Attributes
+    ----------
+    panel
+    lasers
+    camera
+    plane_mm : mm
+        Where the camera focuses.
+    time_s : s
+        Clock; runs on with each capture.
+    captures (how many were taken). The focus is the bench's distance at first
     """
 
     def __init__(self, description: BenchDescription, seed: int = 0) -> None:
@@ -132,7 +173,13 @@ class VirtualHeadset:
         self._integrators: OrderedDict[tuple[int, int, int], Integrator] = OrderedDict()
 
     def move_to_plane(self, plane_mm: float) -> None:
-        """Focus the camera on another plane, mm from the panel; raises InputError unless within 2 m."""
+        """Focus the camera on another plane, mm from the panel.
+
+        Raises
+        ------
+        InputError
+            Unless within 2 m.
+        """
         self.plane_mm = checked_plane(plane_mm)
 
     def _capture(self) -> NDArray[np.uint16]:
@@ -162,7 +209,12 @@ class VirtualHeadset:
     ) -> NDArray[np.float64]:
         """Noise-free irradiance over panel-sized pixels, [H, W], before any fault of the camera.
 
-        A perfect panel under a uniform beam gives about 1. Raises InputError for a wrong size or channel.
+        A perfect panel under a uniform beam gives about 1.
+
+        Raises
+        ------
+        InputError
+            For a wrong size or channel.
         """
         gray, plane = checked_gray(gray, self.panel.shape), self._plane(plane_mm)
         return (
@@ -182,9 +234,18 @@ class VirtualHeadset:
     ) -> Gray:
         """The best pattern, uint8 [H, W], by someone who knows the true bench. For tests and demonstrations.
 
-        target_irradiance : [H, W], any unit, not negative
-        start : gray levels to start from; none: a smooth random phase at the image
-        progress : called with the iteration and the loss
+        Parameters
+        ----------
+        target_irradiance : float array [H, W]
+            Any unit, not negative.
+        start : array or None
+            Gray levels to start from; none: a smooth random phase at the image.
+        progress : callable or None
+            Called with the iteration and the loss.
+
+        Returns
+        -------
+        uint8 array [H, W]
         """
         target = np.asarray(target_irradiance, np.float64)
         if (
@@ -235,7 +296,13 @@ class VirtualHeadset:
 
 
 def checked_plane(plane_mm: float) -> float:
-    """A plane in mm; raises InputError unless it is a finite number within 2 m."""
+    """A plane in mm.
+
+    Raises
+    ------
+    InputError
+        Unless it is a finite number within 2 m.
+    """
     number = isinstance(plane_mm, int | float | np.floating | np.integer) and not isinstance(plane_mm, bool)
     if not number or not math.isfinite(plane_mm) or abs(plane_mm) > 2000:
         raise InputError(f"plane {plane_mm!r} mm is out of range; give a number from -2000 to 2000.")
@@ -243,5 +310,10 @@ def checked_plane(plane_mm: float) -> float:
 
 
 def open_headset(spec: str, seed: int = 0) -> VirtualHeadset:
-    """Open the virtual headset of `virtual:NAME` or of a bench's TOML file. Raises InputError."""
+    """Open the virtual headset of `virtual:NAME` or of a bench's TOML file.
+
+    Raises
+    ------
+    InputError
+    """
     return VirtualHeadset(load_bench(spec), seed)

@@ -15,10 +15,17 @@ PAIRS = ((0, 1), (0, 3), (1, 3), (2, 3))
 class Ads1115(WordRegisters):
     """The converter.
 
-    clock : seconds
-    volts : voltage at input 0 to 3
+    Parameters
+    ----------
+    clock : callable
+        Seconds.
+    volts : callable, V
+        Voltage at input 0 to 3.
 
-    Attributes: alert (whether the ALERT pin is asserted).
+    Attributes
+    ----------
+    alert
+        Whether the ALERT pin is asserted.
     """
 
     def __init__(self, clock: Callable[[], float], volts: Callable[[int], float]) -> None:

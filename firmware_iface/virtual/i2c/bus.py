@@ -30,10 +30,20 @@ class Part(Protocol):
     """What a model offers the bus."""
 
     def write(self, data: bytes) -> None:
-        """Take the bytes of one write message; raises NackError."""
+        """Take the bytes of one write message.
+
+        Raises
+        ------
+        NackError
+        """
 
     def read(self, length: int) -> bytes:
-        """The bytes of one read message; raises NackError."""
+        """The bytes of one read message.
+
+        Raises
+        ------
+        NackError
+        """
 
     def stop(self) -> None:
         """The transfer is over (STOP on the wires)."""
@@ -43,7 +53,13 @@ class Transferring(Protocol):
     """Anything that carries transfers: this bus, or the far end of a socket."""
 
     def transfer(self, messages: Sequence[Message]) -> list[bytes]:
-        """Carry the messages between one START and one STOP; the bytes read. Raises OSError as an adapter."""
+        """Carry the messages between one START and one STOP; the bytes read.
+
+        Raises
+        ------
+        OSError
+            As an adapter.
+        """
 
 
 def failure(number: int) -> OSError:
@@ -54,10 +70,19 @@ def failure(number: int) -> OSError:
 class I2cBus:
     """Parts at their addresses, with faults and a transcript.
 
-    settle : called before and after every transfer, so that the rest of the board follows the bus
-    faults : script that every transfer asks; a fault hits the whole transfer
+    Parameters
+    ----------
+    settle : callable
+        Called before and after every transfer, so that the rest of the board follows the bus.
+    faults : Faults or None
+        Script that every transfer asks; a fault hits the whole transfer.
 
-    Attributes: parts (by address), transcript (every byte that went over the wires since `record` was set).
+    Attributes
+    ----------
+    parts : dict[int, Part]
+        By address.
+    transcript : list of str
+        Every byte that went over the wires since `record` was set.
     """
 
     ADAPTER_TIMEOUT_S = 0.02
@@ -72,7 +97,13 @@ class I2cBus:
         self.lock = threading.RLock()  # whoever touches the parts from outside the bus takes it too
 
     def transfer(self, messages: Sequence[Message]) -> list[bytes]:
-        """Carry the messages between one START and one STOP; the bytes read. Raises OSError as an adapter."""
+        """Carry the messages between one START and one STOP; the bytes read.
+
+        Raises
+        ------
+        OSError
+            As an adapter.
+        """
         self._settle()
         kinds = ("unplug", "nack", "timeout", "stall", "hang", "late", "short_write", "garbage", "die")
         fault = self.faults.take(*kinds)

@@ -27,8 +27,12 @@ KEY_PIN, INTERLOCK_PIN, ALERT_PIN = 4, 5, 6
 class Diode:
     """One laser: what it emits at the exit pupil, and what its photodiode makes of that.
 
-    offset_ma : what the set-point knob of its controller adds; should be 0
-    efficiency : a factor on what it emits, for ageing and faults
+    Attributes
+    ----------
+    offset_ma : float, mA
+        What the set-point knob of its controller adds; should be 0.
+    efficiency : float
+        A factor on what it emits, for ageing and faults.
     """
 
     name: str
@@ -55,11 +59,26 @@ def diodes() -> list[Diode]:
 class LaserBoard:
     """The board, powered on: dark.
 
-    clock : seconds; tests give their own
-    emission : told (time s, {laser: µW}) whenever the light changes
-    faults : script of the bus
+    Parameters
+    ----------
+    clock : callable
+        Seconds; tests give their own.
+    emission : callable
+        Told (time s, {laser: µW}) whenever the light changes.
+    faults : Faults or None
+        Script of the bus.
 
-    Attributes: bus, dac, expander, converter, thermometer, controller (the models), diodes, celsius.
+    Attributes
+    ----------
+    bus
+    dac
+    expander
+    converter
+    thermometer
+    controller
+        The models.
+    diodes
+    celsius : float, °C
     """
 
     def __init__(

@@ -11,7 +11,10 @@ COUNT = 11
 class Mcp23008:
     """The expander.
 
-    outside : levels that the board puts on the pins, bit by bit
+    Parameters
+    ----------
+    outside : callable
+        Levels that the board puts on the pins, bit by bit.
     """
 
     def __init__(self, outside: Callable[[], int]) -> None:

@@ -42,8 +42,12 @@ class Setting:
 class Mcp4728:
     """Channels A to D.
 
-    clock : seconds, for the EEPROM's write time
-    eeprom : settings at power-on; none: as written dark
+    Parameters
+    ----------
+    clock : callable
+        Seconds, for the EEPROM's write time.
+    eeprom : list of Setting or None
+        Settings at power-on; none: as written dark.
     """
 
     def __init__(self, clock: Callable[[], float], eeprom: list[Setting] | None = None) -> None:

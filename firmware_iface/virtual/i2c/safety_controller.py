@@ -53,11 +53,22 @@ class Wiring(Protocol):
 class SafetyController:
     """Gate, limiter and latch.
 
-    clock : seconds
-    wiring : the board
-    built_for : (highest drive ceiling, highest photodiode ceiling, threshold) of each laser, 0.1 mV
+    Parameters
+    ----------
+    clock : callable
+        Seconds.
+    wiring : Wiring
+        The board.
+    built_for : tuple of (int, int, int)
+        (highest drive ceiling, highest photodiode ceiling, threshold) of each laser, 0.1 mV.
 
-    Attributes: faults (latched), armed, ceilings ((drive, photodiode) for each laser; None: not written).
+    Attributes
+    ----------
+    faults
+        Latched.
+    armed
+    ceilings : list of list of int or None
+        (drive, photodiode) for each laser; None: not written.
     """
 
     def __init__(

@@ -16,8 +16,16 @@ BITS = 10
 def expose_bench(capture: Callable[[float], NDArray[np.uint16]], camera: CameraDescription) -> Expose:
     """What the emulated sensor reads where the bench's camera stands.
 
-    capture : a picture of the bench's camera, counts [h, w], at unit gain and the exposure given in ms
-    camera : that camera; its counts are brought to 10 bits, and gain acts above its black level
+    Parameters
+    ----------
+    capture : callable
+        A picture of the bench's camera, counts [h, w], at unit gain and the exposure given in ms.
+    camera : CameraDescription
+        That camera; its counts are brought to 10 bits, and gain acts above its black level.
+
+    Returns
+    -------
+    callable
     """
     to_ten_bits = 2.0 ** (BITS - camera.bit_depth)
 

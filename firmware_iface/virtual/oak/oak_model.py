@@ -39,16 +39,29 @@ _MANUAL_EXPOSURE = 6  # bit of a control's command mask
 class OakModel:
     """The camera; frames run from when a host has started a pipeline until it goes.
 
-    expose : given exposure in ms and gain, one picture, 10-bit counts uint16 [h, w] with w a multiple of 4;
-        called when an exposure begins
-    shape : (h, w), pixels
-    address : loopback address, so that several can run side by side
-    frames_per_s : rate, unless the exposure is longer
-    faults : asked for each frame (hang, timeout: not sent; late; garbage, short_write: malformed, which
-        ends the stream in the host) and each remote call (stall: refused); "unplug" drops the link and
-        lets nobody in
+    Parameters
+    ----------
+    expose : callable
+        Given exposure in ms and gain, one picture, 10-bit counts uint16 [h, w] with w a multiple of 4;
+        called when an exposure begins.
+    shape : (int, int)
+        (h, w), pixels.
+    address : str
+        Loopback address, so that several can run side by side.
+    frames_per_s : float, s
+        Rate, unless the exposure is longer.
+    faults : Faults or None
+        Asked for each frame (hang, timeout: not sent; late; garbage, short_write: malformed, which ends
+        the stream in the host) and each remote call (stall: refused); "unplug" drops the link and lets
+        nobody in.
 
-    Attributes: exposure_ms and gain (as the host set them), frames (how many were sent).
+    Attributes
+    ----------
+    exposure_ms : ms
+    gain
+        As the host set them.
+    frames
+        How many were sent.
     """
 
     def __init__(

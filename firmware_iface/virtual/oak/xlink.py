@@ -31,8 +31,12 @@ class LinkDown(ConnectionError):
 class Link:
     """One host's connection.
 
-    connection : the accepted socket
-    on_stream : called with (this link, name, stream id) for each stream that the host opens
+    Parameters
+    ----------
+    connection : socket.socket
+        The accepted socket.
+    on_stream : callable
+        Called with (this link, name, stream id) for each stream that the host opens.
     """
 
     def __init__(self, connection: socket.socket, on_stream: Callable[[Link, str, int], None]) -> None:

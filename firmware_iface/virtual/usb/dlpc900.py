@@ -48,12 +48,26 @@ class PatternEntry:
 class Dlpc900Model(UsbModel):
     """The controller and its mirrors.
 
-    memory_shape : (rows, columns) of memory bits; four of them, 2 x 2, are one mirror
-    electrodes : which bit of a mirror's value lies top left, top right, bottom left, bottom right
-    controllers : 2 where a second one holds the right half
+    Parameters
+    ----------
+    memory_shape : (int, int)
+        (rows, columns) of memory bits; four of them, 2 x 2, are one mirror.
+    electrodes : (int, int, int, int)
+        Which bit of a mirror's value lies top left, top right, bottom left, bottom right.
+    controllers : int
+        2 where a second one holds the right half.
 
-    Attributes: video (gives what is on the display link, uint32 [rows, columns] of 24 bits, or None for no
-    signal); gray, shape; power, mode, running, entries, images (as loaded), commands (their count).
+    Attributes
+    ----------
+    video (gives what is on the display link, uint32 [rows, columns] of 24 bits, or None for no signal); gray
+    shape; power
+    mode
+    running
+    entries : dict[int, PatternEntry]
+    images : dict[tuple[int, int], NDArray[np.uint32]]
+        As loaded.
+    commands
+        Their count.
     """
 
     def __init__(

@@ -39,13 +39,24 @@ def _sealed(body: bytes) -> bytes:
 class BoardModel(UsbModel):
     """The board and the panel behind it.
 
-    shape : (H, W), pixels
-    serial : serial number
-    faults : see UsbModel
-    clock : seconds, rising
+    Parameters
+    ----------
+    shape : (int, int)
+        (H, W), pixels.
+    serial : str
+        Serial number.
+    faults : Faults or None
+        See UsbModel.
+    clock : callable
+        Seconds, rising.
 
-    Attributes: gray (what the panel shows now), shown (sequence and CRC-32 of the frames displayed, the
-    newest last, up to 4096), fault_bits and temperature_c (what STATUS reports).
+    Attributes
+    ----------
+    gray : uint8 array
+        What the panel shows now.
+    shown : deque[tuple[int, int]]
+        Sequence and CRC-32 of the frames displayed, the newest last, up to 4096.
+    fault_bits and temperature_c (what STATUS reports)
     """
 
     def __init__(

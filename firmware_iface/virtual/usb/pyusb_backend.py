@@ -56,7 +56,10 @@ class _Handle:
 class VirtualUsb:
     """A pyusb backend on which the given models are plugged in; its methods are those of usb.backend.IBackend.
 
-    models : UsbModel, any number; more may be added to the attribute `models`
+    Parameters
+    ----------
+    models : UsbModel
+        UsbModel, any number; more may be added to the attribute `models`.
     """
 
     def __init__(self, *models: UsbModel) -> None:

@@ -58,11 +58,20 @@ def endpoint_descriptor(address: int, kind: int, packet: int, interval: int = 0)
 class UsbModel:
     """What every modelled USB device does; thread safe.
 
-    descriptor, configuration : raw descriptors
-    strings : by index from 1
-    faults : the script that each transfer asks: unplug, hang, timeout, late, stall, garbage, short_write
+    Parameters
+    ----------
+    descriptor, configuration : bytes
+        Raw descriptors.
+    strings : tuple of str
+        By index from 1.
+    faults : Faults or None
+        The script that each transfer asks: unplug, hang, timeout, late, stall, garbage, short_write.
 
-    Attributes: generation (counts how often it was plugged in; old handles are dead), configured.
+    Attributes
+    ----------
+    generation
+        Counts how often it was plugged in; old handles are dead.
+    configured
     """
 
     def __init__(
