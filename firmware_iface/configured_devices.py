@@ -1,4 +1,4 @@
-"""The devices that a configuration names, opened: one table each, one function each.
+"""Open the devices that a configuration names: one table and one function for each.
 
 [panel]                       a panel board over USB (firmware_iface/panel/PROTOCOL.md)
 kind = "board"                or "dlpc900", TI's phase light modulator, or "mirrored", a panel that is a screen, or
@@ -50,7 +50,7 @@ KINDS = {"panel": ("board", "dlpc900", "mirrored"), "camera": ("oak", "virtual")
 
 @dataclass(frozen=True)
 class PanelTable:
-    """[panel]"""
+    """Keys of [panel]."""
 
     kind: str = parameter("board", "which panel")
     bus: str = parameter("usb", "usb, or virtual:SOCKET")
@@ -65,7 +65,7 @@ class PanelTable:
 
 @dataclass(frozen=True)
 class LasersTable:
-    """[lasers] without power and channel."""
+    """Keys of [lasers] except power and channel."""
 
     bus: str = parameter(about="/dev/i2c-N, or virtual:SOCKET")
     mrad_per_pixel: float = parameter(
@@ -75,7 +75,7 @@ class LasersTable:
 
 @dataclass(frozen=True)
 class CameraTable:
-    """[camera]"""
+    """Keys of [camera]."""
 
     kind: str = parameter("oak", "which camera")
     bus: str = parameter("", "virtual:SOCKET")
@@ -90,32 +90,36 @@ def open_panel(table: Table) -> Any:
     Raises
     ------
     InputError
+        Where the table is wrong.
     DeviceError
+        Where the panel cannot be opened.
     """
     from firmware_iface.panel import open_board, open_dlpc900, open_mirrored
     from firmware_iface.panel.panel_board_messages import Timing
     from firmware_iface.panel.phase_light_modulator import P47, P67
 
-    asked = _panel_table(table)
-    if asked.kind not in KINDS["panel"]:
-        return open_own(asked.kind, "panel")
-    if asked.kind == "mirrored":
-        return open_mirrored(max(0, asked.display), (asked.height, asked.width))
-    if asked.kind == "dlpc900":
+    settings = _panel_table(table)
+    if settings.kind not in KINDS["panel"]:
+        return open_own(settings.kind, "panel")
+    if settings.kind == "mirrored":
+        return open_mirrored(max(0, settings.display), (settings.height, settings.width))
+    if settings.kind == "dlpc900":
         return open_dlpc900(
-            None if asked.display < 0 else asked.display,
-            modulator={"p47": P47, "p67": P67}[asked.modulator],
-            serial=asked.serial or None,
-            timeout_s=asked.timeout_ms / 1000,
+            None if settings.display < 0 else settings.display,
+            modulator={"p47": P47, "p67": P67}[settings.modulator],
+            serial=settings.serial or None,
+            timeout_s=settings.timeout_ms / 1000,
         )
-    period_us = round(1e6 / asked.refresh_hz)
+    period_us = round(1e6 / settings.refresh_hz)
     timing = Timing(period_us, light_delay_us=period_us // 4, light_width_us=period_us // 2)
     backend = None
-    if asked.bus.startswith("virtual:"):
+    if settings.bus.startswith("virtual:"):
         from firmware_iface.virtual.remote_hardware import usb_backend
 
-        backend = usb_backend(asked.bus)
-    return open_board(asked.serial or None, backend=backend, timing=timing, timeout_s=asked.timeout_ms / 1000)
+        backend = usb_backend(settings.bus)
+    return open_board(
+        settings.serial or None, backend=backend, timing=timing, timeout_s=settings.timeout_ms / 1000
+    )
 
 
 def open_lasers(table: Table) -> Any:
@@ -124,13 +128,15 @@ def open_lasers(table: Table) -> Any:
     Raises
     ------
     InputError
+        Where the table is wrong.
     DeviceError
+        Where the board cannot be opened.
     """
     from firmware_iface.lasers import open_lasers as open_board
     from firmware_iface.virtual.remote_hardware import i2c_bus
 
-    asked = _lasers_table(table)
-    bus = i2c_bus(asked.bus) if asked.bus.startswith("virtual:") else asked.bus
+    settings = _lasers_table(table)
+    bus = i2c_bus(settings.bus) if settings.bus.startswith("virtual:") else settings.bus
     return open_board(bus, laser_channels(table))
 
 
@@ -140,25 +146,27 @@ def open_camera(table: Table) -> Any:
     Raises
     ------
     InputError
+        Where the table is wrong.
     DeviceError
+        Where the camera cannot be opened.
     """
-    asked = _camera_table(table)
-    if asked.kind not in KINDS["camera"]:
-        return open_own(asked.kind, "camera", exposure_ms=asked.exposure_ms)
-    if asked.kind == "oak":
+    settings = _camera_table(table)
+    if settings.kind not in KINDS["camera"]:
+        return open_own(settings.kind, "camera", exposure_ms=settings.exposure_ms)
+    if settings.kind == "oak":
         from firmware_iface.camera import open_oak
 
         return open_oak(
-            asked.address,
-            frames_per_s=asked.frames_per_s,
-            exposure_ms=asked.exposure_ms,
+            settings.address,
+            frames_per_s=settings.frames_per_s,
+            exposure_ms=settings.exposure_ms,
             timeout_s=1.0,
             starved_s=0.5,
         )
     from firmware_iface.virtual.remote_hardware import RemoteCamera, reach
 
-    camera = RemoteCamera(reach(asked.bus))
-    camera.exposure_ms = asked.exposure_ms
+    camera = RemoteCamera(reach(settings.bus))
+    camera.exposure_ms = settings.exposure_ms
     return camera
 
 
@@ -168,6 +176,7 @@ def check_tables(tables: Mapping[str, Table]) -> None:
     Raises
     ------
     InputError
+        Where a table is wrong, or the power exceeds the Class 1 budget.
     """
     if "panel" in tables:
         _panel_table(tables["panel"])
@@ -178,9 +187,9 @@ def check_tables(tables: Mapping[str, Table]) -> None:
 
 
 def _panel_table(table: Table) -> PanelTable:
-    asked = read_table(PanelTable, table, "[panel]")
-    check_kind(asked.kind, "panel", KINDS["panel"])
-    return asked
+    settings = read_table(PanelTable, table, "[panel]")
+    check_kind(settings.kind, "panel", KINDS["panel"])
+    return settings
 
 
 def _lasers_table(table: Table) -> LasersTable:
@@ -188,13 +197,13 @@ def _lasers_table(table: Table) -> LasersTable:
 
 
 def _camera_table(table: Table) -> CameraTable:
-    asked = read_table(CameraTable, table, "[camera]")
-    check_kind(asked.kind, "camera", KINDS["camera"])
-    return asked
+    settings = read_table(CameraTable, table, "[camera]")
+    check_kind(settings.kind, "camera", KINDS["camera"])
+    return settings
 
 
 def _check_budget(table: Table) -> None:
-    """Without a prediction, all light counts as one spot, and must be within the budget as it is."""
+    """Check the power: without a prediction, all light counts as one spot."""
     power, lasers = laser_power(table), {laser.name: laser for laser in laser_channels(table)}
     if mrad_per_pixel(table):
         return
@@ -210,7 +219,7 @@ def _check_budget(table: Table) -> None:
 
 
 def mrad_per_pixel(table: Table) -> float:
-    """The angle of a pixel at the eye, for the prediction of bright spots; 0: none is to be made."""
+    """The angle of a pixel at the eye, mrad, for the prediction of bright spots; 0: no prediction."""
     return _lasers_table(table).mrad_per_pixel
 
 
@@ -220,6 +229,7 @@ def laser_channels(table: Table) -> Sequence[LaserChannel]:
     Raises
     ------
     InputError
+        Where there is none, or a value is out of range.
     """
     given = table.get("channel", [])
     if not given and str(table.get("bus")).startswith("virtual:"):
@@ -235,6 +245,7 @@ def laser_power(table: Table) -> dict[str, float]:
     Raises
     ------
     InputError
+        Where none is given, a channel is unknown or a value is no fraction.
     """
     power = table.get("power")
     if not isinstance(power, Mapping) or not power:

@@ -16,9 +16,9 @@ def nearest(word: str, known: Iterable[str]) -> str:
     Parameters
     ----------
     word : str
-        What was written.
-    known : sequence of str
-        Iterable of str, what could have been written.
+        As it was written.
+    known : iterable of str
+        What could have been written.
 
     Returns
     -------

@@ -41,17 +41,21 @@ def check_kind(kind: str, part: str, known: Collection[str]) -> None:
 
 
 def open_own(kind: str, part: str, **settings: Any) -> Any:
-    """What the function of kind = "MODULE:FUNCTION" returns; modules of the current folder are found, too.
+    """Open a device by calling the lab's function.
 
     Parameters
     ----------
+    kind : str
+        "MODULE:FUNCTION"; modules of the current folder are found, too.
     part : str
-        "panel" or "camera", which say what it has to have (see NEEDED). settings : attributes that are
-        set then.
+        "panel" or "camera": which attributes the device needs (see NEEDED).
+    **settings
+        Attributes of the device that are set after opening.
 
     Returns
     -------
     object
+        What the function returned.
 
     Raises
     ------
@@ -72,7 +76,7 @@ def open_own(kind: str, part: str, **settings: Any) -> Any:
             setattr(device, name, value)
     except (InputError, DeviceError):
         raise
-    except Exception as error:  # vendors' libraries raise what they like
+    except Exception as error:  # vendors' libraries raise any exception
         raise DeviceError(
             f"the {part} of {kind} cannot be opened: {str(error) or type(error).__name__}."
         ) from error
@@ -85,7 +89,7 @@ def _imported(kind: str, part: str) -> Callable[[], Any]:
     sys.path.insert(0, here)
     try:
         function = getattr(importlib.import_module(module), name)
-    except Exception as error:  # whatever the lab's module does when it is read
+    except Exception as error:  # the lab's module may raise any exception when it is imported
         raise InputError(
             f"'kind' in [{part}] is {kind!r}, which cannot be imported ({error}): install the module, or start "
             "where its file is."

@@ -22,7 +22,19 @@ def parameter(
     high: float = math.inf,
     choices: tuple[Any, ...] = (),
 ) -> Any:
-    """A dataclass field with a meaning and a range (`low` and `high` inclusive, or one of `choices`)."""
+    """A dataclass field with a meaning and a range.
+
+    Parameters
+    ----------
+    default : object
+        Without it, the key is required.
+    about : str
+        What the value means, for messages.
+    low, high : float
+        Range, inclusive.
+    choices : tuple
+        Where given, the only values allowed.
+    """
     metadata = {"about": about, "low": low, "high": high, "choices": choices}
     if default is dataclasses.MISSING:
         return dataclasses.field(metadata=metadata)
@@ -32,13 +44,12 @@ def parameter(
 def read_table(cls: type[T], table: Mapping[str, Any], where: str, ignore: tuple[str, ...] = ()) -> T:
     """Build `cls` from a TOML table.
 
-    cls : dataclass type whose fields were made with `parameter`
-    Raises InputError for an unknown or missing key, a wrong type, or a value out of range.
-
     Parameters
     ----------
+    cls : type
+        A dataclass whose fields were made with `parameter`.
     table : mapping
-        Mapping read from TOML.
+        As read from TOML.
     where : str
         How to name the table in an error, for example "[panel] of bench.toml".
     ignore : tuple of str
@@ -46,7 +57,12 @@ def read_table(cls: type[T], table: Mapping[str, Any], where: str, ignore: tuple
 
     Returns
     -------
-    T
+    cls
+
+    Raises
+    ------
+    InputError
+        For an unknown or missing key, a wrong type, or a value out of range.
     """
     fields = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
     if not isinstance(table, Mapping):

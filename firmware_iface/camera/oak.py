@@ -140,7 +140,11 @@ class OakCamera:
 
     def status(self) -> dict[str, Any]:
         """What the camera's process reports, and its losses so far."""
-        return self._keeper.status() | {"exposure_ms": self.exposure_ms, "gain": self.gain}
+        return self._keeper.status() | {
+            "exposure_ms": self.exposure_ms,
+            "gain": self.gain,
+            "pid": self.pid,
+        }
 
     def close(self) -> None:
         """End the camera's process."""
@@ -194,13 +198,20 @@ def open_oak(
     Parameters
     ----------
     address : str
-        Its IP address, MX ID or USB path; empty: the first that is found.
+        IP address, MX ID or USB path; empty: the first that is found.
     encoding : str
         "raw10" (the sensor's own 10 bits, its own size) or "gray8" (`shape`, 8 bits).
+    shape : (int, int), pixels
+        (h, w) for "gray8".
+    frames_per_s : float
+    exposure_ms : float, ms
+        0.001 to one frame's time.
+    gain : float
+        1 to 16.
     timeout_s : float, s
         Longest wait for a picture, restarts of the process included.
     starved_s : float, s
-        Without frames for so long, the link is taken for dead.
+        After so long without frames, the link is taken as lost.
     start_s : float, s
         Longest wait for the first picture.
 
@@ -212,6 +223,8 @@ def open_oak(
     ------
     InputError
         For settings out of range.
+    DeviceError
+        Where depthai is not installed.
     DeviceGoneError
         Where no picture comes.
     """

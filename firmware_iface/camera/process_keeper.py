@@ -81,7 +81,6 @@ class ProcessKeeper:
                 "restarts": self.restarts,
                 "frames": self.frames,
                 "frame_age_ms": age_ms,
-                "pid": self.pid,
             }
 
     def set_exposure(self, exposure_us: int, iso: int) -> None:

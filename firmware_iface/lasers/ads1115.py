@@ -1,8 +1,8 @@
 """ADS1115: the converter that reads the photodiodes, and whose latching comparator trips on too much light.
 
 It converts without pause, one photodiode at a time, ±2.048 V, 860 a second. Every photodiode's amplifier gives 1 V
-at its laser's full power, so that one threshold serves all. Reading a conversion releases the comparator's latch; the
-safety controller keeps its own.
+at its laser's full power, so that one threshold is enough for all. Reading a conversion releases the comparator's
+latch; the safety controller keeps its own.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Ads1115:
         return self._read(HIGH) * VOLTS_PER_COUNT
 
     def select(self, pin: int) -> None:
-        """Convert input 0 to 3 from now on; its first value is there after 1.3 ms."""
+        """Convert input 0 to 3 from now on; its first value is ready after 1.3 ms."""
         self._write(CONFIG, CONFIGURATION | SINGLE_ENDED | pin << 12)
 
     def volts(self) -> float:

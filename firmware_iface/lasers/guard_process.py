@@ -23,18 +23,26 @@ LEASE_S = 0.100
 
 
 class Guard:
-    """The guard's side: one client on a connected SOCK_SEQPACKET socket, each request one JSON packet."""
+    """The server of one client.
+
+    Parameters
+    ----------
+    client : socket
+        A connected SOCK_SEQPACKET socket; each request is one JSON packet.
+    """
 
     def __init__(self, client: socket.socket) -> None:
         self._client = client
         self._lasers: Lasers | None = None
         self._armed = False
         self._ramp: Iterator[None] | None = None
-        self._failure: str | None = None  # what went wrong between requests; told until it is armed again
-        self._heard_at = self._acted_at = time.monotonic()
+        self._failure: str | None = (
+            None  # a failure between requests; reported until the lasers are armed again
+        )
+        self._request_at = self._acted_at = time.monotonic()
 
     def run(self) -> None:
-        """Serve until the client is gone. The lasers are dark when this returns or raises."""
+        """Serve until the client ends. The lasers are dark when this returns or raises."""
         try:
             while True:
                 due = self._acted_at + (STEP_S if self._ramp else TICK_S)
@@ -43,7 +51,7 @@ class Guard:
                     packet = self._client.recv(PACKET)
                     if not packet:
                         return
-                    self._heard_at = time.monotonic()
+                    self._request_at = time.monotonic()
                     self._client.send(json.dumps(self._answer(packet)).encode())
                 if time.monotonic() >= due:
                     self._act()
@@ -54,11 +62,11 @@ class Guard:
                 self._lasers.close()
 
     def _act(self) -> None:
-        """What is due between requests: a step of the ramp, the heartbeat, or darkness."""
+        """Do what is due between requests: a step of the ramp, the heartbeat, or switching off."""
         self._acted_at = time.monotonic()
         if not (self._armed and self._lasers):
             return
-        if self._acted_at - self._heard_at > LEASE_S:
+        if self._acted_at - self._request_at > LEASE_S:
             self._stop("the program that drives the lasers was silent for 100 ms, so they were switched off")
             return
         try:
@@ -75,7 +83,7 @@ class Guard:
             self._lasers.trip()
 
     def _answer(self, packet: bytes) -> dict[str, Any]:
-        """What one request gives; never raises."""
+        """Answer one request; never raises."""
         try:
             request = json.loads(packet)
             act, given = request["do"], request["with"]
@@ -116,7 +124,7 @@ class Guard:
         self._armed, self._failure, self._acted_at = True, None, time.monotonic()
 
     def _set_power(self, channel: str, fraction: float) -> None:
-        """Begin to go there; the steps follow in `_act`."""
+        """Begin a ramp; its steps follow in `_act`."""
         assert self._lasers is not None
         self._step(self._lasers.ramp(channel, fraction))
 
@@ -133,9 +141,9 @@ class Guard:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Serve the client on the open file descriptor that is named."""
+    """Serve the client on the open file descriptor given as argument."""
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, lambda *_: sys.exit(0))  # by way of `finally`, which goes dark
+        signal.signal(number, lambda *_: sys.exit(0))  # through `finally`, which goes dark
     with socket.socket(fileno=int(arguments[0])) as client:
         Guard(client).run()
     return 0

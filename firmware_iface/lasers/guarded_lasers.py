@@ -1,12 +1,13 @@
-"""The lasers in a small process of their own, so that every way for the rest to die ends dark.
+"""The lasers in a guard process of their own, which is dark after any failure of the program that uses them.
 
 with open_guarded_lasers("/dev/i2c-1", CHANNELS) as lasers:     # the interface of Lasers
     lasers.arm()
     lasers.heartbeat()                                          # from the loop that must be alive
 
-The guard owns the bus and writes the board's heartbeat every 20 ms; nothing heavy runs beside it. It goes dark
+The guard (`guard_process`) owns the bus and writes the board's heartbeat every 20 ms, and does little else. It
+goes dark
 - at once, when the process that opened it ends in any way (its end of the socket closes), or on a signal;
-- when that process says nothing for 100 ms while the board is armed: hanging, stopped, or a loop that got stuck;
+- when that process sends nothing for 100 ms while the board is armed: it hangs, was stopped, or its loop is stuck;
 - by the safety controller's dead-man 100 ms later at most, when the guard itself is killed or hangs.
 """
 
@@ -35,9 +36,21 @@ PACKET = 65536
 
 
 class GuardedLasers:
-    """The client's side: the interface of `Lasers`, with the bus in a guard process. Safe to use from several threads.
+    """The interface of `Lasers`, with the bus in a guard process. Safe to use from several threads.
 
-    Raises as `Lasers` does, and DeviceGoneError (a DeviceError; the lasers are dark) once the guard is gone.
+    Parameters
+    ----------
+    bus : str
+        See `i2c_transfers.open_bus`.
+    channels : sequence of LaserChannel
+        One to three, in the order of the DAC's outputs.
+
+    Raises
+    ------
+    InputError, DeviceError
+        As `Lasers` does.
+    DeviceGoneError
+        From every method, once the guard has ended; the lasers are dark then.
     """
 
     def __init__(self, bus: str, channels: Sequence[LaserChannel]) -> None:
@@ -71,7 +84,7 @@ class GuardedLasers:
         return float(self._ask("power", channel))
 
     def off(self) -> None:
-        """As `Lasers.off`; where the guard is gone, its end has made it dark."""
+        """As `Lasers.off`; where the guard has ended, the lasers are dark already."""
         try:
             self._ask("off")
         except DeviceGoneError:
@@ -86,7 +99,7 @@ class GuardedLasers:
         self._ask("arm")
 
     def heartbeat(self) -> None:
-        """Say that the caller is alive.
+        """Tell the guard that the caller is alive.
 
         Raises
         ------
@@ -105,9 +118,10 @@ class GuardedLasers:
 
     @contextmanager
     def beating(self) -> Iterator[None]:
-        """A thread sends the heartbeat meanwhile, for programs without a loop of their own.
+        """Send the heartbeat from a thread during the block, for programs without a loop of their own.
 
-        It shows that the interpreter runs, not that the program gets on: a service calls `heartbeat` from its loop.
+        It shows that the interpreter runs, not that the program makes progress: a service calls `heartbeat` from its
+        loop.
         """
         ended = threading.Event()
 
@@ -116,7 +130,7 @@ class GuardedLasers:
                 try:
                     self.heartbeat()
                 except DeviceError:
-                    return  # dark; whoever uses the lasers next is told
+                    return  # dark; the next use of the lasers raises
 
         thread = threading.Thread(target=beat, daemon=True)
         thread.start()
@@ -166,11 +180,23 @@ class GuardedLasers:
 
 
 def open_guarded_lasers(bus: str, channels: Sequence[LaserChannel]) -> GuardedLasers:
-    """Open the lasers on a bus (see wire.open_bus) in a guard process.
+    """Open the lasers on a bus in a guard process.
+
+    Parameters
+    ----------
+    bus : str
+        See `i2c_transfers.open_bus`.
+    channels : sequence of LaserChannel
+
+    Returns
+    -------
+    GuardedLasers
 
     Raises
     ------
     InputError
+        Where the bus cannot be opened or the channels do not fit the board.
     DeviceError
+        Where a part of the board fails.
     """
     return GuardedLasers(bus, channels)

@@ -1,4 +1,4 @@
-"""The one way to the bus: plain I2C messages through smbus2. Every driver of a part uses these three functions."""
+"""I2C transfers through smbus2: open a bus, write, read. Every driver of a part uses these functions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,16 @@ if TYPE_CHECKING:
 
 
 def open_bus(bus: str) -> SMBus:
-    """Open a bus: a path such as `/dev/i2c-1`, or `virtual:SOCKET` for a board that another process emulates.
+    """Open a bus.
+
+    Parameters
+    ----------
+    bus : str
+        A path such as `/dev/i2c-1`, or `virtual:SOCKET` for a board that another process emulates.
+
+    Returns
+    -------
+    smbus2.SMBus
 
     Raises
     ------
@@ -31,7 +40,7 @@ def write(bus: SMBus, address: int, data: bytes) -> None:
     Raises
     ------
     OSError
-        Where the part or the adapter does not do it.
+        Where the part or the adapter does not carry it out.
     """
     from smbus2 import i2c_msg
 
@@ -44,6 +53,7 @@ def read(bus: SMBus, address: int, length: int) -> bytes:
     Raises
     ------
     OSError
+        As `write` does.
     """
     from smbus2 import i2c_msg
 
@@ -58,6 +68,7 @@ def write_read(bus: SMBus, address: int, data: bytes, length: int) -> bytes:
     Raises
     ------
     OSError
+        As `write` does.
     """
     from smbus2 import i2c_msg
 

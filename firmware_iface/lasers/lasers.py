@@ -6,9 +6,9 @@ with open_lasers("/dev/i2c-1", CHANNELS) as lasers:
     while showing:
         lasers.heartbeat()          # at least every 50 ms, from the loop that must be alive
 
-Every failure (of the bus, of a reply, of the light) goes the same way: everything is told to go dark, each part by
-itself, and DeviceError is raised. Nothing is tried twice. When the process dies, the heartbeat dies with it, and the
-safety controller is dark after 100 ms.
+Every failure (of the bus, of a reply, of the light) has the same result: every part is switched off by itself, and
+DeviceError is raised. Nothing is tried twice. When the process dies, the heartbeat ends, and the safety controller
+switches off after 100 ms.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ MISSING = {
 
 
 class LatchedError(DeviceError):
-    """The safety controller has latched a fault and is dark; clear() and arm() once the cause is gone."""
+    """The safety controller has latched a fault and is dark; clear() and arm() once the cause is removed."""
 
 
 class Lasers:
@@ -59,12 +59,14 @@ class Lasers:
 
     Parameters
     ----------
-    bus : SMBus
-        An open smbus2.SMBus, which is closed with the lasers.
+    bus : smbus2.SMBus
+        Open; it is closed with the lasers.
     channels : sequence of LaserChannel
         One to three, in the order of the DAC's outputs.
-    clock, wait : callable
-        Seconds, and sleeping; tests give their own.
+    clock : callable
+        Gives the time, s.
+    wait : callable
+        Sleeps, s.
 
     Raises
     ------
@@ -110,7 +112,7 @@ class Lasers:
         Raises
         ------
         InputError
-            For an unknown one.
+            For an unknown channel.
         """
         return self._fractions[self._index(channel)]
 
@@ -133,7 +135,7 @@ class Lasers:
         Raises
         ------
         DeviceError
-            Where the DAC does not do it; everything has then been told to go dark.
+            Where the DAC does not do it; every part has then been switched off.
         """
         self._forget()
         with self._dark_on_failure():
@@ -141,19 +143,19 @@ class Lasers:
             now, _ = self.board.dac.read()
             if not all(output.dark for output in now):
                 raise DeviceError(
-                    "the DAC did not go dark when told to, so the lasers were switched off otherwise."
+                    "the DAC did not go dark on command, so the lasers were switched off otherwise."
                 )
         self._changed_at = self._clock()
 
     # --- arming and staying alive
 
     def clear(self) -> None:
-        """First act after a fault: forget it.
+        """First step after a fault: clear it.
 
         Raises
         ------
         DeviceError
-            That says what holds it.
+            Where it cannot be cleared yet; the message says why.
         """
         self._forget()
         with self._dark_on_failure():
@@ -166,12 +168,12 @@ class Lasers:
             raise DeviceError(f"the fault cannot be cleared: {missing}.")
 
     def arm(self) -> None:
-        """Second act: arm the board, dark.
+        """Second step: arm the board, dark.
 
         Raises
         ------
         DeviceError
-            That says what is missing.
+            Where a condition is missing; the message says which.
         """
         with self._dark_on_failure():
             state = self.board.controller.state()
@@ -190,7 +192,7 @@ class Lasers:
             raise DeviceError(f"the lasers cannot be armed: {missing}.")
 
     def heartbeat(self) -> None:
-        """Say that the caller is alive, at least every 50 ms; looks at one photodiode each time.
+        """Show that the caller is alive, at least every 50 ms; checks one photodiode each time.
 
         No token is written sooner than 6 ms after the last.
 
@@ -203,14 +205,14 @@ class Lasers:
         with self._dark_on_failure():
             self._beat()
             self._raise_latched()
-            self._look()
+            self._check_photodiode()
             if not self._ramping:
                 self._select((self._selected + 1) % len(self._lasers))
 
     def ramp(self, channel: str, fraction: float) -> Iterator[None]:
         """`set_power`, a step at a time: yields between steps, which should be 5 ms apart.
 
-        A caller that must do other things meanwhile (or that must be able to stop) drives it.
+        For a caller that does other things meanwhile or must be able to stop.
         """
         k = self._index(channel)
         if (
@@ -238,7 +240,7 @@ class Lasers:
         self._ramping = True
         try:
             for step in range(1, RAMP_STEPS + 1):
-                # less than was asked, where off() or expect() came between the steps
+                # less than requested, where off() or expect() came between the steps
                 allowed = self._lasers[k].code(self._fractions[k])
                 if allowed == 0:
                     return
@@ -248,7 +250,7 @@ class Lasers:
                 with self._dark_on_failure():
                     if self._clock() - self._beat_at >= BEAT_S:
                         self._beat()
-                    self._look()
+                    self._check_photodiode()
         finally:
             self._ramping = False
 
@@ -291,10 +293,10 @@ class Lasers:
         """Fraction of full power, by channel."""
         return dict(zip(self.channels, self._fractions, strict=True))
 
-    # --- what is seen
+    # --- status and checks
 
     def status(self) -> dict[str, Any]:
-        """What the board says of itself, ready for JSON.
+        """What the board reports, ready for JSON.
 
         Raises
         ------
@@ -315,19 +317,19 @@ class Lasers:
                 "class1_at_full_power": self._budget.exposure_at_full_power().worst,
             }
 
-    def _look(self) -> None:
-        """Compare the selected photodiode with what it should show, if the light has had the time to settle."""
+    def _check_photodiode(self) -> None:
+        """Compare the selected photodiode with its expected voltage, once the light has settled."""
         if self._clock() - max(self._changed_at, self._selected_at) < RAMP_S / RAMP_STEPS - 1e-6:
             return
         k = self._selected
-        seen_v = self.board.converter.volts()
+        measured_v = self.board.converter.volts()
         expected_v = self._lasers[k].photodiode_v(self._codes[k] * VOLTS_PER_CODE)
-        if abs(seen_v - expected_v) <= TOLERANCE * expected_v + FLOOR_V:
+        if abs(measured_v - expected_v) <= TOLERANCE * expected_v + FLOOR_V:
             return
         self._raise_latched()
         raise DeviceError(
-            f"laser '{self.channels[k]}' should make {expected_v:.3f} V at its photodiode and makes {seen_v:.3f} V, so "
-            "the lasers were switched off; check the photodiode, the calibration, and that the set point of the "
+            f"laser '{self.channels[k]}' should make {expected_v:.3f} V at its photodiode and makes "
+            f"{measured_v:.3f} V, so the lasers were switched off; check the photodiode, the calibration, and that the set point of the "
             "laser's controller is 0."
         )
 
@@ -338,11 +340,11 @@ class Lasers:
     def _latched(self) -> str:
         return ", ".join(f.name.lower() for f in self.board.controller.faults() if f.name)
 
-    def _missing(self, wanted: Input) -> str:
+    def _missing(self, needed: Input) -> str:
         inputs = self.board.controller.inputs()
-        return "; ".join(MISSING[i] for i in wanted if not inputs & i) or "it gives no reason; try again"
+        return "; ".join(MISSING[i] for i in needed if not inputs & i) or "it gives no reason; try again"
 
-    # --- what is done
+    # --- single actions
 
     def _index(self, channel: str) -> int:
         if channel not in self.channels:
@@ -367,7 +369,7 @@ class Lasers:
 
     @contextmanager
     def _dark_on_failure(self) -> Iterator[None]:
-        """Whatever fails inside, go dark first and then tell."""
+        """Where the block fails, go dark first and then raise."""
         if self._closed:
             raise DeviceError("the lasers are closed; open them again.")
         try:
@@ -383,7 +385,7 @@ class Lasers:
             raise
 
     def trip(self) -> None:
-        """Latch a fault of the host's own: dark until clear() and arm(). Raises nothing."""
+        """Latch a fault on the host's request: dark until clear() and arm(). Raises nothing."""
         self._go_dark()
 
     def _go_dark(self, command: Command = Command.FAULT) -> None:
@@ -422,12 +424,25 @@ def _close_all() -> None:
 
 
 def open_lasers(bus: str, channels: Sequence[LaserChannel]) -> Lasers:
-    """Open the lasers on a bus (see wire.open_bus).
+    """Open the lasers on a bus.
+
+    Parameters
+    ----------
+    bus : str
+        See `i2c_transfers.open_bus`.
+    channels : sequence of LaserChannel
+        One to three, in the order of the DAC's outputs.
+
+    Returns
+    -------
+    Lasers
 
     Raises
     ------
     InputError
+        Where the bus cannot be opened or the channels do not fit the board.
     DeviceError
+        Where a part of the board fails.
     """
     try:
         opened = open_bus(bus)

@@ -1,4 +1,4 @@
-"""MCP23008: eight pins. 0 to 2 enable the laser-diode controllers; key, interlock and over-power are read on 4 to 6.
+"""MCP23008: eight pins. 0 to 2 enable the laser-diode controllers; key, interlock and over-power are pins 4 to 6.
 
 After reset every pin is an input, and the board pulls the enables low.
 """
@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 
 IODIR, GPIO, OLAT = 0x00, 0x09, 0x0A
 ENABLES = 0b0000_0111
-KEY, INTERLOCK, NO_OVER_POWER = 1 << 4, 1 << 5, 1 << 6
 
 
 class Mcp23008:

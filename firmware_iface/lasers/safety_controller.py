@@ -54,12 +54,20 @@ def packet_error_code(data: bytes) -> int:
 
 
 class SafetyController:
-    """The controller. Everything raises OSError where the bus fails, and DeviceError where a reply is garbled.
+    """The controller.
 
     Parameters
     ----------
-    bus : SMBus
-        An open smbus2.SMBus.
+    bus : smbus2.SMBus
+        Open.
+    address : int
+
+    Raises
+    ------
+    OSError
+        From every method, where the bus does not carry a message.
+    DeviceError
+        From every method that reads, where a reply is garbled.
     """
 
     def __init__(self, bus: SMBus, address: int = 0x36) -> None:

@@ -44,11 +44,11 @@ class Tmp117:
         write(self._bus, self._address, bytes([CONFIG, *THERM_MODE.to_bytes(2, "big")]))
 
     def limit_celsius(self) -> float:
-        """The upper limit as the part holds it."""
+        """The upper limit as the part holds it, °C."""
         return self._read(HIGH) * DEGREES_PER_COUNT
 
     def celsius(self) -> float:
-        """Temperature."""
+        """Temperature, °C."""
         return self._read(TEMPERATURE) * DEGREES_PER_COUNT
 
     def _read(self, register: int) -> int:

@@ -57,10 +57,11 @@ class Dlpc900Control:
 
     Parameters
     ----------
+    link : UsbLink
     receiver : str
         "hdmi" or "displayport" for frames that come over that link, "off" for uploaded ones.
     exposure_us : int, µs
-        Of each pattern.
+        Exposure of each pattern.
     """
 
     def __init__(self, link: UsbLink, receiver: str = "off", exposure_us: int = 16667) -> None:
@@ -72,7 +73,7 @@ class Dlpc900Control:
         self._link = link
         self._receiver, self._exposure_us = receiver, exposure_us
         self._sequence = 0
-        self._unsure = False  # whether the last command broke off
+        self._incomplete = False  # whether the last command broke off
         link.opened.append(self._set_up)
         link.open()
 
@@ -104,7 +105,7 @@ class Dlpc900Control:
             time.sleep(0.05)
 
     def define(self, count: int) -> None:
-        """Fill the pattern table with the first `count` bits of image 0, in turn and for ever."""
+        """Fill the pattern table with the first `count` bits of image 0, in turn and without end."""
         exposure = self._exposure_us.to_bytes(3, "little")
         for position in range(count):
             # one bit, all colours, cleared afterwards; no trigger, no dark time; image 0, this bit position
@@ -131,7 +132,7 @@ class Dlpc900Control:
 
     def close(self) -> None:
         if self._link.is_open:
-            with suppress(DeviceError):  # a controller that is gone shows nothing
+            with suppress(DeviceError):  # an unplugged controller shows nothing
                 self.command(PATTERN, bytes([STOP]))
                 self.set_power("standby")
         self._link.close()
@@ -162,12 +163,12 @@ class Dlpc900Control:
     def _exchange(self, code: int, data: bytes, read: bool) -> tuple[int, bytes]:
         """One command and its answer, (flags, data); answers to earlier commands that come late are dropped."""
         self._link.open()  # before the number is drawn: setting up has commands of its own
-        if self._unsure:
+        if self._incomplete:
             self._recover()
         self._sequence = sequence = (self._sequence + 1) % 256
         flags = _REPLY | (_READ if read else 0)
         packets = struct.pack("<BBHH", flags, sequence, len(data) + 2, code) + data
-        self._unsure = True
+        self._incomplete = True
         for at in range(0, len(packets), PACKET):
             self._link.write(OUT, packets[at : at + PACKET].ljust(PACKET, b"\0"))
         for _ in range(8):
@@ -176,29 +177,38 @@ class Dlpc900Control:
             except ValueError as error:
                 raise DeviceError(f"{self.name}: {error}; check its cable.") from error
             if answered == sequence:
-                self._unsure = False
+                self._incomplete = False
                 return flags, answer
         raise DeviceError(f"{self.name} answers other commands than were sent; power it off and on.")
 
     def _recover(self) -> None:
-        """After a command that broke off: fill up what the controller may still wait for with empty commands.
+        """After an incomplete command: send empty commands for the bytes that the controller may still wait for.
 
-        They ask for no answer and do nothing. Not tried on hardware.
+        They request no answer and do nothing. Not tried on hardware.
         """
         self._link.clear_halt(OUT)
         self._link.clear_halt(IN)
         for _ in range(LONGEST_DATA // PACKET + 2):
             self._link.write(OUT, bytes(PACKET))
-        self._unsure = False
+        self._incomplete = False
 
 
 def parse_answer(packet: bytes) -> tuple[int, int, bytes]:
-    """(flags, sequence, data) of an answer.
+    """Parse an answer.
+
+    Parameters
+    ----------
+    packet : bytes
+
+    Returns
+    -------
+    (int, int, bytes)
+        Flags, sequence, data.
 
     Raises
     ------
     ValueError
-        Where it is none.
+        Where the packet is no answer.
     """
     if len(packet) < 4:
         raise ValueError(f"its answer has {len(packet)} bytes")
@@ -209,7 +219,7 @@ def parse_answer(packet: bytes) -> tuple[int, int, bytes]:
 
 
 class PatternUpload:
-    """Frames as one-bit patterns over USB: up to 24 pictures shown in turn, one alone until the next."""
+    """Frames as one-bit patterns over USB: up to 24 pictures in turn; a single one stays until the next."""
 
     def __init__(self, control: Dlpc900Control, modulator: Modulator = P47) -> None:
         self.shape = modulator.shape
@@ -245,7 +255,7 @@ class PatternUpload:
             raise DeviceError(f"{self._control.name} does not run its patterns; show the frame again.")
 
     def close(self) -> None:
-        """The control part lets go of the link that both use."""
+        """The control part releases the link that both use."""
 
     def _load(self, index: int, image: NDArray[np.uint32]) -> None:
         data = encode(image)
@@ -256,7 +266,7 @@ class PatternUpload:
 
 
 def video_pattern(gray: Gray, modulator: Modulator) -> Gray:
-    """What a display link carries to show gray levels [H, W]: memory bits as 0 and 255, [2 H, 2 W].
+    """The picture on the display link that shows gray levels [H, W]: memory bits as 0 and 255, [2 H, 2 W].
 
     All 24 bit planes are alike, so the pattern stays for a whole frame.
     """
@@ -278,13 +288,19 @@ def open_dlpc900(
     Parameters
     ----------
     display : int or None
-        N of /dev/fbN that it is the screen of; None uploads frames over USB, slowly.
+        N of /dev/fbN whose screen it is; None uploads frames over USB, slowly.
+    modulator : Modulator
+        P47 or P67.
     receiver : str
-        How that screen is connected, "hdmi" or "displayport".
-    backend : object
-        A pyusb backend; None is the system's libusb.
+        Connection of that screen, "hdmi" or "displayport".
+    serial : str or None
+        Serial number, where several are attached.
+    backend : pyusb backend or None
+        None is the system's libusb.
     exposure_us : int, µs
-        Of a pattern, less than a frame of the display.
+        Exposure of a pattern, less than a frame of the display.
+    timeout_s : float, s
+        Longest wait for one transfer.
 
     Returns
     -------
@@ -292,6 +308,8 @@ def open_dlpc900(
 
     Raises
     ------
+    InputError
+        For a setting out of range.
     DeviceGoneError
         Where it is not attached.
     DeviceError

@@ -26,14 +26,20 @@ class MirroredDisplay:
     number : int
         N of /dev/fbN.
     shape : (int, int)
-        (H, W), the panel's pixels; they are drawn at the screen's top left.
+        (H, W), the panel's pixels, drawn at the screen's top left.
     settle_s : float, s
         From the start of a frame on the link until the panel has followed.
     draw : callable
-        Makes the screen's pixels, uint8 [rows, columns], of gray levels [H, W]; none: they are the
-        same.
+        From gray levels [H, W] to the screen's pixels, uint8 array [rows, columns]; by default the same.
     devices, settings : Path
-        Where the kernel shows frame buffers; tests give folders of their own.
+        Folders where the kernel shows frame buffers.
+
+    Raises
+    ------
+    InputError
+        Where the screen cannot carry the panel.
+    DeviceError, DeviceGoneError
+        Where it cannot be opened.
     """
 
     def __init__(
@@ -88,7 +94,7 @@ class MirroredDisplay:
         Raises
         ------
         DeviceGoneError
-            Where it is off the link.
+            Where the screen is disconnected.
         """
         return {"mode": self._get("mode"), "pan": self._get("pan"), "bits_per_pixel": 8 * self._bytes}
 
@@ -131,6 +137,6 @@ class MirroredDisplay:
 
 
 def open_mirrored(number: int, shape: tuple[int, int], settle_s: float = 0.05) -> Panel:
-    """A panel that is nothing but a screen. See MirroredDisplay."""
+    """A panel that is a screen and has no other control. See MirroredDisplay."""
     display = MirroredDisplay(number, shape, settle_s)
     return Panel(display, display)

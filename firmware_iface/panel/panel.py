@@ -13,37 +13,39 @@ Gray = NDArray[np.uint8]
 
 
 class Control(Protocol):
-    """What every panel's control part offers."""
+    """The control part of a panel."""
 
     def status(self) -> dict[str, Any]:
-        """What the panel says of itself, by name.
+        """What the panel reports, by name.
 
         Raises
         ------
         DeviceError
+            Where it does not answer.
         """
 
     def close(self) -> None:
-        """Leave the panel dark where it can be, and let go of it."""
+        """Leave the panel dark where it can be, and release it."""
 
 
 class Frames(Protocol):
-    """What every way of bringing frames to a panel offers."""
+    """The part that brings frames to a panel."""
 
     @property
     def shape(self) -> tuple[int, int]:
         """(H, W), pixels."""
 
     def send(self, gray: Gray) -> int:
-        """Hand one whole frame over and return its sequence number.
+        """Send one whole frame and return its sequence number.
 
         Raises
         ------
         DeviceError
+            Where it was not taken.
         """
 
     def wait(self, sequence: int) -> None:
-        """Return when this frame is what is displayed.
+        """Return when this frame is displayed.
 
         Raises
         ------
@@ -52,7 +54,7 @@ class Frames(Protocol):
         """
 
     def close(self) -> None:
-        """Let go of the link."""
+        """Release the link."""
 
 
 class Panel:
@@ -62,7 +64,7 @@ class Panel:
     ----------
     control : Control
     frames : Frames
-    shape
+    shape : (int, int)
         (H, W), pixels.
     """
 
@@ -71,7 +73,11 @@ class Panel:
         self.shape = frames.shape
 
     def show(self, gray: NDArray[np.generic]) -> None:
-        """Show gray levels, uint8 [H, W], and return when they are displayed.
+        """Show gray levels and return when they are displayed.
+
+        Parameters
+        ----------
+        gray : uint8 array [H, W]
 
         Raises
         ------
@@ -83,16 +89,11 @@ class Panel:
         self.frames.wait(self.frames.send(checked_gray(gray, self.shape)))
 
     def status(self) -> dict[str, Any]:
-        """What the panel says of itself.
-
-        Raises
-        ------
-        DeviceError
-        """
+        """What the panel reports, by name; raises as `Control.status`."""
         return self.control.status()
 
     def close(self) -> None:
-        """Leave the panel dark where it can be, and let go of it."""
+        """Leave the panel dark where it can be, and release it."""
         try:
             self.control.close()
         finally:
@@ -100,11 +101,12 @@ class Panel:
 
 
 def checked_gray(gray: NDArray[np.generic], shape: tuple[int, int]) -> Gray:
-    """`gray` if it is uint8 of this shape.
+    """`gray`, if it is uint8 of this shape.
 
     Raises
     ------
     InputError
+        Where it is not.
     """
     if not isinstance(gray, np.ndarray) or gray.dtype != np.uint8:
         found = gray.dtype if isinstance(gray, np.ndarray) else type(gray).__name__

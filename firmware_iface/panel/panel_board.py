@@ -36,12 +36,14 @@ class BoardControl:
 
     Parameters
     ----------
+    link : UsbLink
     timing : Timing or None
         Set each time the board was found, and checked by reading it back.
 
     Attributes
     ----------
     identity : Identity or None
+        Of the board that is attached.
     """
 
     def __init__(self, link: UsbLink, timing: Timing | None = None) -> None:
@@ -53,7 +55,7 @@ class BoardControl:
 
     @property
     def timing(self) -> Timing:
-        """What the board is set to; assign to change it.
+        """The timing in force; assign to change it.
 
         Raises
         ------
@@ -80,6 +82,7 @@ class BoardControl:
         Raises
         ------
         DeviceError
+            Where it does not answer as it should.
         """
         return self._ask(STATUS, STATUS_BYTES, parse_status)
 
@@ -92,7 +95,7 @@ class BoardControl:
         self._link.control_out(COMMIT, with_crc(struct.pack("<II", sequence, crc)))
 
     def recover(self) -> str:
-        """After a failed transfer: make the board ready for a frame; says what it had refused."""
+        """After a failed transfer: make the board ready for a frame; returns what it had refused."""
         refusal = self.read_status().refusal
         self._link.clear_halt(FRAMES_OUT)
         self._link.control_out(CLEAR)
@@ -100,7 +103,7 @@ class BoardControl:
 
     def close(self) -> None:
         if self._link.is_open:
-            with suppress(DeviceError):  # a board that is gone is dark already
+            with suppress(DeviceError):  # an unplugged board is dark already
                 self.set_mode("dark")
         self._link.close()
 
@@ -133,7 +136,7 @@ class BoardControl:
             raise DeviceError(f"{self._link.name} did not take its timing; power it off and on.")
 
     def _ask(self, request: int, length: int, parse: Any) -> Any:
-        """A parsed reply; asked for once more where the first did not come or was garbled."""
+        """A parsed reply; requested once more where the first was missing or garbled."""
         try:
             return parse(self._link.control_in(request, length))
         except DeviceGoneError:
@@ -207,12 +210,16 @@ def open_board(
     timing: Timing | None = None,
     timeout_s: float = 0.5,
 ) -> Panel:
-    """Open the panel board, or that of this serial number.
+    """Open the panel board.
 
     Parameters
     ----------
-    backend : object
-        A pyusb backend; None is the system's libusb.
+    serial : str or None
+        Serial number, where several are attached.
+    backend : pyusb backend or None
+        None is the system's libusb.
+    timing : Timing or None
+        Of the panel's period; None is 60 Hz.
     timeout_s : float, s
         Longest wait for one transfer.
 

@@ -31,7 +31,7 @@ IDENTITY_BYTES, TIMING_BYTES, STATUS_BYTES = (s.size + 4 for s in (_IDENTITY, _T
 
 @dataclass(frozen=True)
 class Identity:
-    """Which board it is; periods in µs, as the board counts."""
+    """Identity of a board, as its reply gives it."""
 
     width: int
     height: int
@@ -43,7 +43,7 @@ class Identity:
 
 @dataclass(frozen=True)
 class Timing:
-    """One period of the panel, and when in it the light may be on."""
+    """One period of the panel, and the part of it in which the light may be on."""
 
     period_us: int = 16667
     light_delay_us: int = 4000
@@ -52,7 +52,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class Status:
-    """What STATUS reports; sequence numbers are 0 before the first frame."""
+    """The reply to STATUS; sequence numbers are 0 before the first frame."""
 
     mode: str
     buffer: str
@@ -69,7 +69,13 @@ class Status:
 
 
 def parse_identity(reply: bytes) -> Identity:
-    """Raises ValueError with the reason where these 32 bytes are not an identity of version 1."""
+    """Parse a reply to IDENTITY.
+
+    Raises
+    ------
+    ValueError
+        Where these 32 bytes are not an identity of version 1.
+    """
     magic, version, width, height, bits, pitch, shortest, longest, minor, major = _IDENTITY.unpack(
         _checked(reply, _IDENTITY.size)
     )
@@ -79,12 +85,24 @@ def parse_identity(reply: bytes) -> Identity:
 
 
 def parse_timing(reply: bytes) -> Timing:
-    """Raises ValueError where these 16 bytes are not a timing."""
+    """Parse a reply to TIMING.
+
+    Raises
+    ------
+    ValueError
+        Where these 16 bytes are not a timing.
+    """
     return Timing(*_TIMING.unpack(_checked(reply, _TIMING.size)))
 
 
 def parse_status(reply: bytes) -> Status:
-    """Raises ValueError with the reason where these 40 bytes are not a status."""
+    """Parse a reply to STATUS.
+
+    Raises
+    ------
+    ValueError
+        Where these 40 bytes are not a status.
+    """
     mode, buffer, refusal, faults, *counts, temperature = _STATUS.unpack(_checked(reply, _STATUS.size))
     if mode >= len(MODES) or buffer >= len(BUFFERS) or refusal >= len(REFUSALS) or faults >> len(FAULTS):
         raise ValueError("its status has values that the protocol does not know")
@@ -117,7 +135,7 @@ def with_crc(data: bytes) -> bytes:
 
 
 def frame_bytes(gray: Gray, sequence: int) -> tuple[bytes, int]:
-    """One frame as it travels, and the CRC-32 of its pixels."""
+    """One frame as it is sent, and the CRC-32 of its pixels."""
     pixels = gray.tobytes()
     crc = zlib.crc32(pixels)
     height, width = gray.shape
