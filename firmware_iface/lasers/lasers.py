@@ -329,8 +329,8 @@ class Lasers:
         self._raise_latched()
         raise DeviceError(
             f"laser '{self.channels[k]}' should make {expected_v:.3f} V at its photodiode and makes "
-            f"{measured_v:.3f} V, so the lasers were switched off; check the photodiode, the calibration, and that the set point of the "
-            "laser's controller is 0."
+            f"{measured_v:.3f} V, so the lasers were switched off; check the photodiode, "
+            "the calibration, and that the set point of the laser's controller is 0."
         )
 
     def _raise_latched(self) -> None:

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from firmware_iface.lasers.i2c_transfers import write, write_read
+from firmware_iface.lasers.i2c_transfers import write
 
 if TYPE_CHECKING:
     from smbus2 import SMBus
 
-IODIR, GPIO, OLAT = 0x00, 0x09, 0x0A
+IODIR, OLAT = 0x00, 0x0A
 ENABLES = 0b0000_0111
 
 
@@ -38,7 +38,3 @@ class Mcp23008:
         """Enable the lasers whose bits are set, disable the others."""
         write(self._bus, self._address, bytes([OLAT, lasers & ENABLES]))
         write(self._bus, self._address, bytes([IODIR, ~ENABLES & 0xFF]))
-
-    def pins(self) -> int:
-        """Levels of the eight pins, bit by bit."""
-        return write_read(self._bus, self._address, bytes([GPIO]), 1)[0]

@@ -1,4 +1,10 @@
-"""A virtual headset: devices with a simulated bench behind them, whose defects are hidden."""
+"""A virtual headset: devices with a simulated bench behind them that has hidden defects.
+
+The simulation is in `bench_optics`, `simulated_panel`, `simulated_sensor` and `subpixel_propagation`; hidden defects
+are defined in `defects` and combined to benches in `named_benches`. `virtual_headset` is opened in Python;
+`emulated_hardware` answers the real vendor libraries, byte by byte (`i2c`, `usb`, `oak`). Faults of emulated devices
+are in `fault_injection`.
+"""
 
 from firmware_iface.virtual.bench_description import BenchDescription, read_bench
 from firmware_iface.virtual.bench_loading import load_bench

@@ -1,4 +1,4 @@
-"""What a simulated bench is: the nominal part that a person would write down, and its hidden defects.
+"""The description of a simulated bench: the nominal part that a person would write down, and its hidden defects.
 
 The TOML form is bench.toml of a capture set plus `[[defect]]` tables and an optional `[simulation]` table.
 """
@@ -68,7 +68,7 @@ class CameraDescription:
 
 @dataclass(frozen=True)
 class SimulationDescription:
-    """How the bench is simulated, and what of it a person would not write in bench.toml."""
+    """How the bench is simulated: settings that are not in a bench.toml."""
 
     subpixels: int = parameter(4, "samples drawn across a panel pixel", 2, 16)
     padding: float = parameter(2.0, "border, in units of the widest walk of light at the band's edge", 1, 20)
@@ -81,7 +81,7 @@ class SimulationDescription:
 
 @dataclass(frozen=True)
 class BenchDescription:
-    """A simulated bench: nominal tables, hidden defects, how to simulate. Use dataclasses.replace."""
+    """A simulated bench: nominal tables, hidden defects, simulation settings. Change it by dataclasses.replace."""
 
     name: str = "ideal"
     panel: PanelDescription = field(default_factory=PanelDescription)
@@ -137,7 +137,7 @@ class BenchDescription:
         Raises
         ------
         InputError
-            That suggests the nearest.
+            For an unknown name; the message suggests the nearest.
         """
         for c in self.channels:
             if c.name == name:
@@ -145,7 +145,7 @@ class BenchDescription:
         raise InputError(f"there is no channel '{name}'; {nearest(name, [c.name for c in self.channels])}")
 
     def resized(self, height: int, width: int, distance_mm: float | None = None) -> BenchDescription:
-        """The same bench with another panel size, its camera to match, and perhaps another distance."""
+        """The same bench with another panel size, its camera to match, and another distance where one is given."""
         distance = (
             self.propagation if distance_mm is None else replace(self.propagation, distance_mm=distance_mm)
         )
@@ -160,7 +160,7 @@ class BenchDescription:
         )
 
     def nominal(self) -> dict[str, Any]:
-        """What a person would write in bench.toml; says nothing of defects, nor of the bench's own name."""
+        """The tables of a bench.toml, without the defects and the bench's own name."""
         panel = asdict(self.panel)
         if self.panel.phase_sign == 1:
             del panel["phase_sign"]
@@ -182,9 +182,21 @@ class BenchDescription:
 def read_bench(tables: Mapping[str, Any], where: str) -> BenchDescription:
     """A bench from parsed TOML; tables that are left out take their defaults.
 
+    Parameters
+    ----------
+    tables : mapping
+        As read from TOML.
+    where : str
+        The file's name in messages.
+
+    Returns
+    -------
+    BenchDescription
+
     Raises
     ------
     InputError
+        For an unknown key, a wrong type, or a value out of range.
     """
     known = ("schema", "name", "panel", "channel", "propagation", "iris", "camera", "simulation", "defect")
     for key in tables:

@@ -1,7 +1,7 @@
-"""A headset's hardware, emulated down to the bytes, with a simulated bench between its parts.
+"""A headset's hardware, emulated at the level of its buses' bytes, with a simulated bench between its parts.
 
-What the panel board was sent and what comes out of the laser board make what the camera sees. `served` runs it
-in a process of its own, so that it goes on when the process that drives it dies, as hardware does.
+The frame on the panel board and the light of the laser board give the camera's picture. `served` runs it in a
+process of its own, so that it continues when the process that drives it dies, as hardware does.
 """
 
 from __future__ import annotations
@@ -32,21 +32,23 @@ class EmulatedHardware:
     Parameters
     ----------
     bench : str
-        As `virtual.headset.open_headset` takes it.
+        As `virtual_headset.open_headset` takes it.
+    seed : int
+        Of noise and garbage.
 
     Attributes
     ----------
-    headset
-    board
-        Of the panel.
-    lasers
-        Their board.
-    faults
-        Script of each part.
-    light : deque[tuple[float, float]]
+    headset : VirtualHeadset
+        The simulated bench.
+    board : BoardModel
+        The panel's.
+    lasers : LaserBoard
+    faults : dict of str to Faults
+        The script of "panel", "lasers" and "camera".
+    light : deque of (float, float)
         (time s, µW of all lasers) at each change.
-    whole : dict[int, int]
-        CRC-32 of each pattern that the panel displayed.
+    whole : dict of int to int
+        CRC-32 of each pattern that the panel displayed, and how often.
     """
 
     def __init__(self, bench: str, seed: int = 0) -> None:
@@ -65,7 +67,7 @@ class EmulatedHardware:
         self._lock = threading.Lock()
 
     def run(self) -> None:
-        """Let time pass for the parts, for ever: also with nobody on the bus the dead-man acts and frames appear."""
+        """Let time pass for the parts, without end: the dead-man acts and frames appear also without traffic."""
         while True:
             self.lasers.settle()
             self.board.gray  # noqa: B018 - a period that is over displays what was committed
@@ -75,12 +77,16 @@ class EmulatedHardware:
             time.sleep(TICK_S)
 
     def capture(self, exposure_ms: float) -> NDArray[np.uint16]:
-        """What the camera sees, uint16 counts [h, w].
+        """One picture of the camera, with its faults.
+
+        Returns
+        -------
+        uint16 array [h, w], counts
 
         Raises
         ------
         DeviceError
-            As its faults say.
+            Where a fault is armed.
         """
         faults = self.faults["camera"]
         fault = faults.take("unplug", "hang", "timeout", "late", "garbage", "die")
@@ -98,7 +104,7 @@ class EmulatedHardware:
         return counts
 
     def exposed(self, exposure_ms: float) -> NDArray[np.uint16]:
-        """What falls on the camera, uint16 counts [h, w]."""
+        """One picture of the camera without its faults, uint16 counts [h, w]."""
         with self._lock:
             emitted = self.lasers.emitted_uw
             self.headset.panel.show(self.board.gray)
@@ -109,9 +115,14 @@ class EmulatedHardware:
             return self.headset.camera.capture()
 
     def set_to(self, name: str, value: Any) -> None:
-        """Do something to the laser board: key or interlock (bool), celsius, photodiodes (False: cut), efficiency
+        """Change the surroundings of the laser board.
 
-        (of every diode; 1: as calibrated).
+        Parameters
+        ----------
+        name : str
+            "key" or "interlock" (bool), "celsius", "photodiodes" (False: cut), "efficiency" (of every diode; 1: as
+            calibrated).
+        value : bool or float
 
         Raises
         ------
@@ -131,7 +142,7 @@ class EmulatedHardware:
         self.lasers.settle()
 
     def attach_oak(self, address: str) -> None:
-        """Let an emulated OAK camera look at the bench, at a loopback address; its faults are the camera's."""
+        """Emulate an OAK camera in front of the bench, at a loopback address; its faults are the camera's."""
         self.oak = OakModel(
             expose_bench(self.exposed, self.headset.description.camera),
             self.headset.camera.shape,
@@ -141,7 +152,7 @@ class EmulatedHardware:
         )
 
     def light_since(self, since_s: float) -> list[tuple[float, float]]:
-        """What the light was at `since_s`, and each change after it."""
+        """(time s, µW of all lasers): the light at `since_s`, and each change after it."""
         self.lasers.settle()
         changes = list(self.light)
         first = max((k for k, (at, _) in enumerate(changes) if at <= since_s), default=0)

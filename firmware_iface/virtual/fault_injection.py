@@ -1,4 +1,4 @@
-"""Faults of a byte-level model: which, when, for how long. Every model asks the same script before each transfer.
+"""Faults injected into byte-level models: which, when, for how long. Every model asks one script before each transfer.
 
 faults = Faults()
 faults.arm("stall")                 # the next transfer
@@ -21,7 +21,7 @@ KINDS = {
     "stall": "the request is refused (USB: the endpoint halts)",
     "short_write": "only the first part of what is written arrives",
     "nack": "the address is not acknowledged (I2C)",
-    "unplug": "the device is gone; clearing plugs it in again, with the state of a fresh start",
+    "unplug": "the device is unplugged; clearing plugs it in again, with the state of a fresh start",
     "garbage": "the bytes of the transfer arrive as random ones",
     "hang": "nothing is answered or done until it is cleared",
     "late": "what is due comes late, by `late_s`",
@@ -39,16 +39,21 @@ class Faults:
 
     Attributes
     ----------
-    late_s : s
-        How late a late answer is, s.
-    struck and ended (Counters: how often each kind took effect, and how often it was over, by count or cleared, after it had been due)
+    late_s : float, s
+        Delay of a late answer.
+    struck : Counter
+        How often each kind took effect.
+    ended : Counter
+        How often each kind ended, by count or by clearing, after it had been due.
     """
 
     def __init__(self, seed: int = 0) -> None:
         self.late_s = 0.25
         self.struck: Counter[str] = Counter()
         self.ended: Counter[str] = Counter()
-        self._script: dict[str, tuple[int, int | None]] = {}  # kind: (transfers to spare, transfers to hit)
+        self._script: dict[
+            str, tuple[int, int | None]
+        ] = {}  # kind: (transfers that pass, transfers that are struck)
         self._random = random.Random(seed)
         self._lock = threading.Lock()
 
@@ -59,8 +64,12 @@ class Faults:
 
         Parameters
         ----------
+        kind : str
+            One of KINDS.
+        count : int or None
+            Transfers that are struck; None: until cleared.
         after : int
-            Transfers to spare first.
+            Transfers that pass before.
 
         Raises
         ------

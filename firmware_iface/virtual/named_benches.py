@@ -36,7 +36,7 @@ def _benches() -> dict[str, BenchDescription]:
         BenchDescription("triple", defects=(make("crosstalk"), make("illumination"), make("distance"))),
         BenchDescription("colour", channels=_RGB, defects=(make("phase_response"),)),
         BenchDescription(
-            "mixed",  # small enough to train a dozen networks on
+            "mixed",  # small enough to train a dozen networks on it
             defects=(
                 make("zero_order", fill_factor=0.94, surface_amplitude=0.12),
                 make("illumination", waist_x_share=1.9, waist_y_share=2.1),
@@ -70,7 +70,7 @@ def named_bench(name: str) -> BenchDescription:
     Raises
     ------
     InputError
-        That suggests the nearest.
+        For an unknown name; the message suggests the nearest.
     """
     benches = _benches()
     if name not in benches:

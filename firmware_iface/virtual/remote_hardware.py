@@ -35,10 +35,15 @@ USB_FAILURES = {failure.__name__: failure for failure in (NoDevice, Nak, Stall)}
 class RemoteHardware:
     """A connection to emulated hardware; for one thread at a time, others wait.
 
+    Parameters
+    ----------
+    path : str
+        Of its Unix socket.
+
     Raises
     ------
     OSError
-        Where it is not there.
+        Where there is none.
     """
 
     def __init__(self, path: str) -> None:
@@ -46,13 +51,13 @@ class RemoteHardware:
         self._lock = threading.Lock()
 
     def ask(self, request: Any, data: bytes = b"") -> tuple[Any, bytes]:
-        """One request; its answer. Raises what the hardware raised."""
+        """Send one request and return its answer; raises the exception that the hardware raised."""
         with self._lock:
             try:
                 self._connection.send_bytes(json.dumps(request).encode() + b"\n" + data)
                 answer, _, reply = self._connection.recv_bytes().partition(b"\n")
             except EOFError:
-                raise OSError(errno.ENODEV, "the emulated hardware is gone") from None
+                raise OSError(errno.ENODEV, "the emulated hardware has ended") from None
         result = json.loads(answer)
         if "error" in result:
             _raise(result["error"], result["with"])
@@ -77,7 +82,7 @@ class RemoteHardware:
         return self.ask({"do": "set", "name": name, "to": value})[0]
 
     def light(self, since_s: float = 0.0) -> list[tuple[float, float]]:
-        """(time s, µW of all lasers): what it was at `since_s`, and each change after it."""
+        """(time s, µW of all lasers): the light at `since_s`, and each change after it."""
         return [(at, power) for at, power in self.ask({"do": "light", "since": since_s})[0]]
 
     def whole(self) -> set[int]:
@@ -93,7 +98,7 @@ def _raise(kind: str, arguments: list[Any]) -> None:
 
 
 class _RemoteModel:
-    """The panel board as `VirtualUsb` sees a UsbModel."""
+    """The panel board, with the interface of UsbModel."""
 
     def __init__(self, remote: RemoteHardware) -> None:
         self._remote = remote
@@ -131,7 +136,7 @@ class _RemoteModel:
 
 class _RemoteUsb(VirtualUsb):
     def _call(self, handle: Any, timeout_ms: int, act: Any) -> Any:
-        handle.model.timeout_ms = timeout_ms  # the far end gives up by itself
+        handle.model.timeout_ms = timeout_ms  # the other process observes the time limit
         return super()._call(handle, timeout_ms, act)
 
 
@@ -147,21 +152,26 @@ class RemoteCamera:
         self.shape = (height, width)
 
     def capture(self) -> NDArray[np.uint16]:
-        """One picture, uint16 counts [h, w].
+        """One picture.
+
+        Returns
+        -------
+        uint16 array [h, w], counts
 
         Raises
         ------
         DeviceError
+            Where a fault is armed.
         """
         _, counts = self._remote.ask({"camera": "capture", "exposure_ms": self.exposure_ms})
         return np.frombuffer(counts, np.uint16).reshape(self.shape)
 
     def status(self) -> dict[str, Any]:
-        """What the camera says of itself."""
+        """Shape and settings, ready for JSON."""
         return {"shape": list(self.shape), "bit_depth": self.bit_depth, "exposure_ms": self.exposure_ms}
 
     def close(self) -> None:
-        """Let go of it."""
+        """End the connection."""
         self._remote.close()
 
 
@@ -188,8 +198,19 @@ def running(path: Path, bench: str, seed: int = 0, oak: str | None = None) -> It
 
     Parameters
     ----------
+    path : Path
+        Of the Unix socket.
+    bench : str
+        `virtual:NAME` or a TOML file.
+    seed : int
+        Of noise and garbage.
     oak : str or None
-        A loopback address to emulate an OAK camera at. Raises DeviceGoneError where it does not start.
+        A loopback address at which an OAK camera is emulated.
+
+    Raises
+    ------
+    DeviceGoneError
+        Where it does not start.
     """
     command = [
         sys.executable,
@@ -230,6 +251,7 @@ def usb_backend(bus: str) -> VirtualUsb:
     Raises
     ------
     DeviceGoneError
+        Where there is none.
     """
     known = _backends.get(bus)
     if known is not None:
@@ -245,5 +267,5 @@ def usb_backend(bus: str) -> VirtualUsb:
 
 
 def i2c_bus(bus: str) -> str:
-    """The same for the lasers: what firmware_iface.lasers.open_lasers takes for `virtual:SOCKET`."""
+    """The name of the lasers' bus for `virtual:SOCKET`, as firmware_iface.lasers.open_lasers takes it."""
     return bus + LASERS

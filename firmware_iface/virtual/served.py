@@ -1,10 +1,8 @@
-"""Emulated hardware in a process of its own, and the way to it.
+"""Emulated hardware in a process of its own.
 
     python -m firmware_iface.virtual.served SOCKET [--bench SPEC] [--seed N]
 
-Drivers reach it as `bus = "virtual:SOCKET"`: pyusb through `usb_backend`, smbus2 at the name that `i2c_bus`
-gives, the camera through `RemoteCamera`. `RemoteHardware` itself is for tests, who break parts and look at the light. A
-request and its answer are each a line of JSON and then bytes.
+`remote_hardware` is the way to it from other processes.
 """
 
 from __future__ import annotations
@@ -27,11 +25,11 @@ from firmware_iface.virtual.emulated_hardware import EmulatedHardware
 from firmware_iface.virtual.i2c.bus_server import BoardServer
 from firmware_iface.virtual.remote_hardware import LASERS
 
-SWITCH_S = 0.0002  # Python's 5 ms before a thread gives way are long on a bus
+SWITCH_S = 0.0002  # Python's 5 ms until another thread runs are long on a bus
 
 
 def answer(hardware: EmulatedHardware, request: dict[str, Any], data: bytes) -> tuple[Any, bytes]:
-    """Do one request; the answer, and bytes with it."""
+    """Carry out one request; its answer, and bytes that follow it."""
     match request:
         case {"usb": method}:
             return _usb(hardware.board, method, request, data)
@@ -91,7 +89,7 @@ def _serve(hardware: EmulatedHardware, connection: Connection) -> None:
                 outcome: dict[str, Any] = {"answer": result}
             except OSError as error:
                 outcome = {"error": "OSError", "with": [error.errno, error.strerror]}
-            except Exception as error:  # the other side is to see it, and this one to go on
+            except Exception as error:  # reported to the other side; this process continues
                 outcome = {"error": type(error).__name__, "with": [str(error)]}
             connection.send_bytes(json.dumps(outcome).encode() + b"\n" + reply)
 
@@ -104,7 +102,7 @@ def main() -> None:
     parser.add_argument("--oak", metavar="ADDRESS", help="a loopback address to emulate an OAK camera at")
     parser.add_argument("--seed", type=int, default=0, help="of noise and garbage")
     args = parser.parse_args()
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # emulated hardware is not to outlive its test
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # emulated hardware ends with its test
     sys.setswitchinterval(SWITCH_S)
     hardware = EmulatedHardware(args.bench, args.seed)
     for path in (args.socket, args.socket + LASERS):

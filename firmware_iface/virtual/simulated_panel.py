@@ -37,7 +37,7 @@ def share_grid(height: int, width: int) -> tuple[Array, Array]:
 class Drive:
     """Gray levels to phase on sub-pixels, for one channel, and the derivative back.
 
-    A pixel's phase is sign * map(x, y) * 2 pi gain s(gray / levels); a fringing field smears the profile.
+    A pixel's phase is sign * thickness(x, y) * 2 pi gain s(gray / levels); a fringing field smears the profile.
     """
 
     def __init__(self, bench: BenchDescription, wavelength_nm: float) -> None:
@@ -52,7 +52,7 @@ class Drive:
             self._full *= (
                 self._curve.gain * (self._curve.reference_nm / wavelength_nm) ** self._curve.dispersion
             )
-        self._map = _thickness_map(bench.defect(PhaseNonuniformity), panel.height, panel.width)
+        self._thickness = _thickness(bench.defect(PhaseNonuniformity), panel.height, panel.width)
         crosstalk = bench.defect(Crosstalk)
         self._smear_y = self._smear_x = None
         if crosstalk:
@@ -66,7 +66,7 @@ class Drive:
 
     def magnitude(self, gray: NDArray[np.floating]) -> Single:
         """Phase of each pixel before its sign, rad; `gray` may be fractional."""
-        return (self._full * self._map * self._shape(gray)).astype(np.float32)
+        return (self._full * self._thickness * self._shape(gray)).astype(np.float32)
 
     def slope(self, gray: NDArray[np.floating]) -> Single:
         """d magnitude / d gray, rad a gray level."""
@@ -75,20 +75,29 @@ class Drive:
         slope = np.ones_like(t)
         if d:
             slope += -d.s_curvature * np.cos(2 * np.pi * t) + np.pi * d.lopsidedness * np.sin(2 * np.pi * t)
-        return (self._full * self._map * slope / self.levels).astype(np.float32)
+        return (self._full * self._thickness * slope / self.levels).astype(np.float32)
 
     def gray_of(self, magnitude: Array) -> Array:
         """Fractional gray, 0..255, of each pixel's phase before its sign, rad; inverse of `magnitude`."""
         table = np.arange(256.0)
-        return np.interp(magnitude / (self._full * self._map), self._shape(table), table)
+        return np.interp(magnitude / (self._full * self._thickness), self._shape(table), table)
 
     def wrapped(self, gray: Array) -> Array:
-        """Gray levels in 0..255 whose phase is that of `gray` modulo 2 pi, or the nearest the panel can show.
+        """Gray levels in 0..255 with the phase of `gray` modulo 2 pi, or the nearest that the panel can show.
 
-        Fractional; meant for gradient steps that run over the panel's range by less than a wave.
+        For gradient steps that leave the panel's range by less than a wave.
+
+        Parameters
+        ----------
+        gray : float64 array [H, W]
+
+        Returns
+        -------
+        float64 array [H, W]
+            Fractional.
         """
         table = np.linspace(0, self.levels * 1.5, 3073)
-        scale = self._full * self._map
+        scale = self._full * self._thickness
         waves = 2 * np.pi / scale
         flat = self._shape(table)
         period = np.interp(waves, flat, table)
@@ -98,7 +107,7 @@ class Drive:
             self._shape(np.where(low | high, out, 0)) + np.where(low, waves, 0) - np.where(high, waves, 0)
         )
         out = np.where(low | high, np.interp(shifted, flat, table), out)
-        # where less than a wave is in reach, the far side of the gap may be nearer: split it in the middle
+        # where the panel shows less than a wave, the far side of the gap may be nearer: split it in the middle
         return np.where(out > 255, np.where(out - 255 > period - out, 0, 255), np.clip(out, 0, 255))
 
     def _shape(self, gray: NDArray[np.floating]) -> Array:
@@ -126,7 +135,7 @@ class Drive:
         return np.float32(self.sign) * out
 
 
-def _thickness_map(d: PhaseNonuniformity | None, height: int, width: int) -> Array:
+def _thickness(d: PhaseNonuniformity | None, height: int, width: int) -> Array:
     if d is None:
         return np.ones((1, 1))
     y, x = share_grid(height, width)
@@ -137,10 +146,22 @@ def _thickness_map(d: PhaseNonuniformity | None, height: int, width: int) -> Arr
 
 
 def smear_weights(width_px: float, asymmetry: float, q: int) -> Array:
-    """What each sub-pixel takes from its pixel's neighbours, [q, 2 R + 1]; rows sum to 1.
+    """Weights of a pixel's neighbours in the phase of each sub-pixel; rows sum to 1.
 
     The kernel is a two-sided exponential of decay lengths width (1 +/- asymmetry), integrated exactly over
     pixels and averaged over each sub-pixel.
+
+    Parameters
+    ----------
+    width_px : float, pixels
+    asymmetry : float
+        -1 to 1.
+    q : int
+        Sub-pixels across a pixel.
+
+    Returns
+    -------
+    float64 array [q, 2 R + 1]
     """
     after, before = max(width_px * (1 + asymmetry), 1e-6), max(width_px * (1 - asymmetry), 1e-6)
 
@@ -186,9 +207,14 @@ def _smear_adjoint(a: Single, weights: Array) -> Single:
 
 
 class Surface:
-    """What the pattern does not change at the panel: field = lit * exp(j phase) + unlit, on sub-pixels.
+    """The panel without its pattern: field = lit * exp(j phase) + unlit, on sub-pixels.
 
-    lit, unlit : complex64 [qH, qW], for a beam of unit mean irradiance; unlit is [1, 1] where `dark`
+    Attributes
+    ----------
+    lit, unlit : complex64 array [qH, qW]
+        For a beam of unit mean irradiance; unlit is [1, 1] where `dark`.
+    dark : bool
+        Whether no light is unmodulated.
     """
 
     def __init__(self, bench: BenchDescription, wavelength_nm: float) -> None:
@@ -198,9 +224,9 @@ class Surface:
         fill = leak.fill_factor if leak else bench.panel.fill_factor
         active = active_area(fill, q)
         covered = np.tile(active, (h, w))
-        map_ = beam * _stripes(bench.defect(Stripes), w, q)
+        amplitude = beam * _stripes(bench.defect(Stripes), w, q)
         path = panel_path_nm(bench.defect(PanelWavefront), h * q, w * q, w / h)
-        surface = map_ * np.exp(2j * np.pi * path / wavelength_nm) * _dust(bench.defect(Specks), h, w, q)
+        surface = amplitude * np.exp(2j * np.pi * path / wavelength_nm) * _dust(bench.defect(Specks), h, w, q)
         self.lit: Complex = (surface * covered).astype(np.complex64)
         self.dark = leak is None
         self.unlit: Complex = np.zeros((1, 1), np.complex64)

@@ -1,4 +1,4 @@
-"""From irradiance samples to camera counts: what the eye would see, what the camera makes of it, its noise.
+"""From irradiance samples to camera counts: the picture for the eye, the camera's picture, its noise.
 
 Irradiance samples [sY, sX] lie s a panel pixel over a padded window, sample (s i, s j) on the centre of pixel
 (i, j). Pixels integrate over their area: the box, the ghost and the lens are one exact filter of frequency.
@@ -29,14 +29,15 @@ Complex = NDArray[np.complex64]
 
 
 class Integrator:
-    """Camera pixels, and the picture that the eye would see on the panel's own grid.
+    """Irradiance on camera pixels, and on panel pixels, as the eye would see it.
 
     Parameters
     ----------
+    bench : BenchDescription
     samples : (int, int)
         (sY, sX), shape of the irradiance samples.
     oversampling : int
-        S, samples a panel pixel.
+        s, samples a panel pixel.
     """
 
     def __init__(self, bench: BenchDescription, samples: tuple[int, int], oversampling: int) -> None:
@@ -62,7 +63,7 @@ class Integrator:
         return np.fft.irfft2(np.fft.rfft2(wide) * self._display.conj(), s=self.samples).astype(np.float32)
 
     def camera(self, irradiance: Single) -> Array:
-        """Irradiance on camera pixels, [h, w]: through the lens, and where the camera really looks."""
+        """Irradiance on camera pixels, [h, w]: through the lens, at the camera's true position."""
         spectrum = np.fft.rfft2(irradiance) * self._camera
         if self._where is None:
             return self._on_grid(spectrum).astype(np.float64)
@@ -83,7 +84,7 @@ class Integrator:
 
 
 def ghost_filter(d: Ghost | None, fy: Array, fx: Array) -> Complex | Array:
-    """What a weak displaced copy does to the irradiance's spectrum; f in cycles a pixel."""
+    """Effect of a weak displaced copy on the irradiance's spectrum; f in cycles a pixel."""
     if d is None:
         return np.ones((1, 1))
     blur = np.exp(-2 * (np.pi * d.sigma_px) ** 2 * (fy**2 + fx**2))
@@ -166,10 +167,11 @@ class Sensor:
         self._convention = bench.defect(Convention)
 
     def electrons(self, irradiance: Array, dose: float) -> Array:
-        """Mean electrons, [h, w], of irradiance on camera pixels.
+        """Mean electrons of irradiance on camera pixels.
 
         Parameters
         ----------
+        irradiance : float64 array [h, w]
         dose : float
             Power as a share of full power, times exposure over 10 ms.
 
@@ -189,7 +191,7 @@ class Sensor:
         return dose * (signal + self.stray_e)
 
     def respond(self, electrons: Array) -> Array:
-        """Electrons as the read-out reports them: bent where the response is not straight."""
+        """Electrons as the read-out reports them, after a response that may be nonlinear."""
         d = self._response
         if d is None:
             return electrons

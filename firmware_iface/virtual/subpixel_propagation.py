@@ -47,7 +47,7 @@ class Band:
     q : int
         Sub-pixels across a pixel.
     border_px : float, pixels
-        Empty pixels added to each axis, at least.
+        Least number of empty pixels added to each axis.
     half_band : float
         The band's half width, cycles a pixel (0.5 is the panel's own); its edges are included.
     """
@@ -122,16 +122,18 @@ class Band:
 
 
 def walk_px(wavelength_nm: float, pitch_um: float, distance_mm: float, half_band: float) -> float:
-    """How far light at the band's edge walks sideways over a distance, panel pixels.
+    """Sideways distance that light at the band's edge travels.
 
     Parameters
     ----------
-    half_band : float
-        Cycles a pixel.
+    wavelength_nm : float, nm
+    pitch_um : float, µm
+    distance_mm : float, mm
+    half_band : float, cycles a pixel
 
     Returns
     -------
-    float, pixels
+    float, panel pixels
     """
     sine = min(half_band * wavelength_nm * 1e-3 / pitch_um, 0.99)
     return abs(distance_mm) * 1e3 / pitch_um * sine / np.sqrt(1 - sine**2)

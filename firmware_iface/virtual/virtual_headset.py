@@ -26,7 +26,7 @@ from firmware_iface.virtual.simulated_sensor import Drift, Integrator, Sensor
 
 
 class VirtualPanel:
-    """The phase panel. It shows gray 0 until told otherwise.
+    """The phase panel. It shows gray 0 at first.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class VirtualPanel:
 
     @property
     def gray(self) -> Gray:
-        """What is shown, uint8 [H, W]; a copy."""
+        """The gray levels shown, uint8 [H, W]; a copy."""
         return self._gray.copy()
 
     def show(self, gray: NDArray[np.generic]) -> None:
@@ -101,6 +101,8 @@ class VirtualCamera:
         (h, w), pixels.
     bit_depth : int
         Bits of a count.
+    take : callable
+        Gives one picture.
     """
 
     def __init__(
@@ -135,26 +137,26 @@ class VirtualCamera:
 
 
 class VirtualHeadset:
-    """All devices of one headset and the simulated bench they stand on.
+    """All devices of one headset, on a simulated bench.
 
     Parameters
     ----------
     description : BenchDescription
         The bench.
     seed : int
-        Fixes noise and drift; a capture's noise depends on the seed and on how many captures came
-        before.
+        Fixes noise and drift; a capture's noise depends on the seed and on the number of captures before.
 
     Attributes
     ----------
-    panel
-    lasers
-    camera
-    plane_mm : mm
-        Where the camera focuses.
-    time_s : s
-        Clock; runs on with each capture.
-    captures (how many were taken). The focus is the bench's distance at first
+    panel : VirtualPanel
+    lasers : VirtualLasers
+    camera : VirtualCamera
+    plane_mm : float, mm
+        Focus of the camera; the bench's distance at first.
+    time_s : float, s
+        Clock; each capture advances it.
+    captures : int
+        How many were taken.
     """
 
     def __init__(self, description: BenchDescription, seed: int = 0) -> None:
@@ -169,7 +171,7 @@ class VirtualHeadset:
         self._optics = BenchOptics(description)
         self._sensor = Sensor(description)
         self._drift = Drift(description.defect(LaserDrift), seed)
-        self._seen: dict[str, tuple[Gray, float, NDArray[np.float64]]] = {}
+        self._recent: dict[str, tuple[Gray, float, NDArray[np.float64]]] = {}
         self._integrators: OrderedDict[tuple[int, int, int], Integrator] = OrderedDict()
 
     def move_to_plane(self, plane_mm: float) -> None:
@@ -232,14 +234,18 @@ class VirtualHeadset:
         start: NDArray[np.generic] | None = None,
         progress: Callable[[int, float], None] | None = None,
     ) -> Gray:
-        """The best pattern, uint8 [H, W], by someone who knows the true bench. For tests and demonstrations.
+        """The best pattern where the true bench is known. For tests and demonstrations.
 
         Parameters
         ----------
         target_irradiance : float array [H, W]
             Any unit, not negative.
         start : array or None
-            Gray levels to start from; none: a smooth random phase at the image.
+            Gray levels to start from; None: a smooth random phase at the image.
+        channel : str
+        plane_mm : float or None, mm
+            None: the camera's focus.
+        iterations : int
         progress : callable or None
             Called with the iteration and the loss.
 
@@ -275,14 +281,14 @@ class VirtualHeadset:
         return self.plane_mm if plane_mm is None else checked_plane(plane_mm)
 
     def _camera_irradiance(self, gray: Gray, channel: str, plane_mm: float) -> NDArray[np.float64]:
-        """Irradiance on camera pixels; kept for each channel, since a camera that runs sees most of it again."""
-        last = self._seen.get(channel)
+        """Irradiance on camera pixels; kept for each channel, since a running camera repeats most of it."""
+        last = self._recent.get(channel)
         if last is not None and last[1] == plane_mm and np.array_equal(last[0], gray):
             return last[2]
         optics = self._optics.irradiance(gray, channel, plane_mm)
         seen = self._integrator(channel, plane_mm).camera(optics)
         seen.flags.writeable = False
-        self._seen[channel] = gray.copy(), plane_mm, seen
+        self._recent[channel] = gray.copy(), plane_mm, seen
         return seen
 
     def _integrator(self, channel: str, plane_mm: float) -> Integrator:
@@ -315,5 +321,6 @@ def open_headset(spec: str, seed: int = 0) -> VirtualHeadset:
     Raises
     ------
     InputError
+        Where there is no such bench.
     """
     return VirtualHeadset(load_bench(spec), seed)

@@ -18,13 +18,13 @@ class Ads1115(WordRegisters):
     Parameters
     ----------
     clock : callable
-        Seconds.
-    volts : callable, V
-        Voltage at input 0 to 3.
+        Gives the time, s.
+    volts : callable
+        Gives the voltage at input 0 to 3, V.
 
     Attributes
     ----------
-    alert
+    alert : bool
         Whether the ALERT pin is asserted.
     """
 

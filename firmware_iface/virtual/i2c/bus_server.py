@@ -20,12 +20,13 @@ PACKET = 65536
 
 
 class BoardServer:
-    """Serves a board's bus and lets its time run. `close` ends both.
+    """Serves a board's bus and lets the board's time run; `close` ends both.
 
     Parameters
     ----------
+    board : LaserBoard
     path : Path
-        Of the socket; made new.
+        Of the socket, which is created.
     """
 
     def __init__(self, board: LaserBoard, path: Path) -> None:
@@ -83,12 +84,12 @@ class RemoteBus:
         self._socket: socket.socket | None = None
 
     def transfer(self, messages: Sequence[Message]) -> list[bytes]:
-        """Carry the messages; the bytes read.
+        """Carry messages, as `I2cBus.transfer`.
 
         Raises
         ------
         OSError
-            As an adapter.
+            As from an adapter.
         """
         asked = [(m.address, None if m.data is None else m.data.hex(), m.length) for m in messages]
         with self._lock:
@@ -139,6 +140,7 @@ def connect(path: str) -> str:
     Raises
     ------
     OSError
+        Where nobody serves the bus.
     """
     if path not in _nodes:
         bus = RemoteBus(path)

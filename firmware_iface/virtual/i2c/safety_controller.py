@@ -32,7 +32,7 @@ class Fault(IntFlag):
 
 
 class Wiring(Protocol):
-    """What the controller's pins see."""
+    """Levels at the controller's pins."""
 
     key: bool
     interlock: bool
@@ -56,7 +56,7 @@ class SafetyController:
     Parameters
     ----------
     clock : callable
-        Seconds.
+        Gives the time, s.
     wiring : Wiring
         The board.
     built_for : tuple of (int, int, int)
@@ -64,10 +64,10 @@ class SafetyController:
 
     Attributes
     ----------
-    faults
-        Latched.
-    armed
-    ceilings : list of list of int or None
+    faults : Fault
+        Latched faults.
+    armed : bool
+    ceilings : list of [int or None, int or None]
         (drive, photodiode) for each laser; None: not written.
     """
 
@@ -78,7 +78,7 @@ class SafetyController:
         self.power_on()
 
     def power_on(self) -> None:
-        """Dark, unconfigured, nothing heard."""
+        """Dark, not configured, no token received."""
         self.faults = Fault(0)
         self.armed = False
         self.ceilings: list[list[int | None]] = [[None, None] for _ in LASERS]
@@ -89,7 +89,7 @@ class SafetyController:
         self._ticked = self._clock()
         self._pointer: int | None = None
 
-    # --- what it does to the light
+    # --- the light
 
     @property
     def gate(self) -> bool:
@@ -115,7 +115,7 @@ class SafetyController:
     def _threshold_v(self, laser: int) -> float:
         return self.built_for[laser][2] * 1e-4
 
-    # --- what it does in time
+    # --- time
 
     def settle(self) -> None:
         """Do what is due by now."""
@@ -189,7 +189,7 @@ class SafetyController:
         )
         return sum(bool(holding) << bit for bit, holding in enumerate(holds))
 
-    # --- what the host asks
+    # --- commands of the host
 
     def _command(self, value: int) -> None:
         now = self._clock()

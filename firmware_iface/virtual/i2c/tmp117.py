@@ -12,12 +12,12 @@ SOFT_RESET, THERM_MODE, WRITABLE, DATA_READY = 0x0002, 0x0010, 0x0FFC, 0x2000
 
 
 class Tmp117(WordRegisters):
-    """The thermometer. Its averaging and its modes are taken, and have no effect: data is always fresh.
+    """The thermometer. It accepts averaging and modes, which have no effect: data is always fresh.
 
     Parameters
     ----------
-    celsius : callable, °C
-        The temperature it feels.
+    celsius : callable
+        Gives the temperature, °C.
     """
 
     def __init__(self, celsius: Callable[[], float]) -> None:

@@ -1,4 +1,4 @@
-"""A simulated bench in front of the emulated camera."""
+"""Exposures of the emulated OAK camera that stands in front of a simulated bench."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ BITS = 10
 
 
 def expose_bench(capture: Callable[[float], NDArray[np.uint16]], camera: CameraDescription) -> Expose:
-    """What the emulated sensor reads where the bench's camera stands.
+    """The sensor of the emulated camera, at the place of the bench's camera.
 
     Parameters
     ----------
     capture : callable
-        A picture of the bench's camera, counts [h, w], at unit gain and the exposure given in ms.
+        From an exposure in ms to a picture of the bench's camera, counts [h, w], at unit gain.
     camera : CameraDescription
-        That camera; its counts are brought to 10 bits, and gain acts above its black level.
+        The bench's camera; its counts are converted to 10 bits, and gain acts above its black level.
 
     Returns
     -------
     callable
+        From exposure in ms and gain to 10-bit counts, uint16 array [h, w].
     """
     to_ten_bits = 2.0 ** (BITS - camera.bit_depth)
 

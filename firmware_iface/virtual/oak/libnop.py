@@ -27,7 +27,7 @@ def encode(value: Any) -> bytes:
     Raises
     ------
     TypeError
-        For what the format has no place for.
+        For a type or a number that the format cannot hold.
     """
     match value:
         case Encoded():
@@ -57,7 +57,7 @@ def decode(data: bytes) -> Any:
     Raises
     ------
     ValueError
-        Where it is not one.
+        Where the data is no value.
     """
     try:
         return _decode(data, 0, 0)[0]

@@ -29,6 +29,8 @@ def pack_raw10(counts: NDArray[np.uint16]) -> bytes:
 
 @dataclass(frozen=True)
 class SensorExposure:
+    """One exposure; `end_s` is its end, monotonic s."""
+
     counts: NDArray[np.uint16]
     end_s: float
     exposure_ms: float
@@ -36,6 +38,7 @@ class SensorExposure:
 
 
 def frame_message(exposure: SensorExposure, source: str, number: int) -> bytes:
+    """A frame as it is sent; `source` is "raw" for RAW10, any other name for GRAY8."""
     counts = exposure.counts
     height, width = counts.shape
     if source == "raw":
@@ -52,7 +55,7 @@ def frame_message(exposure: SensorExposure, source: str, number: int) -> bytes:
 
 
 def split_message(message: bytes) -> tuple[int, bytes]:
-    """(kind, metadata) of a message; the data before the metadata is of no use here."""
+    """(kind, metadata) of a message; the data before the metadata is not used."""
     if len(message) < 24 or message[-16:] != _MARKER:
         raise LinkDown
     size = int.from_bytes(message[-20:-16], "little")
@@ -60,7 +63,7 @@ def split_message(message: bytes) -> tuple[int, bytes]:
 
 
 def _geometry(width: int, height: int) -> tuple[Any, ...]:
-    """An image that was neither cropped nor turned, and a lens nobody calibrated."""
+    """An image that was neither cropped nor turned, and a lens without calibration."""
     rows = (encode([float(i == j) for j in range(3)]) for i in range(3))
     unit = Encoded(b"\xba\x03" + b"".join(rows))
     size = Unsigned(width), Unsigned(height)
@@ -70,6 +73,7 @@ def _geometry(width: int, height: int) -> tuple[Any, ...]:
 
 
 def camera_features(height: int, width: int) -> dict[str, Any]:
+    """What getConnectedCameraFeatures answers."""
     field = {"x": 0.0, "y": 0.0, "width": 1.0, "height": 1.0, "normalized": True, "hasNormalized": True}
     mode = {"width": width, "height": height, "minFps": 1.0, "maxFps": 120.0, "fov": field, "type": 1}
     return {

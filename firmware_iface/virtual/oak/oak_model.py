@@ -37,30 +37,30 @@ _MANUAL_EXPOSURE = 6  # bit of a control's command mask
 
 
 class OakModel:
-    """The camera; frames run from when a host has started a pipeline until it goes.
+    """The camera; frames run from the start of a host's pipeline until the host ends the link.
 
     Parameters
     ----------
     expose : callable
-        Given exposure in ms and gain, one picture, 10-bit counts uint16 [h, w] with w a multiple of 4;
-        called when an exposure begins.
+        From exposure in ms and gain to 10-bit counts, uint16 array [h, w], w a multiple of 4; called
+        when an exposure begins.
     shape : (int, int)
         (h, w), pixels.
     address : str
         Loopback address, so that several can run side by side.
-    frames_per_s : float, s
+    frames_per_s : float
         Rate, unless the exposure is longer.
     faults : Faults or None
         Asked for each frame (hang, timeout: not sent; late; garbage, short_write: malformed, which ends
-        the stream in the host) and each remote call (stall: refused); "unplug" drops the link and lets
-        nobody in.
+        the stream in the host) and each remote call (stall: refused); "unplug" drops the link and refuses
+        every host.
 
     Attributes
     ----------
-    exposure_ms : ms
-    gain
+    exposure_ms : float, ms
+    gain : float
         As the host set them.
-    frames
+    frames : int
         How many were sent.
     """
 
@@ -214,7 +214,7 @@ class OakModel:
                 wait([coming], max(self._period_s, self.exposure_ms / 1000))
                 if coming.done():
                     newest, coming = coming.result(), None
-                # a bench that takes longer than a frame to compute must not silence the stream: meanwhile the
+                # a bench that takes longer than a frame to compute must not interrupt the stream: meanwhile the
                 # frame before is sent again, with the time at which it was exposed
                 if newest is not None and self._send(link, stream, frame_message(newest, source, number)):
                     number += 1
@@ -236,7 +236,7 @@ class OakModel:
         return True
 
     def _take(self) -> SensorExposure:
-        """One exposure: what is there when it begins, at the time when it ends."""
+        """One exposure: the picture at its begin, with the time of its end."""
         exposure_ms, gain = self.exposure_ms, self.gain
         end_s = time.monotonic() + exposure_ms / 1000
         counts = self._expose(exposure_ms, gain)

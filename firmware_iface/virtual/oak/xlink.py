@@ -25,7 +25,7 @@ _LONGEST = 64 * 1024 * 1024
 
 
 class LinkDown(ConnectionError):
-    """The host has gone, or the link was dropped."""
+    """The host has ended the link, or it was dropped."""
 
 
 class Link:
@@ -52,7 +52,7 @@ class Link:
         self._last_id = 0
 
     def run(self) -> None:
-        """Serve the host until it goes."""
+        """Serve the host until it ends the link."""
         with suppress(OSError):
             while self._serve_one():
                 pass

@@ -54,20 +54,25 @@ class Dlpc900Model(UsbModel):
         (rows, columns) of memory bits; four of them, 2 x 2, are one mirror.
     electrodes : (int, int, int, int)
         Which bit of a mirror's value lies top left, top right, bottom left, bottom right.
+    mirrored : bool
+        Whether the memory's columns run the other way.
     controllers : int
         2 where a second one holds the right half.
 
     Attributes
     ----------
-    video (gives what is on the display link, uint32 [rows, columns] of 24 bits, or None for no signal); gray
-    shape; power
-    mode
-    running
-    entries : dict[int, PatternEntry]
-    images : dict[tuple[int, int], NDArray[np.uint32]]
-        As loaded.
-    commands
-        Their count.
+    video : callable or None
+        Gives the picture on the display link, uint32 array [rows, columns] of 24 bits; None: no signal.
+    gray : uint8 array [H, W]
+    shape : (int, int)
+        (H, W), mirrors.
+    power, mode : int
+    running : bool
+    entries : dict of int to PatternEntry
+    images : dict of (int, int) to uint32 array
+        By image and controller, as loaded.
+    commands : int
+        How many were received.
     """
 
     def __init__(

@@ -48,15 +48,17 @@ class BoardModel(UsbModel):
     faults : Faults or None
         See UsbModel.
     clock : callable
-        Seconds, rising.
+        Gives the time, s.
 
     Attributes
     ----------
-    gray : uint8 array
-        What the panel shows now.
-    shown : deque[tuple[int, int]]
+    gray : uint8 array [H, W]
+        On the panel now.
+    shown : deque of (int, int)
         Sequence and CRC-32 of the frames displayed, the newest last, up to 4096.
-    fault_bits and temperature_c (what STATUS reports)
+    fault_bits : int
+    temperature_c : float, °C
+        As STATUS reports them.
     """
 
     def __init__(

@@ -58,8 +58,8 @@ class VirtualUsb:
 
     Parameters
     ----------
-    models : UsbModel
-        UsbModel, any number; more may be added to the attribute `models`.
+    *models : UsbModel
+        More may be added to the attribute `models`.
     """
 
     def __init__(self, *models: UsbModel) -> None:

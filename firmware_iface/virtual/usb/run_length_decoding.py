@@ -9,14 +9,29 @@ from numpy.typing import NDArray
 
 
 class CommandError(Exception):
-    """The command fails with this error number."""
+    """A command fails; `number` is the controller's error number."""
 
     def __init__(self, number: int) -> None:
         self.number = number
 
 
 def decode_image(data: bytes, height: int, width: int) -> NDArray[np.uint32]:
-    """The pixels of a compressed image with its header, uint32 [height, width]; refuses what is none."""
+    """Decode a compressed image with its header.
+
+    Parameters
+    ----------
+    data : bytes
+    height, width : int, pixels
+
+    Returns
+    -------
+    uint32 array [height, width]
+
+    Raises
+    ------
+    CommandError
+        Where the data is no such image.
+    """
     if len(data) < 48 or data[:4] != b"Spld" or struct.unpack_from("<HH", data, 4) != (width, height):
         raise CommandError(6)
     if data[25] != 2:

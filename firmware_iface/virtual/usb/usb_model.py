@@ -1,6 +1,6 @@
 """A USB device at the level of its bytes: descriptors, setup packets, endpoints, and faults on any of them.
 
-A front end (pyusb's backend in `backend`, or a host controller's) calls `control`, `write` and `read`; a
+A front end (`pyusb_backend`, or a host controller) calls `control`, `write` and `read`; a
 model fills in `on_control`, `on_write` and `on_read` and may raise Stall or Nak there.
 """
 
@@ -27,11 +27,11 @@ class Stall(Exception):
 
 
 class Nak(Exception):
-    """The device has nothing to say or no room yet; raised to the front end once it has given up."""
+    """The device has no data or no room yet; raised to the front end after its time limit."""
 
 
 class NoDevice(Exception):
-    """The cable is out."""
+    """The device is unplugged."""
 
 
 def device_descriptor(vendor: int, product: int, release: int = 0x0100) -> bytes:
@@ -56,7 +56,7 @@ def endpoint_descriptor(address: int, kind: int, packet: int, interval: int = 0)
 
 
 class UsbModel:
-    """What every modelled USB device does; thread safe.
+    """Behaviour that every modelled USB device has; thread safe.
 
     Parameters
     ----------
@@ -69,9 +69,10 @@ class UsbModel:
 
     Attributes
     ----------
-    generation
-        Counts how often it was plugged in; old handles are dead.
-    configured
+    generation : int
+        How often it was plugged in; handles of earlier generations are invalid.
+    configured : int
+        The configuration in force; 0: none.
     """
 
     def __init__(
@@ -87,7 +88,7 @@ class UsbModel:
 
     @property
     def present(self) -> bool:
-        """Whether it is plugged in. A device that was out meanwhile has lost its state."""
+        """Whether it is plugged in. A device that was unplugged meanwhile has lost its state."""
         with self._lock:
             if self.generation != self.faults.ended["unplug"]:
                 self.generation = self.faults.ended["unplug"]
