@@ -121,7 +121,7 @@ class UsbLink:
         taken = self._do(lambda d: d.write(endpoint, data, self._ms))
         if taken != len(data):
             raise DeviceError(
-                f"{self.name} took {taken} of {len(data)} bytes; send them again, and where that goes on, "
+                f"{self.name} took {taken} of {len(data)} bytes; send them again, and if that repeats, "
                 "check the cable."
             )
 

@@ -78,7 +78,7 @@ class SafetyController:
         found = (self._read(IDENTITY, 1), self._read(VERSION, 1))
         if found != KNOWN:
             raise DeviceError(
-                f"the safety controller says identity {found[0]:#04x}, version {found[1]}, and this driver knows "
+                f"the safety controller reports identity {found[0]:#04x}, version {found[1]}, and this driver needs "
                 f"{KNOWN[0]:#04x}, version {KNOWN[1]}; check the address and the board's firmware."
             )
 

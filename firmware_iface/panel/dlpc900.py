@@ -82,7 +82,7 @@ class Dlpc900Control:
         flags, answer = self._exchange(code, data, read)
         if flags & _FAILED:
             number = self._exchange(LAST_ERROR, b"", True)[1][:1]
-            reason = ERRORS.get(number[0], f"error {number[0]}") if number else "it does not say why"
+            reason = ERRORS.get(number[0], f"error {number[0]}") if number else "it gives no reason"
             raise DeviceError(f"{self.name} refused command 0x{code:04x}: {reason}.")
         return answer
 
@@ -148,7 +148,7 @@ class Dlpc900Control:
         end = time.monotonic() + LOCK_S
         while not self._byte(MAIN_STATUS) & 8:
             if time.monotonic() > end:
-                raise DeviceError(f"{self.name} sees no picture on {self._receiver}; check that cable.")
+                raise DeviceError(f"{self.name} detects no picture on {self._receiver}; check that cable.")
             time.sleep(0.05)
         self.set_mode("video-pattern")
         self.define(1)

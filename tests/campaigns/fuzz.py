@@ -1,9 +1,9 @@
-"""Coverage-guided fuzzing of every parser of bytes that we wrote: no crash, no hang, no read beyond the message.
+"""Coverage-guided fuzzing of every parser of bytes in the project: no crash, no hang, no read beyond the message.
 
     python -m tests.campaigns.fuzz [--seconds N] [--json] [TARGET ...]
 
-Each target takes any bytes and may refuse them with the errors it documents; anything else, five seconds
-without an end, or two gigabytes is a finding: the run ends with exit code 1 and the input lies in the folder
+Each target takes any bytes and may refuse them with the errors it documents; anything else, a run of
+more than five seconds, or two gigabytes is a finding: the run ends with exit code 1 and the input lies in the folder
 given by --findings. Needs the extra `fuzz` (atheris).
 """
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -53,7 +55,7 @@ def test_any_picture_is_unpacked_within_its_bytes_or_refused(
     try:
         counts = unpack(data, encoding, height, width, stride)
     except ValueError as error:
-        assert str(error)
+        assert re.search("not known|whole groups of four|do not hold", str(error))
         return
     assert counts.shape == (height, width) and counts.max() <= (1023 if encoding == "raw10" else 255)
     assert stride * (height - 1) < len(data)

@@ -112,7 +112,7 @@ class LaserBoard:
         }
 
     def power_cycle(self) -> None:
-        """Off and on again: every part in its power-on state, the DAC as its EEPROM says."""
+        """Off and on again: every part in its power-on state, the DAC as stored in its EEPROM."""
         with self.bus.lock:
             self._power_on()
         self.settle()

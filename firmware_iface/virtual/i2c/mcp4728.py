@@ -69,7 +69,7 @@ class Mcp4728:
         self.power_on()
 
     def power_on(self) -> None:
-        """Outputs as the EEPROM says."""
+        """Outputs as stored in the EEPROM."""
         self.channels = list(self.eeprom)
 
     def volts(self, channel: int) -> float:

@@ -137,7 +137,7 @@ class SafetyController:
             self._ticked = max(self._ticked, time_s)
 
     def _next_limits_v(self) -> list[float]:
-        """Where the limits may be in a tick from now; they fall there at once, and rise there with the tick."""
+        """The limits of the next tick; they fall at once, and rise with the tick."""
         limits = []
         for k in LASERS:
             ceiling, threshold = (self.ceilings[k][0] or 0) * 1e-4, self._threshold_v(k)

@@ -221,7 +221,7 @@ class OakModel:
                 self._sleep_until(begin + self._period_s)
 
     def _send(self, link: Link, stream: int, frame: bytes) -> bool:
-        """Send a frame as the faults say; whether it was sent."""
+        """Send a frame, with its faults; whether it was sent."""
         fault = self.faults.take("hang", "timeout", "late", "garbage", "short_write")
         if fault in ("hang", "timeout"):
             return False

@@ -93,7 +93,7 @@ class Link:
                 return False
             data = self._exactly(size)
             self._answer(number, kind, name, stream, size)
-            self._request(READ_RELEASE, name, stream, size)  # taken at once, so the host may go on
+            self._request(READ_RELEASE, name, stream, size)  # taken at once, so the host may send more
             self._received[stream].put(data)
         elif kind == CREATE:
             self._names[stream], self._received[stream] = name, Queue()

@@ -172,7 +172,7 @@ class BoardModel(UsbModel):
         self._state, self._header = FILLING, (sequence, length, pixels_crc)
 
     def _run(self) -> None:
-        """Let the periods pass that the clock says have passed."""
+        """Carry out what is due after the periods that have passed."""
         if self._state == PENDING and self._periods() >= self._due:
             assert self._header is not None
             self._front = bytes(self._back)

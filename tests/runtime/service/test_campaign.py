@@ -9,8 +9,8 @@ import smbus2
 
 from firmware_iface.lasers.i2c_transfers import open_bus
 from firmware_iface.virtual.remote_hardware import i2c_bus
+from tests.campaigns.fault_kinds import KINDS
 from tests.campaigns.faults import campaign, plans, summary
-from tests.campaigns.kinds import KINDS
 from tests.campaigns.lane import Lane
 from tests.campaigns.soak import soak
 
