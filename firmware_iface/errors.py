@@ -32,8 +32,8 @@ def nearest(word: str, known: Iterable[str]) -> str:
 
 
 class DeviceError(RuntimeError):
-    """A device did not do what it was asked: one sentence that says which, what happened, and what to do."""
+    """A device failed: one sentence that says which, what happened, and what to do."""
 
 
 class DeviceGoneError(DeviceError):
-    """The device is not there (any more); it may come back."""
+    """The device is not attached, or not any more; it may come back."""

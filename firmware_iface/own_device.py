@@ -29,7 +29,13 @@ NEEDED = {
 
 
 def check_kind(kind: str, part: str, known: Collection[str]) -> None:
-    """Raise InputError where a kind of a [panel] or [camera] is neither known nor MODULE:FUNCTION."""
+    """Check the kind of a [panel] or [camera].
+
+    Raises
+    ------
+    InputError
+        Where it is neither known nor MODULE:FUNCTION.
+    """
     if kind in known:
         return
     module, _, function = kind.partition(":")

@@ -112,7 +112,7 @@ def exposure(
     wavelength_nm: Mapping[str, float],
     shares: Mapping[str, Sequence[float]] | None = None,
 ) -> Exposure:
-    """What these lasers use of the Class 1 limits.
+    """Shares of the Class 1 limits that these lasers use.
 
     Parameters
     ----------

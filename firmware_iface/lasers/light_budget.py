@@ -50,15 +50,21 @@ class LightBudget:
         self._shares = found
 
     def exposure(self, fractions: Mapping[str, float]) -> Exposure:
-        """What fractions of full power, by channel, use of the Class 1 limits with the prediction in force."""
+        """Shares of the Class 1 limits at fractions of full power, by channel, with the prediction in force."""
         return exposure(self._power_uw(fractions), self._wavelength_nm, self._shares)
 
     def exposure_at_full_power(self) -> Exposure:
-        """What all lasers at full power use of the limits, in one spot."""
+        """Shares of the Class 1 limits with all lasers at full power, in one spot."""
         return exposure(self._full_power_uw, self._wavelength_nm)
 
     def check(self, fractions: Mapping[str, float]) -> None:
-        """Raise InputError where fractions of full power, by channel, would exceed the budget."""
+        """Check fractions of full power, by channel.
+
+        Raises
+        ------
+        InputError
+            Where they would exceed the budget.
+        """
         worst = self.exposure(fractions).worst
         if worst > 1 + 1e-9:
             raise InputError(

@@ -74,7 +74,13 @@ class SafetyController:
         self._bus, self._address = bus, address
 
     def check_identity(self) -> None:
-        """Raise DeviceError unless it is a controller of this protocol."""
+        """Check that it is a controller of this protocol.
+
+        Raises
+        ------
+        DeviceError
+            Where it is not.
+        """
         found = (self._read(IDENTITY, 1), self._read(VERSION, 1))
         if found != KNOWN:
             raise DeviceError(

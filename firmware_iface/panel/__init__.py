@@ -1,4 +1,4 @@
-"""Phase panels: our own panel board, TI's DLPC900, mirrored displays, and what slmsuite drives."""
+"""Panels (phase-only spatial light modulators): a panel board over USB, TI's DLPC900, and screens."""
 
 from firmware_iface.panel.dlpc900 import open_dlpc900
 from firmware_iface.panel.mirrored_display import MirroredDisplay, open_mirrored

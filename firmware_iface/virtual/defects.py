@@ -180,7 +180,7 @@ class SensorBlur(Defect):
 
 @dataclass(frozen=True)
 class Misregistration(Defect):
-    """What is left of shift, rotation, scale and distortion after registration."""
+    """Shift, rotation, scale and distortion that remain after registration."""
 
     kind = "misregistration"
     stage = "sensor"

@@ -16,7 +16,7 @@ class WordRegisters(ABC):
 
     @abstractmethod
     def store(self, register: int, value: int) -> None:
-        """Take what is written."""
+        """Store a written value."""
 
     def write(self, data: bytes) -> None:
         """Pointer alone, or pointer and value."""

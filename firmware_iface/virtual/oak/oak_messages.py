@@ -73,7 +73,7 @@ def _geometry(width: int, height: int) -> tuple[Any, ...]:
 
 
 def camera_features(height: int, width: int) -> dict[str, Any]:
-    """What getConnectedCameraFeatures answers."""
+    """The answer to getConnectedCameraFeatures."""
     field = {"x": 0.0, "y": 0.0, "width": 1.0, "height": 1.0, "normalized": True, "hasNormalized": True}
     mode = {"width": width, "height": height, "minFps": 1.0, "maxFps": 120.0, "fov": field, "type": 1}
     return {

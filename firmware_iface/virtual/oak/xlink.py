@@ -153,7 +153,7 @@ def listen(address: str) -> tuple[socket.socket, socket.socket]:
 
 
 def discovery_answer(question: bytes, serial: str) -> bytes | None:
-    """What a booted device answers to a discovery datagram; None where it is none."""
+    """The answer of a booted device to a discovery datagram; None where the question is none."""
     if len(question) < 4 or question[:4] != struct.pack("<I", 1):
         return None
     return struct.pack("<I32sI", 1, serial.encode(), BOOTED)

@@ -58,6 +58,8 @@ class Dlpc900Model(UsbModel):
         Whether the memory's columns run the other way.
     controllers : int
         2 where a second one holds the right half.
+    faults : Faults or None
+        See UsbModel.
 
     Attributes
     ----------
