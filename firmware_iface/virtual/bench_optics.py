@@ -22,7 +22,8 @@ from firmware_iface.virtual.defects import (
     SpatialCoherence,
     TemporalCoherence,
 )
-from firmware_iface.virtual.simulated_panel import Drive, Surface, tilt_factor
+from firmware_iface.virtual.simulated_drive import Drive
+from firmware_iface.virtual.simulated_panel import Surface, tilt_factor
 from firmware_iface.virtual.subpixel_propagation import Band, walk_px
 
 Single = NDArray[np.float32]

@@ -68,7 +68,7 @@ def panel_board() -> Target:
 
 def modulator_answers() -> Target:
     """Answers of the DLPC900."""
-    from firmware_iface.panel.dlpc900 import parse_answer
+    from firmware_iface.panel.dlpc900_commands import parse_answer
 
     def one(data: bytes) -> None:
         with suppress(ValueError):

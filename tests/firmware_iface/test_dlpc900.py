@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
 from firmware_iface.panel import Panel, open_dlpc900, run_length_encoding
 from firmware_iface.panel import phase_light_modulator as plm
-from firmware_iface.panel.dlpc900 import Dlpc900Control, PatternUpload, parse_answer
+from firmware_iface.panel.dlpc900 import PatternUpload
+from firmware_iface.panel.dlpc900_commands import Dlpc900Control, parse_answer
 from firmware_iface.panel.phase_light_modulator import P47, P67, Modulator
 from firmware_iface.virtual.usb import Dlpc900Model, VirtualUsb
 from firmware_iface.virtual.usb.run_length_decoding import CommandError, decode_image
