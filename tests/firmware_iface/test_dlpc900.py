@@ -97,7 +97,7 @@ def test_the_bytes_of_one_upload() -> None:
         "08 00 2a 1a",
     ]
     assert sent[1][6:18].hex(" ") == "00 00 80 3e 00 71 00 00 00 00 00 00"  # pattern 0, 16000 us, 1 bit
-    assert sent[2][6:12].hex(" ") == "01 00 00 00 00 00"  # one pattern, for ever
+    assert sent[2][6:12].hex(" ") == "01 00 00 00 00 00"  # one pattern, without end
     encoded = run_length_encoding.encode(
         plm.bit_plane(np.array([[0, 240]], np.uint8), mirror).astype(np.uint32)
     )
@@ -196,7 +196,7 @@ def test_power_mode_and_status() -> None:
         (0x1A24, b"\2", "not for this mode"),
     ],
 )
-def test_the_controllers_reason_is_told(code: int, data: bytes, reason: str) -> None:
+def test_the_controllers_reason_is_reported(code: int, data: bytes, reason: str) -> None:
     control = opened(small_model()).control
     assert isinstance(control, Dlpc900Control)
     with pytest.raises(DeviceError, match=f"0x{code:04x}: .*{reason}"):

@@ -1,4 +1,4 @@
-"""Benches in TOML and by name: what is read, what is refused, what is told."""
+"""Benches in TOML and by name: what is read, what is refused, what is reported."""
 
 from __future__ import annotations
 

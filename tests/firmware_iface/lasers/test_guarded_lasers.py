@@ -218,7 +218,7 @@ def test_the_interface_of_the_lasers(light: Light, lasers: GuardedLasers) -> Non
 
 
 @patient
-def test_a_fault_is_told_with_the_next_heartbeat_and_until_it_is_armed_again(
+def test_a_fault_is_reported_with_the_next_heartbeat_and_until_it_is_armed_again(
     light: Light, lasers: GuardedLasers
 ) -> None:
     lasers.arm()

@@ -293,7 +293,7 @@ def test_power_on_is_dark_even_with_a_bright_eeprom_and_everything_closed(bench:
     "kind", ["nack", "timeout", "stall", "short_write", "garbage", "unplug", "late", "hang"]
 )
 @pytest.mark.parametrize("after", range(0, 12))
-def test_any_fault_of_the_bus_ends_dark_within_150_ms_and_is_told(
+def test_any_fault_of_the_bus_ends_dark_within_150_ms_and_is_reported(
     bench: Bench, kind: str, after: int
 ) -> None:
     """While showing, wherever in the traffic it strikes: four heartbeats' transfers and a change of power."""
@@ -302,7 +302,7 @@ def test_any_fault_of_the_bus_ends_dark_within_150_ms_and_is_told(
     lasers.set_power("red", 0.5)
     faults, take = bench.board.bus.faults, bench.board.bus.faults.take
     struck_at: list[float] = []
-    told = False
+    reported = False
 
     def watched(*kinds: str) -> str | None:
         hit = take(*kinds)
@@ -321,20 +321,20 @@ def test_any_fault_of_the_bus_ends_dark_within_150_ms_and_is_told(
             lasers.heartbeat()
         lasers.set_power("red", 0.6)
     except DeviceError:
-        told = True
+        reported = True
     assert struck_at
-    assert told or kind in ("garbage", "late"), (
+    assert reported or kind in ("garbage", "late"), (
         "garbage in a write, or lateness within the window, harms nothing"
     )
-    assert (bench.light_uw == 0) == told
-    if told:
+    assert (bench.light_uw == 0) == reported
+    if reported:
         assert lasers.power("red") == 0
         assert bench.seen[-1][0] - struck_at[0] <= 0.150
 
 
 def test_a_reply_of_garbage_is_never_believed(bench: Bench) -> None:
-    """Over many random replies to heartbeats: it is told and dark, or the reply did not matter."""
-    told = 0
+    """Over many random replies to heartbeats: it is reported and dark, or the reply did not matter."""
+    reported = 0
     for _ in range(60):
         lasers = bench.armed()
         lasers.set_power("green", 0.5)
@@ -344,12 +344,12 @@ def test_a_reply_of_garbage_is_never_believed(bench: Bench) -> None:
                 bench.pass_time(0.025)
                 lasers.heartbeat()
         except DeviceError:
-            told += 1
+            reported += 1
             assert bench.light_uw == 0
         bench.board.bus.faults.clear()
         lasers.close()
         bench.board.power_cycle()
-    assert told >= 59, "one in 256 passes the packet error code"
+    assert reported >= 59, "one in 256 passes the packet error code"
 
 
 def bright(bench: Bench) -> Lasers:
@@ -459,7 +459,7 @@ def test_clearing_while_it_emits_is_an_off_that_the_photodiodes_agree_with(bench
         lasers.heartbeat()
 
 
-def test_every_part_is_told_to_go_dark_whatever_the_others_do(
+def test_every_part_is_switched_off_also_where_others_fail(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lasers = bench.armed()
@@ -536,7 +536,7 @@ def test_a_new_host_goes_on_where_the_last_token_was(bench: Bench) -> None:
     first._token = 0
     bench.pass_time(0.02)
     first._beat()  # token 1, as a new host's first one would be
-    first._closed = True  # the process is gone without a word
+    first._closed = True  # the process was killed
     bench.pass_time(0.2)
     second = bench.open()
     second.clear()
