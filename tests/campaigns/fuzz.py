@@ -195,7 +195,7 @@ def service_messages() -> Target:
 def bundles() -> Target:
     """A bundle's manifest and its arrays, also where the hashes are right."""
     from firmware_iface.errors import InputError
-    from runtime.bundle.bundle_folder import bundle_folder as bundle
+    from runtime.bundle import bundle_folder as bundle
 
     folder = Path(_SCRATCH.name)
 
