@@ -1,4 +1,8 @@
-"""Devices of a holographic headset, and virtual ones with a simulated bench behind them.
+"""Drivers for the devices of a holographic headset, and virtual devices with a simulated bench behind them.
+
+The panel is a phase-only spatial light modulator (SLM). A file of `virtual/i2c` or `virtual/usb` with the name of a
+driver is the model of the same part: `lasers/mcp4728.py` drives the DAC that `virtual/i2c/mcp4728.py` emulates,
+`panel/dlpc900.py` the controller of `virtual/usb/dlpc900.py`. Model and driver share no code.
 
 At most numpy is imported here; vendor libraries are imported when a device is opened.
 """

@@ -6,10 +6,10 @@ Copy this file and `tests/firmware_iface/test_driver_template.py`, and change fo
 2. the parse function: bytes in, a value or ValueError out, nothing else, so that it can be fuzzed,
 3. the class: a handful of methods in physical units, each a transfer that succeeded or a DeviceError,
 4. the model (here ThermometerModel in the test): the same bytes written down a second time, from the
-   device's documentation and not from the driver, on `virtual.usb.UsbModel` or the I2C bus.
+   device's documentation and not from the driver, on `virtual.usb.usb_model.UsbModel` or the I2C bus.
 
 The tests are the same for every device: the bytes of opening and using it, each fault of
-`virtual.faults.KINDS` that its bus knows, unplug and replug, and random bytes into the parse function.
+`virtual.fault_injection.KINDS` that its bus knows, unplug and replug, and random bytes into the parse function.
 """
 
 from __future__ import annotations
@@ -25,7 +25,21 @@ READ_TEMPERATURE = 1
 
 
 def parse_temperature(reply: bytes) -> float:
-    """°C from i16 in 0.01 °C and its complement; ValueError where these are not four such bytes."""
+    """Temperature from i16 in 0.01 °C and its complement.
+
+    Parameters
+    ----------
+    reply : bytes
+
+    Returns
+    -------
+    float, °C
+
+    Raises
+    ------
+    ValueError
+        Where these are not four such bytes.
+    """
     value, complement = struct.unpack("<hh", reply) if len(reply) == 4 else (0, 0)
     if value != ~complement:
         raise ValueError("the reply is garbled")
@@ -33,9 +47,14 @@ def parse_temperature(reply: bytes) -> float:
 
 
 class Thermometer:
-    """The device. Opening takes the bus, so that it runs on an emulated one.
+    """The device; the bus is a parameter, so that it runs on an emulated one.
 
-    backend : a pyusb backend; None is the system's libusb
+    Parameters
+    ----------
+    backend : pyusb backend or None
+        None is the system's libusb.
+    timeout_s : float, s
+        Longest wait for one transfer.
     """
 
     def __init__(self, backend: Any = None, timeout_s: float = 0.5) -> None:
@@ -43,16 +62,22 @@ class Thermometer:
         self._link.open()
 
     def temperature_c(self) -> float:
-        """Temperature, °C; raises DeviceError."""
+        """Temperature, °C.
+
+        Raises
+        ------
+        DeviceError
+            Where it does not answer or the reply is garbled.
+        """
         try:
             return parse_temperature(self._link.control_in(READ_TEMPERATURE, 4))
         except ValueError as error:
             raise DeviceError(f"the thermometer: {error}; check its cable.") from error
 
     def status(self) -> dict[str, Any]:
-        """What the device says of itself; raises DeviceError."""
+        """What the device reports; raises as `temperature_c`."""
         return {"temperature_c": self.temperature_c()}
 
     def close(self) -> None:
-        """Let go of the device."""
+        """Release the device."""
         self._link.close()

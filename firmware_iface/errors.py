@@ -13,8 +13,16 @@ class InputError(ValueError):
 def nearest(word: str, known: Iterable[str]) -> str:
     """A hint that names the known word nearest to `word`, or lists all known words when none is near.
 
-    word : str, what was written
-    known : iterable of str, what could have been written
+    Parameters
+    ----------
+    word : str
+        As it was written.
+    known : iterable of str
+        What could have been written.
+
+    Returns
+    -------
+    str
     """
     names = list(known)
     close = difflib.get_close_matches(str(word), names, n=1, cutoff=0.5)
@@ -24,8 +32,8 @@ def nearest(word: str, known: Iterable[str]) -> str:
 
 
 class DeviceError(RuntimeError):
-    """A device did not do what it was asked: one sentence that says which, what happened, and what to do."""
+    """A device failed: one sentence that says which, what happened, and what to do."""
 
 
 class DeviceGoneError(DeviceError):
-    """The device is not there (any more); it may come back."""
+    """The device is not attached, or not any more; it may come back."""

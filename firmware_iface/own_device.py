@@ -29,7 +29,13 @@ NEEDED = {
 
 
 def check_kind(kind: str, part: str, known: Collection[str]) -> None:
-    """Raise InputError where a kind of a [panel] or [camera] is neither known nor MODULE:FUNCTION."""
+    """Check the kind of a [panel] or [camera].
+
+    Raises
+    ------
+    InputError
+        Where it is neither known nor MODULE:FUNCTION.
+    """
     if kind in known:
         return
     module, _, function = kind.partition(":")
@@ -41,10 +47,28 @@ def check_kind(kind: str, part: str, known: Collection[str]) -> None:
 
 
 def open_own(kind: str, part: str, **settings: Any) -> Any:
-    """What the function of kind = "MODULE:FUNCTION" returns; modules of the current folder are found, too.
+    """Open a device by calling the lab's function.
 
-    part : "panel" or "camera", which say what it has to have (see NEEDED). settings : attributes that are set then.
-    Raises InputError where it cannot be called or returns something else, DeviceError where it fails.
+    Parameters
+    ----------
+    kind : str
+        "MODULE:FUNCTION"; modules of the current folder are found, too.
+    part : str
+        "panel" or "camera": which attributes the device needs (see NEEDED).
+    **settings
+        Attributes of the device that are set after opening.
+
+    Returns
+    -------
+    object
+        What the function returned.
+
+    Raises
+    ------
+    InputError
+        Where it cannot be called or returns something else.
+    DeviceError
+        Where it fails.
     """
     function = _imported(kind, part)
     try:
@@ -58,7 +82,7 @@ def open_own(kind: str, part: str, **settings: Any) -> Any:
             setattr(device, name, value)
     except (InputError, DeviceError):
         raise
-    except Exception as error:  # vendors' libraries raise what they like
+    except Exception as error:  # vendors' libraries raise any exception
         raise DeviceError(
             f"the {part} of {kind} cannot be opened: {str(error) or type(error).__name__}."
         ) from error
@@ -71,7 +95,7 @@ def _imported(kind: str, part: str) -> Callable[[], Any]:
     sys.path.insert(0, here)
     try:
         function = getattr(importlib.import_module(module), name)
-    except Exception as error:  # whatever the lab's module does when it is read
+    except Exception as error:  # the lab's module may raise any exception when it is imported
         raise InputError(
             f"'kind' in [{part}] is {kind!r}, which cannot be imported ({error}): install the module, or start "
             "where its file is."

@@ -1,4 +1,4 @@
-"""What slmsuite drives, as ours: pass any of its SLM or camera objects.
+"""Panels and cameras that slmsuite drives, behind the interfaces used here: pass its SLM or camera object.
 
 panel = SlmsuitePanel(SLM(...))
 camera = SlmsuiteCamera(Camera(...))
@@ -21,7 +21,11 @@ class SlmsuitePanel:
     Gray levels go to it as they are, as display values: slmsuite's own wavefront correction and its sign of
     phase do not touch them. On a panel of more than 8 bits, gray is scaled to its range.
 
-    Attributes: slm, shape ((H, W), pixels).
+    Attributes
+    ----------
+    slm : slmsuite SLM
+    shape : (int, int)
+        (H, W), pixels.
     """
 
     def __init__(self, slm: Any) -> None:
@@ -30,7 +34,19 @@ class SlmsuitePanel:
         self._bits = int(slm.bitdepth)
 
     def show(self, gray: NDArray[np.generic]) -> None:
-        """Show gray levels, uint8 [H, W], and wait for the panel to settle."""
+        """Show gray levels and wait for the panel to settle.
+
+        Parameters
+        ----------
+        gray : uint8 array [H, W]
+
+        Raises
+        ------
+        InputError
+            For another type or size.
+        DeviceError
+            Where slmsuite fails.
+        """
         levels: NDArray[Any] = checked_gray(gray, self.shape)
         if self._bits > 8:
             levels = levels.astype(np.uint16) << (self._bits - 8)
@@ -38,22 +54,27 @@ class SlmsuitePanel:
             levels = levels >> (8 - self._bits)
         try:
             self.slm.set_phase(levels, settle=True)
-        except Exception as error:  # vendors' libraries raise what they like
+        except Exception as error:  # vendors' libraries raise any exception
             raise DeviceError(f"slmsuite's panel did not take a pattern: {error}") from error
 
     def status(self) -> dict[str, Any]:
-        """What slmsuite knows of it."""
+        """Name and settings, as slmsuite reports them."""
         return {"name": str(getattr(self.slm, "name", "")), "bit_depth": self._bits}
 
     def close(self) -> None:
-        """Let go of the panel."""
+        """Close the panel."""
         self.slm.close()
 
 
 class SlmsuiteCamera:
     """A camera behind an slmsuite camera object.
 
-    Attributes: camera, shape ((h, w), pixels), bit_depth.
+    Attributes
+    ----------
+    camera : slmsuite camera
+    shape : (int, int)
+        (h, w), pixels.
+    bit_depth : int
     """
 
     def __init__(self, camera: Any) -> None:
@@ -63,7 +84,13 @@ class SlmsuiteCamera:
 
     @property
     def exposure_ms(self) -> float:
-        """Exposure time, ms; setting it raises InputError where the camera does not take it."""
+        """Exposure time, ms.
+
+        Raises
+        ------
+        InputError
+            On setting, where the camera does not take it.
+        """
         return float(self.camera.get_exposure()) * 1000
 
     @exposure_ms.setter
@@ -75,7 +102,17 @@ class SlmsuiteCamera:
             )
 
     def capture(self) -> NDArray[np.uint16]:
-        """One picture, uint16 counts [h, w], taken after this call."""
+        """One picture, exposed after this call.
+
+        Returns
+        -------
+        uint16 array [h, w], counts
+
+        Raises
+        ------
+        DeviceError
+            Where slmsuite fails or the picture is not plain monochrome.
+        """
         try:
             self.camera.flush()
             picture = np.asarray(self.camera.get_image(hdr=False, averaging=False))
@@ -89,9 +126,9 @@ class SlmsuiteCamera:
         return picture.astype(np.uint16)
 
     def status(self) -> dict[str, Any]:
-        """What slmsuite knows of it."""
+        """Name and settings, as slmsuite reports them."""
         return {"name": str(getattr(self.camera, "name", "")), "exposure_ms": self.exposure_ms}
 
     def close(self) -> None:
-        """Let go of the camera."""
+        """Close the camera."""
         self.camera.close()

@@ -1,6 +1,6 @@
-"""One device on USB as drivers see it: transfers that either do what they say or raise a DeviceError.
+"""One device on USB, for drivers: each transfer either succeeds or raises a DeviceError.
 
-A device that was unplugged is looked for again at the next transfer, so a driver need not be made anew.
+A device that was unplugged is looked for again at the next transfer, so a driver need not be opened again.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 
 from firmware_iface.errors import DeviceError, DeviceGoneError
 
-_GONE = {errno.ENODEV, errno.ENXIO, errno.ESHUTDOWN, errno.EIO, errno.EPROTO}
+_UNPLUGGED = {errno.ENODEV, errno.ENXIO, errno.ESHUTDOWN, errno.EIO, errno.EPROTO}
 _TIMEOUT = errno.ETIMEDOUT
 _REFUSED = errno.EPIPE
 
@@ -22,12 +22,23 @@ TO_HOST, TO_DEVICE = 0xC0, 0x40  # vendor requests to the device
 class UsbLink:
     """A device by vendor and product ID, with interface 0 claimed while it is open; for one thread at a time.
 
-    name : what messages call it
-    serial : serial number, where several are attached
-    backend : a pyusb backend; None is the system's libusb
-    timeout_s : longest wait for one transfer
+    Parameters
+    ----------
+    vendor, product : int
+        IDs.
+    name : str
+        Its name in messages.
+    serial : str or None
+        Serial number, where several are attached.
+    backend : pyusb backend or None
+        None is the system's libusb.
+    timeout_s : float, s
+        Longest wait for one transfer.
 
-    Attribute: opened, functions that are called each time the device was found, to set it up.
+    Attributes
+    ----------
+    opened : list of callable
+        Called each time the device was found, to set it up.
     """
 
     def __init__(
@@ -52,7 +63,13 @@ class UsbLink:
         return self._device is not None
 
     def open(self) -> None:
-        """Find and set up the device unless it is open; raises DeviceGoneError where it is not attached."""
+        """Find and set up the device unless it is open.
+
+        Raises
+        ------
+        DeviceGoneError
+            Where it is not attached.
+        """
         if self._device is not None:
             return
         self._device = self._find()
@@ -65,16 +82,22 @@ class UsbLink:
             raise
 
     def close(self) -> None:
-        """Let go of the device; the next transfer opens it again."""
+        """Release the device; the next transfer opens it again."""
         import usb.util
 
         device, self._device = self._device, None
         if device is not None:
-            with suppress(Exception):  # a device that is gone cannot be released
+            with suppress(Exception):  # an unplugged device cannot be released
                 usb.util.dispose_resources(device)
 
     def control_in(self, request: int, length: int, value: int = 0) -> bytes:
-        """The reply to a vendor request; DeviceError where it is not of this length."""
+        """The reply to a vendor request.
+
+        Raises
+        ------
+        DeviceError
+            Where the reply is not of this length.
+        """
         reply = bytes(self._do(lambda d: d.ctrl_transfer(TO_HOST, request, value, 0, length, self._ms)))
         if len(reply) != length:
             raise DeviceError(
@@ -88,11 +111,17 @@ class UsbLink:
         self._do(lambda d: d.ctrl_transfer(TO_DEVICE, request, value, 0, data, self._ms))
 
     def write(self, endpoint: int, data: bytes) -> None:
-        """One transfer to an endpoint; DeviceError where not all of it was taken."""
+        """One transfer to an endpoint.
+
+        Raises
+        ------
+        DeviceError
+            Where the device did not take all bytes.
+        """
         taken = self._do(lambda d: d.write(endpoint, data, self._ms))
         if taken != len(data):
             raise DeviceError(
-                f"{self.name} took {taken} of {len(data)} bytes; send them again, and where that goes on, "
+                f"{self.name} took {taken} of {len(data)} bytes; send them again, and if that repeats, "
                 "check the cable."
             )
 
@@ -111,11 +140,11 @@ class UsbLink:
     def _find(self) -> Any:
         import usb.core
 
-        wanted: dict[str, Any] = {"idVendor": self.vendor, "idProduct": self.product}
+        search: dict[str, Any] = {"idVendor": self.vendor, "idProduct": self.product}
         if self.serial is not None:
-            wanted["serial_number"] = self.serial
+            search["serial_number"] = self.serial
         try:
-            device = usb.core.find(backend=self._backend, **wanted)
+            device = usb.core.find(backend=self._backend, **search)
         except usb.core.NoBackendError as error:
             raise DeviceError(
                 "libusb is not installed, so no USB device can be opened; install libusb-1.0."
@@ -133,7 +162,7 @@ class UsbLink:
     def _claim(self, device: Any) -> None:
         import usb.util
 
-        with suppress(NotImplementedError):  # no such notion outside Linux
+        with suppress(NotImplementedError):  # not known outside Linux
             if device.is_kernel_driver_active(0):
                 device.detach_kernel_driver(0)
         device.set_configuration()
@@ -152,7 +181,7 @@ class UsbLink:
             raise failure from error
 
     def _failure(self, error: Any) -> DeviceError:
-        if error.errno in _GONE:
+        if error.errno in _UNPLUGGED:
             return DeviceGoneError(f"{self.name} was unplugged or lost power; plug it in again.")
         if error.errno == _TIMEOUT:
             return DeviceError(

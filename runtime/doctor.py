@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from firmware_iface.assembled import open_camera, open_lasers, open_panel
+from firmware_iface.configured_devices import open_camera, open_lasers, open_panel
 from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
 from runtime.service.configuration import Configuration, read_configuration
 

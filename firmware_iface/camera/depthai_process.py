@@ -1,7 +1,7 @@
-"""The process that owns the camera: depthai and nothing else, because that library can end its process.
+"""The process that owns the camera. It runs depthai and nothing else, because that library can end its process.
 
-Started by `OakCamera` with one argument, JSON. It ends by itself when frames stay out, when the link is lost
-and when its parent is gone; a new one is started in its place. It never reconnects.
+Started by `ProcessKeeper` with one argument, JSON. It ends by itself when no frames come, when the link is lost
+and when its parent ends; a new one is started in its place. It never reconnects.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ import sys
 import time
 from typing import Any
 
-from firmware_iface.camera.pipe import Frame, frame_message, state_message
+from firmware_iface.camera.process_messages import Frame, frame_message, state_message
 
 LOST, STARVED, FAILED = 11, 12, 13  # exit codes
 
-FIRST_S = 5.0  # a sensor takes its time to start
+FIRST_S = 5.0  # for the first frame: a sensor needs time to start
 
 _ENVIRONMENT = {  # read by the library when it is loaded
     "DEPTHAI_TELEMETRY": "0",
@@ -37,9 +37,9 @@ def main(argument: str) -> None:
     job = json.loads(argument)
     _die_with(job["parent"])
     os.environ.update(_ENVIRONMENT)
-    child = _Child(job)
+    child = _CameraStream(job)
     try:
-        child.tell("starting")
+        child.report("starting")
         import depthai as dai
 
         device = child.search(dai)
@@ -47,37 +47,37 @@ def main(argument: str) -> None:
     except BrokenPipeError:
         os._exit(0)
     except Exception as error:
-        child.tell(f"failed: {error}")
+        child.report(f"failed: {error}")
         os._exit(FAILED)
 
 
 def _die_with(parent: int) -> None:
-    """Have the kernel kill this process when the thread that started it ends, however that comes about."""
+    """Have the kernel kill this process when the thread that started it ends in any way."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(0)
 
 
-class _Child:
+class _CameraStream:
     def __init__(self, job: dict[str, Any]) -> None:
         self._job = job
         self._out, self._in = job["out"], job["in"]
         self._exposure_us, self._iso = job["exposure_us"], job["iso"]
 
-    def tell(self, text: str) -> None:
+    def report(self, text: str) -> None:
         self._write(state_message(text))
 
     def search(self, dai: Any) -> Any:
-        """The opened camera, as soon as it is there."""
+        """The opened camera, as soon as it is found."""
         while True:
-            self.tell("searching")
-            self._orders()
+            self.report("searching")
+            self._read_settings()
             try:
                 address = self._job["address"]
                 device = dai.Device(dai.DeviceInfo(address)) if address else dai.Device()
             except RuntimeError as error:
-                self.tell(f"searching: {error}")
+                self.report(f"searching: {error}")
                 time.sleep(0.2)
                 continue
             device.setMaxReconnectionAttempts(0, lambda state: None)
@@ -85,7 +85,7 @@ class _Child:
 
     def stream(self, dai: Any, device: Any) -> None:
         """Send every frame on."""
-        self.tell("opening")
+        self.report("opening")
         job = self._job
         height, width = job["shape"]
         pipeline = dai.Pipeline(device)
@@ -100,31 +100,31 @@ class _Child:
         queue = output.createOutputQueue(maxSize=1, blocking=False)
         control = camera.inputControl.createInputQueue()
         pipeline.start()
-        last, told = time.monotonic(), 0.0
-        patience_s = max(job["starved_s"], FIRST_S)
+        last, reported = time.monotonic(), 0.0
+        limit_s = max(job["starved_s"], FIRST_S)
         while True:
-            if self._orders():
+            if self._read_settings():
                 order = dai.CameraControl()
                 order.setManualExposure(self._exposure_us, self._iso)
                 control.send(order)
             try:
                 image = queue.get(datetime.timedelta(milliseconds=20))
             except dai.MessageQueue.QueueException:
-                self.tell("the link was lost")
+                self.report("the link was lost")
                 os._exit(LOST)
             now = time.monotonic()
             if image is not None:
                 self._write(frame_message(_frame(image)))
-                last, patience_s = now, job["starved_s"]
-            elif now - last > patience_s + self._exposure_us * 2e-6:
-                self.tell("no frames came")
+                last, limit_s = now, job["starved_s"]
+            elif now - last > limit_s + self._exposure_us * 2e-6:
+                self.report("no frames came")
                 os._exit(STARVED)  # without closing: the library may hang in it
-            if now - told > 0.2:
-                self.tell("streaming")
-                told = now
+            if now - reported > 0.2:
+                self.report("streaming")
+                reported = now
 
-    def _orders(self) -> bool:
-        """Read what the parent wants; whether that is new. Its end of the pipe closed means: stop."""
+    def _read_settings(self) -> bool:
+        """Read settings from the parent; whether there were any. A closed pipe means: stop."""
         changed = False
         while select.select([self._in], [], [], 0)[0]:
             data = os.read(self._in, 4096)

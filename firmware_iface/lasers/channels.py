@@ -1,4 +1,4 @@
-"""What is known of each laser: its wavelength, its calibration, and where it is wired."""
+"""The laser channels of a board: wavelength and calibration of each."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from firmware_iface.errors import InputError
 from firmware_iface.lasers.mcp4728 import VOLTS_PER_CODE
-from firmware_iface.virtual.tables import check_instance, parameter
+from firmware_iface.toml_tables import check_instance, parameter
 
 MA_PER_V = 50.0  # of the laser-diode controllers' modulation inputs
 PHOTODIODE_FULL_V = 1.0
@@ -14,10 +14,15 @@ PHOTODIODE_FULL_V = 1.0
 
 @dataclass(frozen=True)
 class LaserChannel:
-    """One laser and its calibration. Raises InputError for a value out of range.
+    """One laser and its calibration.
 
     The laser-diode controller's own set point must be 0 (its modulation input adds to it), and its hardware limit set
-    to what the diode bears. The photodiode's amplifier is set to 1 V at full power.
+    to what the diode tolerates. The photodiode's amplifier is set to 1 V at full power.
+
+    Raises
+    ------
+    InputError
+        For a value out of range.
     """
 
     name: str = parameter(about="name of the colour")
@@ -39,17 +44,17 @@ class LaserChannel:
             )
 
     def drive_v(self, fraction: float) -> float:
-        """Voltage at the modulation input for a fraction of full power; 0 for darkness."""
+        """Voltage at the modulation input for a fraction of full power, V; 0 for darkness."""
         if fraction <= 0:
             return 0.0
         return (self.threshold_ma + fraction * self.full_power_uw / self.slope_uw_per_ma) / MA_PER_V
 
     def code(self, fraction: float) -> int:
-        """The DAC's code for it, rounded down: never more light than asked."""
+        """The DAC's code for a fraction of full power, rounded down: never more light than requested."""
         return int(self.drive_v(fraction) / VOLTS_PER_CODE + 1e-9)
 
     def photodiode_v(self, drive_v: float) -> float:
-        """What the photodiode shows at a voltage at the modulation input."""
+        """Voltage of the photodiode at a voltage at the modulation input, V."""
         power_uw = self.slope_uw_per_ma * max(0.0, drive_v * MA_PER_V - self.threshold_ma)
         return PHOTODIODE_FULL_V * power_uw / self.full_power_uw
 

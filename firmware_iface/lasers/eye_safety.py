@@ -8,7 +8,7 @@ thermal         390 µW for a point source (1.5 mrad or less); 7e-4 C6 T2^-0.25 
 photochemical   39 µW * C3 from 400 to 600 nm, C3 = 1 below 450 nm and 10^(0.02 (wavelength - 450)) above; over
                 30 000 s the eye moves, so all light counts as one spot
 
-A hologram can send all its light into one spot, so without a prediction it is taken to do that. A predicted picture
+A hologram can send all its light into one spot, so this is assumed without a prediction. A predicted picture
 counts with its brightest spots: for squares from 1.5 to 100 mrad, the largest share of the light that any square
 holds, against the limit of a source as large as the next smaller square. Sizes in between are then covered too.
 
@@ -50,9 +50,24 @@ def photochemical_limit_uw(wavelength_nm: float) -> float:
 def spot_shares(irradiance: NDArray[np.floating], mrad_per_pixel: float) -> tuple[float, ...]:
     """The largest share of a picture's light in any square of each of SIZES_MRAD.
 
-    irradiance : [H, W], predicted in the image plane, any unit, not negative
-    mrad_per_pixel : angle that a pixel takes at the eye
-    Raises InputError where the picture cannot be one. A square is rounded up to whole pixels, so is never too small.
+    A square is rounded up to whole pixels, so is never too small.
+
+    Parameters
+    ----------
+    irradiance : float array [H, W]
+        Predicted in the image plane, any unit, not negative.
+    mrad_per_pixel : float, mrad
+        Angle of a pixel at the eye.
+
+    Returns
+    -------
+    tuple of float
+        One share for each of SIZES_MRAD, 0 to 1.
+
+    Raises
+    ------
+    InputError
+        Where this is no picture of light, or the angle is not above 0.
     """
     picture = np.asarray(irradiance, np.float64)
     if picture.ndim != 2 or not np.isfinite(picture).all() or picture.size == 0 or picture.min() < 0:
@@ -61,7 +76,7 @@ def spot_shares(irradiance: NDArray[np.floating], mrad_per_pixel: float) -> tupl
         raise InputError(f"{mrad_per_pixel!r} mrad a pixel is not an angle; give a number above 0.")
     total = float(picture.sum())
     if total == 0:
-        return ALL_IN_ONE_SPOT  # nothing is predicted: assume nothing
+        return ALL_IN_ONE_SPOT  # no prediction: the worst case
     table = np.zeros((picture.shape[0] + 1, picture.shape[1] + 1))
     table[1:, 1:] = picture.cumsum(0).cumsum(1)
     shares = []
@@ -75,7 +90,13 @@ def spot_shares(irradiance: NDArray[np.floating], mrad_per_pixel: float) -> tupl
 
 @dataclass(frozen=True)
 class Exposure:
-    """Shares of the Class 1 limits that are used; 1 is the limit."""
+    """Shares of the Class 1 limits that are used.
+
+    Attributes
+    ----------
+    thermal, photochemical : float
+        1 is the limit.
+    """
 
     thermal: float
     photochemical: float
@@ -91,12 +112,21 @@ def exposure(
     wavelength_nm: Mapping[str, float],
     shares: Mapping[str, Sequence[float]] | None = None,
 ) -> Exposure:
-    """What these lasers use of the Class 1 limits.
+    """Shares of the Class 1 limits that these lasers use.
 
-    power_uw : by channel, through a 7 mm aperture at the exit pupil
-    wavelength_nm : by channel, 400 to 700
-    shares : by channel, from `spot_shares`; channels without: all their light in one spot. The brightest spots of
-        all channels are taken to fall on one another.
+    Parameters
+    ----------
+    power_uw : mapping of channel to float, µW
+        Through a 7 mm aperture at the exit pupil.
+    wavelength_nm : mapping of channel to float, nm
+        400 to 700.
+    shares : mapping of channel to sequence of float, or None
+        From `spot_shares`. A channel that is missing has all its light in
+        one spot. The brightest spots of all channels are taken to coincide.
+
+    Returns
+    -------
+    Exposure
     """
     photochemical = sum(p / photochemical_limit_uw(wavelength_nm[c]) for c, p in power_uw.items())
     found = {c: (shares or {}).get(c, ALL_IN_ONE_SPOT) for c in power_uw}

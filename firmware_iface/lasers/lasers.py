@@ -6,9 +6,9 @@ with open_lasers("/dev/i2c-1", CHANNELS) as lasers:
     while showing:
         lasers.heartbeat()          # at least every 50 ms, from the loop that must be alive
 
-Every failure (of the bus, of a reply, of the light) goes the same way: everything is told to go dark, each part by
-itself, and DeviceError is raised. Nothing is tried twice. When the process dies, the heartbeat dies with it, and the
-safety controller is dark after 100 ms.
+Every failure (of the bus, of a reply, of the light) has the same result: every part is switched off by itself, and
+DeviceError is raised. Nothing is tried twice. When the process dies, the heartbeat ends, and the safety controller
+switches off after 100 ms.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ import numpy as np
 
 from firmware_iface.errors import DeviceError, InputError
 from firmware_iface.lasers.channels import LaserChannel
-from firmware_iface.lasers.eye_safety import ALL_IN_ONE_SPOT, exposure
+from firmware_iface.lasers.i2c_transfers import open_bus
+from firmware_iface.lasers.laser_board import LaserBoard
+from firmware_iface.lasers.light_budget import LightBudget
 from firmware_iface.lasers.mcp4728 import VOLTS_PER_CODE
-from firmware_iface.lasers.parts import Parts
 from firmware_iface.lasers.safety_controller import Command, Input, State
-from firmware_iface.lasers.wire import open_bus
 
 if TYPE_CHECKING:
     from smbus2 import SMBus
@@ -51,17 +51,29 @@ MISSING = {
 
 
 class LatchedError(DeviceError):
-    """The safety controller has latched a fault and is dark; clear() and arm() once the cause is gone."""
+    """The safety controller has latched a fault and is dark; clear() and arm() once the cause is removed."""
 
 
 class Lasers:
     """The lasers of one board, opened dark and not armed.
 
-    bus : an open smbus2.SMBus, which is closed with the lasers
-    channels : one to three, in the order of the DAC's outputs
-    clock, wait : seconds, and sleeping; tests give their own
-    Raises InputError where the channels do not fit the board, DeviceError where a part fails or the DAC would not be
-    dark at power-on.
+    Parameters
+    ----------
+    bus : smbus2.SMBus
+        Open; it is closed with the lasers.
+    channels : sequence of LaserChannel
+        One to three, in the order of the DAC's outputs.
+    clock : callable
+        Gives the time, s.
+    wait : callable
+        Sleeps, s.
+
+    Raises
+    ------
+    InputError
+        Where the channels do not fit the board.
+    DeviceError
+        Where a part fails or the DAC would not be dark at power-on.
     """
 
     def __init__(
@@ -78,32 +90,41 @@ class Lasers:
         self._bus, self._clock, self._wait = bus, clock, wait
         self._lasers = tuple(channels)
         self.channels = tuple(c.name for c in channels)
-        self._wavelengths = {c.name: c.wavelength_nm for c in channels}
-        self.parts = Parts(bus)
+        self._budget = LightBudget(channels)
+        self.board = LaserBoard(bus)
         self._fractions = [0.0] * len(channels)
         self._codes = [0] * len(channels)
-        self._shares: dict[str, tuple[float, ...]] = {}
         self._token = 0
         self._beat_at = self._changed_at = self._selected_at = -math.inf
         self._selected, self._ramping = 0, False
         self._closed = False
         with self._dark_on_failure():
-            self.parts.set_up(self._lasers)
-            self._token = self.parts.controller.token()
+            self.board.set_up(self._lasers)
+            self._token = self.board.controller.token()
             self._select(0)
         _open.add(self)
 
     # --- the headset's interface
 
     def power(self, channel: str) -> float:
-        """A laser's power, fraction of full; raises InputError for an unknown one."""
+        """A laser's power, fraction of full.
+
+        Raises
+        ------
+        InputError
+            For an unknown channel.
+        """
         return self._fractions[self._index(channel)]
 
     def set_power(self, channel: str, fraction: float) -> None:
         """Set a laser to a fraction of full power: down at once, up over 100 ms with the photodiode watched.
 
-        Raises InputError where either is unknown or the lasers together would exceed the Class 1 budget, and
-        DeviceError (dark by then) where a part fails or the photodiode does not follow.
+        Raises
+        ------
+        InputError
+            Where either is unknown or the lasers together would exceed the Class 1 budget.
+        DeviceError
+            Where a part fails or the photodiode does not follow (dark by then).
         """
         for _ in self.ramp(channel, fraction):
             self._wait(RAMP_S / RAMP_STEPS)
@@ -111,44 +132,59 @@ class Lasers:
     def off(self) -> None:
         """Every laser to 0, at once, and read back; the board stays armed.
 
-        Raises DeviceError where the DAC does not do it; everything has then been told to go dark.
+        Raises
+        ------
+        DeviceError
+            Where the DAC does not do it; every part has then been switched off.
         """
         self._forget()
         with self._dark_on_failure():
-            self.parts.dac.dark()
-            now, _ = self.parts.dac.read()
+            self.board.dac.dark()
+            now, _ = self.board.dac.read()
             if not all(output.dark for output in now):
                 raise DeviceError(
-                    "the DAC did not go dark when told to, so the lasers were switched off otherwise."
+                    "the DAC did not go dark on command, so the lasers were switched off otherwise."
                 )
         self._changed_at = self._clock()
 
     # --- arming and staying alive
 
     def clear(self) -> None:
-        """First act after a fault: forget it. Raises DeviceError that says what holds it."""
+        """First step after a fault: clear it.
+
+        Raises
+        ------
+        DeviceError
+            Where it cannot be cleared yet; the message says why.
+        """
         self._forget()
         with self._dark_on_failure():
-            self.parts.dac.dark()
-            self.parts.controller.command(Command.CLEAR)
-            held = self.parts.controller.state() is State.FAULT
+            self.board.dac.dark()
+            self.board.controller.command(Command.CLEAR)
+            held = self.board.controller.state() is State.FAULT
             needed = Input.INTERLOCK | Input.DARK | Input.COOL | Input.QUIET
             missing = self._missing(needed) if held else ""
         if held:
             raise DeviceError(f"the fault cannot be cleared: {missing}.")
 
     def arm(self) -> None:
-        """Second act: arm the board, dark. Raises DeviceError that says what is missing."""
+        """Second step: arm the board, dark.
+
+        Raises
+        ------
+        DeviceError
+            Where a condition is missing; the message says which.
+        """
         with self._dark_on_failure():
-            state = self.parts.controller.state()
+            state = self.board.controller.state()
             if state is State.OFF:
                 self._forget()
-                self.parts.dac.dark()
-                self.parts.expander.enable((1 << len(self._lasers)) - 1)
+                self.board.dac.dark()
+                self.board.expander.enable((1 << len(self._lasers)) - 1)
                 self._beat()
-                self.parts.controller.command(Command.ARM_FIRST)
-                self.parts.controller.command(Command.ARM_SECOND)
-                state = self.parts.controller.state()
+                self.board.controller.command(Command.ARM_FIRST)
+                self.board.controller.command(Command.ARM_SECOND)
+                state = self.board.controller.state()
             latched, missing = self._latched(), self._missing(Input(0x7F))
         if state is State.FAULT:
             raise DeviceError(f"a fault is latched ({latched}); find its cause, then clear() and arm().")
@@ -156,22 +192,27 @@ class Lasers:
             raise DeviceError(f"the lasers cannot be armed: {missing}.")
 
     def heartbeat(self) -> None:
-        """Say that the caller is alive, at least every 50 ms; looks at one photodiode each time.
+        """Show that the caller is alive, at least every 50 ms; checks one photodiode each time.
 
-        Raises DeviceError (dark by then) where a fault is latched, a photodiode shows what it should not, or a part
-        does not answer. No token is written sooner than 6 ms after the last.
+        No token is written sooner than 6 ms after the last.
+
+        Raises
+        ------
+        DeviceError
+            Where a fault is latched, a photodiode shows what it should not, or a part does not answer (dark
+            by then).
         """
         with self._dark_on_failure():
             self._beat()
             self._raise_latched()
-            self._look()
+            self._check_photodiode()
             if not self._ramping:
                 self._select((self._selected + 1) % len(self._lasers))
 
     def ramp(self, channel: str, fraction: float) -> Iterator[None]:
         """`set_power`, a step at a time: yields between steps, which should be 5 ms apart.
 
-        A caller that must do other things meanwhile (or that must be able to stop) drives it.
+        For a caller that does other things meanwhile or must be able to stop.
         """
         k = self._index(channel)
         if (
@@ -180,9 +221,7 @@ class Lasers:
             or not 0 <= fraction <= 1
         ):
             raise InputError(f"power {fraction!r} of laser '{channel}' is not a fraction; give 0 to 1.")
-        self._check_budget(
-            {**dict(zip(self.channels, self._fractions, strict=True)), channel: float(fraction)}
-        )
+        self._budget.check(self._powers() | {channel: float(fraction)})
         start, end = self._codes[k], self._lasers[k].code(fraction)
         if end <= start:
             with self._dark_on_failure():
@@ -191,7 +230,7 @@ class Lasers:
             return
         with self._dark_on_failure():
             self._raise_latched()
-            armed = self.parts.controller.state() in (State.ARMED, State.EMIT)
+            armed = self.board.controller.state() in (State.ARMED, State.EMIT)
             self._select(k)
         if not armed:
             raise DeviceError("the lasers are not armed; arm() them first.")
@@ -201,7 +240,7 @@ class Lasers:
         self._ramping = True
         try:
             for step in range(1, RAMP_STEPS + 1):
-                # less than was asked, where off() or expect() came between the steps
+                # less than requested, where off() or expect() came between the steps
                 allowed = self._lasers[k].code(self._fractions[k])
                 if allowed == 0:
                     return
@@ -211,30 +250,37 @@ class Lasers:
                 with self._dark_on_failure():
                     if self._clock() - self._beat_at >= BEAT_S:
                         self._beat()
-                    self._look()
+                    self._check_photodiode()
         finally:
             self._ramping = False
 
     # --- the Class 1 budget
 
     def expect(self, shares: Mapping[str, Sequence[float]] | None) -> float:
-        """Say what the next pattern is predicted to make, before it is shown (None: unknown, all in one spot).
+        """Take the prediction for the next pattern, before it is shown.
 
-        shares : by channel, from eye_safety.spot_shares
-        Lowers every laser by one factor, at once, where the pattern's brightest spots would exceed the budget, and
-        returns that factor (1: nothing changed). Powers do not rise again by themselves.
+        Lowers every laser by one factor, at once, where the pattern's brightest spots would exceed the budget.
+        Powers do not rise again by themselves.
+
+        Parameters
+        ----------
+        shares : mapping of channel to sequence of float, or None
+            From `eye_safety.spot_shares`. None: nothing is known, all light counts as one spot.
+
+        Returns
+        -------
+        float
+            The factor; 1 where nothing changed.
+
+        Raises
+        ------
+        InputError
+            Where a channel is unknown or the shares are not those of `spot_shares`.
+        DeviceError
+            Where the lasers could not be lowered; they are dark then.
         """
-        found = dict(shares or {})
-        for channel, values in found.items():
-            self._index(channel)
-            values = tuple(float(v) for v in values)
-            if len(values) != len(ALL_IN_ONE_SPOT) or not all(0 < v <= 1 for v in values):
-                raise InputError(
-                    f"the shares of '{channel}' are not what spot_shares gives; use it to make them."
-                )
-            found[channel] = values
-        self._shares = {c: tuple(v) for c, v in found.items()}
-        worst = self._exposure(dict(zip(self.channels, self._fractions, strict=True)))["worst"]
+        self._budget.expect(shares)
+        worst = self._budget.exposure(self._powers()).worst
         factor = min(1.0, 1 / worst) if worst > 0 else 1.0
         if factor < 1:
             self._fractions = [f * factor for f in self._fractions]
@@ -243,68 +289,62 @@ class Lasers:
                     self._put(k, laser.code(self._fractions[k]))
         return factor
 
-    def _check_budget(self, fractions: dict[str, float]) -> None:
-        worst = self._exposure(fractions)["worst"]
-        if worst > 1 + 1e-9:
-            raise InputError(
-                f"the lasers together would make {worst:.2f} of the Class 1 limit of a point source; lower one, or "
-                "say with expect() what the pattern is predicted to make."
-            )
+    def _powers(self) -> dict[str, float]:
+        """Fraction of full power, by channel."""
+        return dict(zip(self.channels, self._fractions, strict=True))
 
-    def _exposure(self, fractions: Mapping[str, float]) -> dict[str, float]:
-        found = exposure(self._power_uw(fractions), self._wavelengths, self._shares)
-        return {"thermal": found.thermal, "photochemical": found.photochemical, "worst": found.worst}
-
-    def _power_uw(self, fractions: Mapping[str, float]) -> dict[str, float]:
-        return {c.name: c.full_power_uw * fractions[c.name] for c in self._lasers}
-
-    # --- what is seen
+    # --- status and checks
 
     def status(self) -> dict[str, Any]:
-        """What the board says of itself, ready for JSON. Raises DeviceError (dark by then) where it does not answer."""
+        """What the board reports, ready for JSON.
+
+        Raises
+        ------
+        DeviceError
+            Where it does not answer (dark by then).
+        """
         with self._dark_on_failure():
-            inputs = self.parts.controller.inputs()
-            fractions = dict(zip(self.channels, self._fractions, strict=True))
+            inputs = self.board.controller.inputs()
+            fractions = self._powers()
+            used = self._budget.exposure(fractions)
             return {
-                "state": self.parts.controller.state().name.lower(),
-                "faults": [f.name.lower() for f in self.parts.controller.faults() if f.name],
+                "state": self.board.controller.state().name.lower(),
+                "faults": [f.name.lower() for f in self.board.controller.faults() if f.name],
                 "holds": {i.name.lower(): bool(inputs & i) for i in Input if i.name},
                 "power": fractions,
-                "celsius": round(self.parts.thermometer.celsius(), 2),
-                "class1": self._exposure(fractions),
-                "class1_at_full_power": exposure(
-                    self._power_uw(dict.fromkeys(self.channels, 1.0)), self._wavelengths
-                ).worst,
+                "celsius": round(self.board.thermometer.celsius(), 2),
+                "class1": {"thermal": used.thermal, "photochemical": used.photochemical, "worst": used.worst},
+                "class1_at_full_power": self._budget.exposure_at_full_power().worst,
             }
 
-    def _look(self) -> None:
-        """Compare the selected photodiode with what it should show, if the light has had the time to settle."""
+    def _check_photodiode(self) -> None:
+        """Compare the selected photodiode with its expected voltage, once the light has settled."""
         if self._clock() - max(self._changed_at, self._selected_at) < RAMP_S / RAMP_STEPS - 1e-6:
             return
         k = self._selected
-        seen_v = self.parts.converter.volts()
+        measured_v = self.board.converter.volts()
         expected_v = self._lasers[k].photodiode_v(self._codes[k] * VOLTS_PER_CODE)
-        if abs(seen_v - expected_v) <= TOLERANCE * expected_v + FLOOR_V:
+        if abs(measured_v - expected_v) <= TOLERANCE * expected_v + FLOOR_V:
             return
         self._raise_latched()
         raise DeviceError(
-            f"laser '{self.channels[k]}' should make {expected_v:.3f} V at its photodiode and makes {seen_v:.3f} V, so "
-            "the lasers were switched off; check the photodiode, the calibration, and that the set point of the "
-            "laser's controller is 0."
+            f"laser '{self.channels[k]}' should make {expected_v:.3f} V at its photodiode and makes "
+            f"{measured_v:.3f} V, so the lasers were switched off; check the photodiode, "
+            "the calibration, and that the set point of the laser's controller is 0."
         )
 
     def _raise_latched(self) -> None:
-        if self.parts.controller.state() is State.FAULT:
+        if self.board.controller.state() is State.FAULT:
             raise LatchedError(f"the safety controller has switched the lasers off: {self._latched()}.")
 
     def _latched(self) -> str:
-        return ", ".join(f.name.lower() for f in self.parts.controller.faults() if f.name)
+        return ", ".join(f.name.lower() for f in self.board.controller.faults() if f.name)
 
-    def _missing(self, wanted: Input) -> str:
-        inputs = self.parts.controller.inputs()
-        return "; ".join(MISSING[i] for i in wanted if not inputs & i) or "it gives no reason; try again"
+    def _missing(self, needed: Input) -> str:
+        inputs = self.board.controller.inputs()
+        return "; ".join(MISSING[i] for i in needed if not inputs & i) or "it gives no reason; try again"
 
-    # --- what is done
+    # --- single actions
 
     def _index(self, channel: str) -> int:
         if channel not in self.channels:
@@ -315,21 +355,21 @@ class Lasers:
         if self._clock() - self._beat_at < SOONEST_BEAT_S:
             return
         self._token = (self._token + 1) % 256
-        self.parts.controller.beat(self._token)
+        self.board.controller.beat(self._token)
         self._beat_at = self._clock()
 
     def _put(self, k: int, code: int) -> None:
         self._codes[k] = code
-        self.parts.dac.set_code(k, code)
+        self.board.dac.set_code(k, code)
         self._changed_at = self._clock()
 
     def _select(self, k: int) -> None:
-        self.parts.converter.select(k)
+        self.board.converter.select(k)
         self._selected, self._selected_at = k, self._clock()
 
     @contextmanager
     def _dark_on_failure(self) -> Iterator[None]:
-        """Whatever fails inside, go dark first and then tell."""
+        """Where the block fails, go dark first and then raise."""
         if self._closed:
             raise DeviceError("the lasers are closed; open them again.")
         try:
@@ -345,12 +385,12 @@ class Lasers:
             raise
 
     def trip(self) -> None:
-        """Latch a fault of the host's own: dark until clear() and arm(). Raises nothing."""
+        """Latch a fault on the host's request: dark until clear() and arm(). Raises nothing."""
         self._go_dark()
 
     def _go_dark(self, command: Command = Command.FAULT) -> None:
         self._forget()
-        self.parts.go_dark(command)
+        self.board.go_dark(command)
 
     def _forget(self) -> None:
         self._fractions = [0.0] * len(self._lasers)
@@ -384,7 +424,26 @@ def _close_all() -> None:
 
 
 def open_lasers(bus: str, channels: Sequence[LaserChannel]) -> Lasers:
-    """Open the lasers on a bus (see wire.open_bus). Raises InputError, DeviceError."""
+    """Open the lasers on a bus.
+
+    Parameters
+    ----------
+    bus : str
+        See `i2c_transfers.open_bus`.
+    channels : sequence of LaserChannel
+        One to three, in the order of the DAC's outputs.
+
+    Returns
+    -------
+    Lasers
+
+    Raises
+    ------
+    InputError
+        Where the bus cannot be opened or the channels do not fit the board.
+    DeviceError
+        Where a part of the board fails.
+    """
     try:
         opened = open_bus(bus)
     except OSError as error:

@@ -1,7 +1,7 @@
 """MCP4728: the DAC whose four outputs set the lasers' currents. Internal reference, gain 1: 0.5 mV a code.
 
 At 50 mA/V that is 0.025 mA a code and at most 102.4 mA. The part has no watchdog, and at power-on it shows what its
-EEPROM holds: both are why the safety controller stands behind it.
+EEPROM holds: for both reasons the safety controller follows it.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from firmware_iface.errors import DeviceError
-from firmware_iface.lasers.wire import read, write
+from firmware_iface.lasers.i2c_transfers import read, write
 
 if TYPE_CHECKING:
     from smbus2 import SMBus
@@ -24,7 +24,16 @@ CHANNELS = 4
 
 @dataclass(frozen=True)
 class Output:
-    """One channel as the part reports it: code, whether it is powered, whether at 0.5 mV a code."""
+    """One channel as the part reports it.
+
+    Attributes
+    ----------
+    code : int
+        0 to 4095.
+    powered : bool
+    fine : bool
+        Whether a code is 0.5 mV.
+    """
 
     code: int
     powered: bool
@@ -32,19 +41,29 @@ class Output:
 
     @property
     def dark(self) -> bool:
-        """Whether it puts out nothing."""
+        """Whether its output is 0 V."""
         return self.code == 0 or not self.powered
 
 
 def decode(reply: bytes) -> tuple[list[Output], list[Output]]:
-    """(outputs now, outputs after power-on) from the 24 bytes that the part sends; raises DeviceError.
+    """Outputs from the 24 bytes that the part sends.
 
     Each channel is status, two bytes of the register, status, two bytes of the EEPROM; bits 5 and 4 of the status
     count the channels.
+
+    Returns
+    -------
+    (list of Output, list of Output)
+        Outputs now, and after power-on.
+
+    Raises
+    ------
+    DeviceError
+        Where these are not such bytes.
     """
     if len(reply) != 6 * CHANNELS or any(reply[3 * i] >> 4 & 3 != i // 2 for i in range(2 * CHANNELS)):
         raise DeviceError(
-            "the DAC (MCP4728) sent no sense; check its wiring, then switch the board off and on."
+            "the DAC (MCP4728) sent an impossible reply; check its wiring, then switch the board off and on."
         )
     found = [
         Output(
@@ -58,29 +77,43 @@ def decode(reply: bytes) -> tuple[list[Output], list[Output]]:
 class Mcp4728:
     """The DAC.
 
-    bus : an open smbus2.SMBus
+    Parameters
+    ----------
+    bus : smbus2.SMBus
+        Open.
+    address : int
+
+    Raises
+    ------
+    OSError
+        From every method, where the bus does not carry a message.
     """
 
     def __init__(self, bus: SMBus, address: int = 0x60) -> None:
         self._bus, self._address = bus, address
 
     def read(self) -> tuple[list[Output], list[Output]]:
-        """(outputs now, outputs after power-on), A to D. Raises DeviceError, OSError."""
+        """(outputs now, outputs after power-on), A to D.
+
+        Raises
+        ------
+        DeviceError
+            Where the reply is garbled.
+        """
         return decode(read(self._bus, self._address, 6 * CHANNELS))
 
     def set_code(self, channel: int, code: int) -> None:
-        """Put out `code`, 0 to 4095, on channel 0 (A) to 3 (D), at once. Raises OSError."""
+        """Put out `code`, 0 to 4095, on channel 0 (A) to 3 (D), at once."""
         high, low = INTERNAL_REFERENCE | code >> 8, code & 0xFF
         write(self._bus, self._address, bytes([MULTI_WRITE | channel << 1, high, low]))
 
     def dark(self) -> None:
-        """Code 0 on every channel, in one message (fast write). Raises OSError."""
+        """Code 0 on every channel, in one message (fast write)."""
         write(self._bus, self._address, bytes(2 * CHANNELS))
 
     def store_dark(self) -> None:
-        """Make power-on dark: every channel off in the EEPROM, and now. It takes 50 ms. Raises OSError.
+        """Make power-on dark: every channel off in the EEPROM, and now. It takes 50 ms.
 
-        The EEPROM bears a million writes: do this when a board is made, not when it is opened.
-        """
+        The EEPROM lasts for a million writes: do this when a board is made, not when it is opened."""
         off = bytes([INTERNAL_REFERENCE | OFF_500K, 0])
         write(self._bus, self._address, bytes([SEQUENTIAL_WRITE]) + CHANNELS * off)

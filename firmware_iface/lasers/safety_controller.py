@@ -1,4 +1,4 @@
-"""The safety controller of the laser board; safety_controller.md beside this file is its protocol."""
+"""The safety controller of the laser board; safety_controller.md next to this file is its protocol."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import IntEnum, IntFlag
 from typing import TYPE_CHECKING
 
 from firmware_iface.errors import DeviceError
-from firmware_iface.lasers.wire import write, write_read
+from firmware_iface.lasers.i2c_transfers import write, write_read
 
 if TYPE_CHECKING:
     from smbus2 import SMBus
@@ -18,13 +18,13 @@ KNOWN = (0x4C, 1)
 
 
 class State(IntEnum):
-    """What it is doing."""
+    """State of the controller, register STATE."""
 
     OFF, ARMED, EMIT, FAULT = range(4)
 
 
 class Fault(IntFlag):
-    """What it has latched."""
+    """Latched faults, register FAULTS."""
 
     KEY, INTERLOCK, HEARTBEAT = 1, 2, 4
     OVERPOWER_0, OVERPOWER_1, OVERPOWER_2 = 8, 16, 32
@@ -32,13 +32,13 @@ class Fault(IntFlag):
 
 
 class Input(IntFlag):
-    """What holds now; all are needed to arm."""
+    """Conditions that hold now, register INPUTS; all are needed to arm."""
 
     KEY, INTERLOCK, HEARTBEAT, DARK, COOL, QUIET, CEILINGS = 1, 2, 4, 8, 16, 32, 64
 
 
 class Command(IntEnum):
-    """What it can be told."""
+    """Commands, register COMMAND."""
 
     OFF, CLEAR, ARM_FIRST, ARM_SECOND, FAULT = 0x00, 0xC3, 0xA5, 0x5A, 0xF0
 
@@ -54,48 +54,65 @@ def packet_error_code(data: bytes) -> int:
 
 
 class SafetyController:
-    """The controller. Everything raises OSError where the bus fails, and DeviceError where a reply is garbled.
+    """The controller.
 
-    bus : an open smbus2.SMBus
+    Parameters
+    ----------
+    bus : smbus2.SMBus
+        Open.
+    address : int
+
+    Raises
+    ------
+    OSError
+        From every method, where the bus does not carry a message.
+    DeviceError
+        From every method that reads, where a reply is garbled.
     """
 
     def __init__(self, bus: SMBus, address: int = 0x36) -> None:
         self._bus, self._address = bus, address
 
     def check_identity(self) -> None:
-        """Raise DeviceError unless it is a controller of this protocol."""
+        """Check that it is a controller of this protocol.
+
+        Raises
+        ------
+        DeviceError
+            Where it is not.
+        """
         found = (self._read(IDENTITY, 1), self._read(VERSION, 1))
         if found != KNOWN:
             raise DeviceError(
-                f"the safety controller says identity {found[0]:#04x}, version {found[1]}, and this driver knows "
+                f"the safety controller reports identity {found[0]:#04x}, version {found[1]}, and this driver needs "
                 f"{KNOWN[0]:#04x}, version {KNOWN[1]}; check the address and the board's firmware."
             )
 
     def state(self) -> State:
-        """What it is doing."""
+        """Its state."""
         value = self._read(STATE, 1)
         if value not in State.__members__.values():
             raise DeviceError(f"the safety controller is in the unknown state {value}; update its firmware.")
         return State(value)
 
     def faults(self) -> Fault:
-        """What it has latched."""
+        """Its latched faults."""
         return Fault(self._read(FAULTS, 2))
 
     def inputs(self) -> Input:
-        """What holds now."""
+        """The conditions that hold now."""
         return Input(self._read(INPUTS, 1))
 
     def command(self, command: Command) -> None:
-        """Tell it; it ignores what its conditions forbid."""
+        """Send a command; the controller ignores what its conditions forbid."""
         self._write(COMMAND, bytes([command]))
 
     def beat(self, token: int) -> None:
-        """Write the heartbeat's token, 0 to 255, another one than the last."""
+        """Write the heartbeat's token, 0 to 255, different from the last."""
         self._write(TOKEN, bytes([token]))
 
     def token(self) -> int:
-        """The token it heard last; 0: none."""
+        """The token it received last; 0: none."""
         return self._read(TOKEN, 1)
 
     def ceilings_v(self, laser: int) -> tuple[float, float]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 import time
 
+from firmware_iface.lasers.i2c_transfers import open_bus
 from firmware_iface.lasers.mcp4728 import Mcp4728
-from firmware_iface.lasers.wire import open_bus
 
 
 def main(arguments: list[str]) -> int:

@@ -13,36 +13,59 @@ Gray = NDArray[np.uint8]
 
 
 class Control(Protocol):
-    """What every panel's control part offers."""
+    """The control part of a panel."""
 
     def status(self) -> dict[str, Any]:
-        """What the panel says of itself, by name; raises DeviceError."""
+        """What the panel reports, by name.
+
+        Raises
+        ------
+        DeviceError
+            Where it does not answer.
+        """
 
     def close(self) -> None:
-        """Leave the panel dark where it can be, and let go of it."""
+        """Leave the panel dark where it can be, and release it."""
 
 
 class Frames(Protocol):
-    """What every way of bringing frames to a panel offers."""
+    """The part that brings frames to a panel."""
 
     @property
     def shape(self) -> tuple[int, int]:
         """(H, W), pixels."""
 
     def send(self, gray: Gray) -> int:
-        """Hand one whole frame over and return its sequence number; raises DeviceError."""
+        """Send one whole frame and return its sequence number.
+
+        Raises
+        ------
+        DeviceError
+            Where it was not taken.
+        """
 
     def wait(self, sequence: int) -> None:
-        """Return when this frame is what is displayed; DeviceError where it was lost or does not come."""
+        """Return when this frame is displayed.
+
+        Raises
+        ------
+        DeviceError
+            Where it was lost or does not come.
+        """
 
     def close(self) -> None:
-        """Let go of the link."""
+        """Release the link."""
 
 
 class Panel:
     """A phase panel.
 
-    Attributes: control, frames, shape ((H, W), pixels).
+    Attributes
+    ----------
+    control : Control
+    frames : Frames
+    shape : (int, int)
+        (H, W), pixels.
     """
 
     def __init__(self, control: Control, frames: Frames) -> None:
@@ -50,18 +73,27 @@ class Panel:
         self.shape = frames.shape
 
     def show(self, gray: NDArray[np.generic]) -> None:
-        """Show gray levels, uint8 [H, W], and return when they are displayed.
+        """Show gray levels and return when they are displayed.
 
-        Raises InputError for another type or size, DeviceError where the panel does not show them.
+        Parameters
+        ----------
+        gray : uint8 array [H, W]
+
+        Raises
+        ------
+        InputError
+            For another type or size.
+        DeviceError
+            Where the panel does not show them.
         """
         self.frames.wait(self.frames.send(checked_gray(gray, self.shape)))
 
     def status(self) -> dict[str, Any]:
-        """What the panel says of itself; raises DeviceError."""
+        """What the panel reports, by name; raises as `Control.status`."""
         return self.control.status()
 
     def close(self) -> None:
-        """Leave the panel dark where it can be, and let go of it."""
+        """Leave the panel dark where it can be, and release it."""
         try:
             self.control.close()
         finally:
@@ -69,7 +101,13 @@ class Panel:
 
 
 def checked_gray(gray: NDArray[np.generic], shape: tuple[int, int]) -> Gray:
-    """`gray` if it is uint8 of this shape; raises InputError."""
+    """`gray`, if it is uint8 of this shape.
+
+    Raises
+    ------
+    InputError
+        Where it is not.
+    """
     if not isinstance(gray, np.ndarray) or gray.dtype != np.uint8:
         found = gray.dtype if isinstance(gray, np.ndarray) else type(gray).__name__
         raise InputError(f"the pattern is {found}; give the panel uint8 gray levels.")

@@ -13,9 +13,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_iface.virtual import defects
-from firmware_iface.virtual.description import BenchDescription
-from firmware_iface.virtual.simulated_panel import Drive, Surface, tilt_factor
+from firmware_iface.virtual.bench_description import BenchDescription
+from firmware_iface.virtual.defects import (
+    Convention,
+    Distance,
+    Iris,
+    PupilAberration,
+    SpatialCoherence,
+    TemporalCoherence,
+)
+from firmware_iface.virtual.simulated_drive import Drive
+from firmware_iface.virtual.simulated_panel import Surface, tilt_factor
 from firmware_iface.virtual.subpixel_propagation import Band, walk_px
 
 Single = NDArray[np.float32]
@@ -24,24 +32,33 @@ Pullback = Callable[[Single], NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
-class Line:
-    """One spectral line: its wavelength, its share of the power, and its transfer over the band."""
+class SpectralLine:
+    """One spectral line.
+
+    Attributes
+    ----------
+    wavelength_nm : float, nm
+    share : float
+        Of the power.
+    transfer : complex64 array [Fy, Fx]
+        Transfer function over the band.
+    """
 
     wavelength_nm: float
     share: float
     transfer: Complex
 
 
-class Path:
+class OpticalPath:
     """Panel to image plane for one channel and one plane: geometry, spectral lines, source points."""
 
     def __init__(self, bench: BenchDescription, channel: str, plane_mm: float) -> None:
         wavelength = bench.channel(channel).wavelength_nm
-        offset, convention = bench.defect(defects.Distance), bench.defect(defects.Convention)
+        offset, convention = bench.defect(Distance), bench.defect(Convention)
         distance = plane_mm + (offset.offset_mm if offset else 0.0)
         if convention:
             distance *= convention.distance_sign
-        iris = bench.defect(defects.Iris)
+        iris = bench.defect(Iris)
         half = iris.half_width if iris else bench.iris.half_width
         centre = (iris.centre_y_share, iris.centre_x_share) if iris else (0.0, 0.0)
         half_band = 0.5 * (half + max(abs(centre[0]), abs(centre[1])))
@@ -49,19 +66,19 @@ class Path:
         border = 16 + bench.simulation.padding * walk_px(wavelength, pitch, distance, half_band)
         self.band = Band((bench.panel.height, bench.panel.width), q, border, half_band)
         passed = iris_mask(self.band, bench.iris.shape, half, centre)
-        delay = relay_path_nm(bench.defect(defects.PupilAberration), self.band)
+        delay = relay_path_nm(bench.defect(PupilAberration), self.band)
         self.lines = [
-            Line(
+            SpectralLine(
                 wl,
                 share,
                 (passed * np.exp(2j * np.pi * delay / wl) * self.band.transfer(wl, pitch, distance)).astype(
                     np.complex64
                 ),
             )
-            for wl, share in spectral_lines(wavelength, bench.defect(defects.TemporalCoherence))
+            for wl, share in spectral_lines(wavelength, bench.defect(TemporalCoherence))
         ]
         to_cycles = pitch / wavelength  # 1 mrad in cycles a pixel
-        points = source_points(bench.defect(defects.SpatialCoherence))
+        points = source_points(bench.defect(SpatialCoherence))
         self.tilts = [(fy * to_cycles, fx * to_cycles) for fy, fx in points]
         self.wavelength_nm = wavelength
 
@@ -75,7 +92,7 @@ def iris_mask(band: Band, shape: str, half_width: float, centre: tuple[float, fl
     return np.asarray((y <= limit) & (x <= limit))
 
 
-def relay_path_nm(d: defects.PupilAberration | None, band: Band) -> NDArray[np.float64]:
+def relay_path_nm(d: PupilAberration | None, band: Band) -> NDArray[np.float64]:
     """Path difference of the relay over the pupil, nm, [Fy, Fx]; radius 1 is the edge of the panel's band."""
     y, x = 2 * band.fy[:, None], 2 * band.fx[None, :]
     if d is None:
@@ -91,8 +108,8 @@ def relay_path_nm(d: defects.PupilAberration | None, band: Band) -> NDArray[np.f
     )
 
 
-def spectral_lines(wavelength_nm: float, d: defects.TemporalCoherence | None) -> list[tuple[float, float]]:
-    """(wavelength nm, share of the power) of the lines that stand for a Gaussian line, out to 2.5 sigma."""
+def spectral_lines(wavelength_nm: float, d: TemporalCoherence | None) -> list[tuple[float, float]]:
+    """(wavelength nm, share of the power) of the lines that approximate a Gaussian line, out to 2.5 sigma."""
     if d is None or d.lines == 1 or d.linewidth_nm == 0:
         return [(wavelength_nm, 1.0)]
     sigma = d.linewidth_nm / 2.3548
@@ -102,13 +119,13 @@ def spectral_lines(wavelength_nm: float, d: defects.TemporalCoherence | None) ->
     return [(wavelength_nm + float(a) * sigma, float(s)) for a, s in zip(at, shares, strict=True)]
 
 
-def source_points(d: defects.SpatialCoherence | None) -> list[tuple[float, float]]:
+def source_points(d: SpatialCoherence | None) -> list[tuple[float, float]]:
     """Directions (y, x) in mrad of equally bright points that fill the source's disc evenly."""
     if d is None or d.radius_mrad == 0:
         return [(0.0, 0.0)]
     points = [(0.0, 0.0)]
     for ring in range(1, d.rings + 1):
-        # rings of 6 k points at radius k/(rings + 1/2): every point stands for the same area
+        # rings of 6 k points at radius k/(rings + 1/2): every point represents the same area
         n = 6 * ring
         angle = 2 * np.pi * (np.arange(n) + 0.5 * (ring % 2)) / n
         area_inside, area_outside = 1 + 3 * ring * (ring - 1), 1 + 3 * ring * (ring + 1)
@@ -118,7 +135,7 @@ def source_points(d: defects.SpatialCoherence | None) -> list[tuple[float, float
 
 
 class BenchOptics:
-    """All of a bench's light before the camera; keeps the last few paths."""
+    """A bench's light before the camera; keeps the paths used last."""
 
     _KEPT = 6
 
@@ -126,7 +143,7 @@ class BenchOptics:
         self.bench = bench
         self._drives: dict[str, Drive] = {}
         self._surfaces: dict[float, Surface] = {}
-        self._paths: OrderedDict[tuple[str, float], Path] = OrderedDict()
+        self._paths: OrderedDict[tuple[str, float], OpticalPath] = OrderedDict()
 
     def drive(self, channel: str) -> Drive:
         """The channel's drive."""
@@ -134,18 +151,18 @@ class BenchOptics:
             self._drives[channel] = Drive(self.bench, self.bench.channel(channel).wavelength_nm)
         return self._drives[channel]
 
-    def path(self, channel: str, plane_mm: float) -> Path:
+    def path(self, channel: str, plane_mm: float) -> OpticalPath:
         """The channel's path to a plane."""
         key = (channel, float(plane_mm))
         if key not in self._paths:
-            self._paths[key] = Path(self.bench, channel, plane_mm)
+            self._paths[key] = OpticalPath(self.bench, channel, plane_mm)
             if len(self._paths) > self._KEPT:
                 self._paths.popitem(last=False)
         self._paths.move_to_end(key)
         return self._paths[key]
 
     def surface(self, wavelength_nm: float) -> Surface:
-        """What the pattern does not change at the panel, at a wavelength."""
+        """The panel's surface at a wavelength."""
         if wavelength_nm not in self._surfaces:
             if len(self._surfaces) >= 24:
                 self._surfaces.clear()
@@ -166,7 +183,20 @@ class BenchOptics:
     def irradiance_and_pullback(
         self, gray: NDArray[np.generic], channel: str, plane_mm: float
     ) -> tuple[Single, Pullback]:
-        """Irradiance samples, and the map from d f / d irradiance [sY, sX] to d f / d gray [H, W]."""
+        """Irradiance, and its pullback.
+
+        Parameters
+        ----------
+        gray : array [H, W]
+            Fractions allowed.
+        channel : str
+        plane_mm : float, mm
+
+        Returns
+        -------
+        (float32 array [sY, sX], callable)
+            Irradiance samples; from d f / d irradiance [sY, sX] to d f / d gray [H, W].
+        """
         irradiance, modes = self._run(gray, channel, plane_mm, keep=True)
         drive, path = self.drive(channel), self.path(channel, plane_mm)
         slope = drive.slope(np.asarray(gray, np.float64))
@@ -186,7 +216,7 @@ class BenchOptics:
 
     def _run(
         self, gray: NDArray[np.generic], channel: str, plane_mm: float, keep: bool
-    ) -> tuple[Single, list[tuple[Line, Complex | None, float, Complex, Complex]]]:
+    ) -> tuple[Single, list[tuple[SpectralLine, Complex | None, float, Complex, Complex]]]:
         drive, path = self.drive(channel), self.path(channel, plane_mm)
         phase = drive.magnitude(np.asarray(gray, np.float64))
         total = np.zeros(path.band.samples, np.float32)

@@ -1,4 +1,4 @@
-"""What can be wrong with a simulated bench: one frozen dataclass a kind, parameters in physical units.
+"""Hidden defects of a simulated bench: one frozen dataclass for each kind, parameters in physical units.
 
 The first eighteen kinds carry the names of the catalogue of effects. `specks`, `fringes`, `stripes` are
 outside the catalogue, and `convention` is a bench described the wrong way. Lateral parameters that scale with
@@ -12,12 +12,20 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from firmware_iface.errors import InputError, nearest
-from firmware_iface.virtual.tables import parameter, read_table
+from firmware_iface.toml_tables import parameter, read_table
 
 
 @dataclass(frozen=True)
 class Defect:
-    """Base of all defects; `kind` is the name in TOML, `stage` where in the light path it acts."""
+    """Base of all defects.
+
+    Attributes
+    ----------
+    kind : str
+        The name in TOML.
+    stage : str
+        Where in the light path it acts.
+    """
 
     kind: ClassVar[str] = ""
     stage: ClassVar[str] = ""
@@ -95,7 +103,7 @@ class Illumination(Defect):
 
 @dataclass(frozen=True)
 class PanelWavefront(Defect):
-    """A panel like a potato chip: saddle, trefoil and a dent, one path difference for all colours."""
+    """A panel that is not flat: saddle, trefoil and a dent, one path difference for all colours."""
 
     kind = "panel_wavefront"
     stage = "panel"
@@ -172,7 +180,7 @@ class SensorBlur(Defect):
 
 @dataclass(frozen=True)
 class Misregistration(Defect):
-    """What is left of shift, rotation, scale and distortion after registration."""
+    """Shift, rotation, scale and distortion that remain after registration."""
 
     kind = "misregistration"
     stage = "sensor"
@@ -313,14 +321,20 @@ DEFECT_KINDS: dict[str, type[Defect]] = {c.kind: c for c in _CATALOGUE + _OUTSID
 
 
 def make_defect(kind: str, where: str = "a defect", **parameters: Any) -> Defect:
-    """A defect by name; parameters that are not given take their defaults. Raises InputError."""
+    """A defect by name; parameters that are not given take their defaults.
+
+    Raises
+    ------
+    InputError
+        For an unknown kind or parameter, or a value out of range.
+    """
     if kind not in DEFECT_KINDS:
         raise InputError(f"{where} has an unknown kind '{kind}'; {nearest(kind, DEFECT_KINDS)}")
     return read_table(DEFECT_KINDS[kind], parameters, f"{where} (kind '{kind}')")
 
 
 def read_defect(table: Mapping[str, Any], where: str) -> Defect:
-    """A defect from one `[[defect]]` table, whose `kind` names it. Raises InputError."""
+    """A defect from one `[[defect]]` table, whose `kind` names it; raises as `make_defect`."""
     if not isinstance(table, Mapping) or "kind" not in table:
         raise InputError(f"{where} lacks the key 'kind'; add kind = \"...\" with a kind of defect.")
     return make_defect(str(table["kind"]), where, **{k: v for k, v in table.items() if k != "kind"})

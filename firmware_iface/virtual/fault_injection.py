@@ -1,4 +1,4 @@
-"""Faults of a byte-level model: which, when, for how long. Every model asks the same script before each transfer.
+"""Faults injected into byte-level models: which, when, for how long. Every model asks one script before each transfer.
 
 faults = Faults()
 faults.arm("stall")                 # the next transfer
@@ -21,7 +21,7 @@ KINDS = {
     "stall": "the request is refused (USB: the endpoint halts)",
     "short_write": "only the first part of what is written arrives",
     "nack": "the address is not acknowledged (I2C)",
-    "unplug": "the device is gone; clearing plugs it in again, with the state of a fresh start",
+    "unplug": "the device is unplugged; clearing plugs it in again, with the state of a fresh start",
     "garbage": "the bytes of the transfer arrive as random ones",
     "hang": "nothing is answered or done until it is cleared",
     "late": "what is due comes late, by `late_s`",
@@ -32,17 +32,28 @@ KINDS = {
 class Faults:
     """The faults of one model. Safe to arm from one thread while another drives the model.
 
-    seed : fixes the random bytes of "garbage"
+    Parameters
+    ----------
+    seed : int
+        Fixes the random bytes of "garbage".
 
-    Attributes: late_s (how late a late answer is, s), struck and ended (Counters: how often each kind took
-    effect, and how often it was over, by count or cleared, after it had been due).
+    Attributes
+    ----------
+    late_s : float, s
+        Delay of a late answer.
+    struck : Counter
+        How often each kind took effect.
+    ended : Counter
+        How often each kind ended, by count or by clearing, after it had been due.
     """
 
     def __init__(self, seed: int = 0) -> None:
         self.late_s = 0.25
         self.struck: Counter[str] = Counter()
         self.ended: Counter[str] = Counter()
-        self._script: dict[str, tuple[int, int | None]] = {}  # kind: (transfers to spare, transfers to hit)
+        self._script: dict[
+            str, tuple[int, int | None]
+        ] = {}  # kind: (transfers that pass, transfers that are struck)
         self._random = random.Random(seed)
         self._lock = threading.Lock()
 
@@ -51,8 +62,19 @@ class Faults:
 
         "unplug" always lasts until it is cleared.
 
-        after : transfers to spare first
-        Raises InputError for an unknown kind or a number out of range.
+        Parameters
+        ----------
+        kind : str
+            One of KINDS.
+        count : int or None
+            Transfers that are struck; None: until cleared.
+        after : int
+            Transfers that pass before.
+
+        Raises
+        ------
+        InputError
+            For an unknown kind or a number out of range.
         """
         if kind not in KINDS:
             raise InputError(f"there is no fault '{kind}'; {nearest(kind, KINDS)}")

@@ -1,4 +1,4 @@
-"""From irradiance samples to camera counts: what the eye would see, what the camera makes of it, its noise.
+"""From irradiance samples to camera counts: the picture for the eye, the camera's picture, its noise.
 
 Irradiance samples [sY, sX] lie s a panel pixel over a padded window, sample (s i, s j) on the centre of pixel
 (i, j). Pixels integrate over their area: the box, the ghost and the lens are one exact filter of frequency.
@@ -9,8 +9,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_iface.virtual import defects
-from firmware_iface.virtual.description import BenchDescription
+from firmware_iface.virtual.bench_description import BenchDescription
+from firmware_iface.virtual.defects import (
+    Convention,
+    Fringes,
+    Ghost,
+    LaserDrift,
+    Misregistration,
+    SensorBlur,
+    SensorResponse,
+    StrayLight,
+    Vignetting,
+)
 from firmware_iface.virtual.simulated_panel import share_grid
 
 Array = NDArray[np.float64]
@@ -19,18 +29,23 @@ Complex = NDArray[np.complex64]
 
 
 class Integrator:
-    """Camera pixels, and the picture that the eye would see on the panel's own grid.
+    """Irradiance on camera pixels, and on panel pixels, as the eye would see it.
 
-    samples : (sY, sX), shape of the irradiance samples
-    oversampling : s, samples a panel pixel
+    Parameters
+    ----------
+    bench : BenchDescription
+    samples : (int, int)
+        (sY, sX), shape of the irradiance samples.
+    oversampling : int
+        s, samples a panel pixel.
     """
 
     def __init__(self, bench: BenchDescription, samples: tuple[int, int], oversampling: int) -> None:
         self.bench, self.samples, self.s = bench, samples, oversampling
         fy: Array = np.asarray(np.fft.fftfreq(samples[0]) * oversampling, np.float64)[:, None]
         fx: Array = np.asarray(np.fft.rfftfreq(samples[1]) * oversampling, np.float64)[None, :]
-        ghost = ghost_filter(bench.defect(defects.Ghost), fy, fx)
-        lens = lens_filter(bench.defect(defects.SensorBlur), fy, fx)
+        ghost = ghost_filter(bench.defect(Ghost), fy, fx)
+        lens = lens_filter(bench.defect(SensorBlur), fy, fx)
         side = bench.camera.pixel_um / bench.panel.pitch_um
         self._display = (np.sinc(fy) * np.sinc(fx) * ghost).astype(np.complex64)
         self._camera = (np.sinc(fy * side) * np.sinc(fx * side) * ghost * lens).astype(np.complex64)
@@ -48,7 +63,7 @@ class Integrator:
         return np.fft.irfft2(np.fft.rfft2(wide) * self._display.conj(), s=self.samples).astype(np.float32)
 
     def camera(self, irradiance: Single) -> Array:
-        """Irradiance on camera pixels, [h, w]: through the lens, and where the camera really looks."""
+        """Irradiance on camera pixels, [h, w]: through the lens, at the camera's true position."""
         spectrum = np.fft.rfft2(irradiance) * self._camera
         if self._where is None:
             return self._on_grid(spectrum).astype(np.float64)
@@ -68,8 +83,8 @@ class Integrator:
         return fine[: self.s * h : self.s, : self.s * w : self.s].astype(np.float32)
 
 
-def ghost_filter(d: defects.Ghost | None, fy: Array, fx: Array) -> Complex | Array:
-    """What a weak displaced copy does to the irradiance's spectrum; f in cycles a pixel."""
+def ghost_filter(d: Ghost | None, fy: Array, fx: Array) -> Complex | Array:
+    """Effect of a weak displaced copy on the irradiance's spectrum; f in cycles a pixel."""
     if d is None:
         return np.ones((1, 1))
     blur = np.exp(-2 * (np.pi * d.sigma_px) ** 2 * (fy**2 + fx**2))
@@ -78,7 +93,7 @@ def ghost_filter(d: defects.Ghost | None, fy: Array, fx: Array) -> Complex | Arr
     )
 
 
-def lens_filter(d: defects.SensorBlur | None, fy: Array, fx: Array) -> Array:
+def lens_filter(d: SensorBlur | None, fy: Array, fx: Array) -> Array:
     """Transfer of the camera's lens; f in cycles a pixel."""
     if d is None:
         return np.ones((1, 1))
@@ -89,7 +104,7 @@ def lens_filter(d: defects.SensorBlur | None, fy: Array, fx: Array) -> Array:
 
 def camera_positions(bench: BenchDescription) -> tuple[Array, Array] | None:
     """(y, x), each [h, w]: panel coordinates of the camera pixels; None where they are the panel's own."""
-    d = bench.defect(defects.Misregistration)
+    d = bench.defect(Misregistration)
     camera = bench.camera
     if camera.registered and d is None:
         return None
@@ -145,20 +160,24 @@ class Sensor:
     def __init__(self, bench: BenchDescription) -> None:
         self.bench = bench
         h, w = bench.camera.height, bench.camera.width
-        self.gain = sensitivity(bench.defect(defects.Vignetting), h, w) * fringes(
-            bench.defect(defects.Fringes), h, w
-        )
+        self.gain = sensitivity(bench.defect(Vignetting), h, w) * fringes(bench.defect(Fringes), h, w)
         full_counts = 2**bench.camera.bit_depth - 1 - bench.camera.black_level
-        self.stray_e = (
-            stray_counts(bench.defect(defects.StrayLight), h, w) / full_counts * bench.camera.full_well_e
-        )
-        self._response = bench.defect(defects.SensorResponse)
-        self._convention = bench.defect(defects.Convention)
+        self.stray_e = stray_counts(bench.defect(StrayLight), h, w) / full_counts * bench.camera.full_well_e
+        self._response = bench.defect(SensorResponse)
+        self._convention = bench.defect(Convention)
 
     def electrons(self, irradiance: Array, dose: float) -> Array:
-        """Mean electrons, [h, w], of irradiance on camera pixels.
+        """Mean electrons of irradiance on camera pixels.
 
-        dose : power as a share of full power, times exposure over 10 ms
+        Parameters
+        ----------
+        irradiance : float64 array [h, w]
+        dose : float
+            Power as a share of full power, times exposure over 10 ms.
+
+        Returns
+        -------
+        float64 array [h, w]
         """
         d = self._convention
         if d and d.mirror_x:
@@ -172,7 +191,7 @@ class Sensor:
         return dose * (signal + self.stray_e)
 
     def respond(self, electrons: Array) -> Array:
-        """Electrons as the read-out reports them: bent where the response is not straight."""
+        """Electrons as the read-out reports them, after a response that may be nonlinear."""
         d = self._response
         if d is None:
             return electrons
@@ -197,7 +216,7 @@ class Sensor:
         return counts
 
 
-def sensitivity(d: defects.Vignetting | None, height: int, width: int) -> Array:
+def sensitivity(d: Vignetting | None, height: int, width: int) -> Array:
     """cos^4 of the field angle about an off-centre axis, 1 at its best, [height, width]."""
     if d is None:
         return np.ones((1, 1))
@@ -207,7 +226,7 @@ def sensitivity(d: defects.Vignetting | None, height: int, width: int) -> Array:
     return 1 / (1 + (r * np.tan(np.deg2rad(d.corner_angle_deg))) ** 2) ** 2
 
 
-def fringes(d: defects.Fringes | None, height: int, width: int) -> Array:
+def fringes(d: Fringes | None, height: int, width: int) -> Array:
     """1 + a chirped sinusoid, [height, width]."""
     if d is None:
         return np.ones((1, 1))
@@ -218,7 +237,7 @@ def fringes(d: defects.Fringes | None, height: int, width: int) -> Array:
     return 1 + d.contrast * np.cos(2 * np.pi / d.period_px * (t + d.chirp * t**2 / (2 * half)) + 0.5)
 
 
-def stray_counts(d: defects.StrayLight | None, height: int, width: int) -> Array:
+def stray_counts(d: StrayLight | None, height: int, width: int) -> Array:
     """Added light at full power and 10 ms, counts, [height, width]."""
     if d is None:
         return np.zeros((1, 1))
@@ -231,7 +250,7 @@ def stray_counts(d: defects.StrayLight | None, height: int, width: int) -> Array
 class Drift:
     """The lasers' power, capture by capture; the same for the same seed."""
 
-    def __init__(self, d: defects.LaserDrift | None, seed: int) -> None:
+    def __init__(self, d: LaserDrift | None, seed: int) -> None:
         self._d, self._rng = d, np.random.default_rng([seed, 41])
         self._walk = [0.0]
 

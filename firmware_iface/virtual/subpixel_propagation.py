@@ -40,10 +40,16 @@ def _sum(a: Complex, axis: int = -1) -> Complex:
 class Band:
     """From sub-pixels to a band of frequencies, from the band to irradiance samples, and both adjoints.
 
-    shape : (H, W), panel pixels
-    q : sub-pixels across a pixel
-    border_px : empty pixels added to each axis, at least
-    half_band : the band's half width, cycles a pixel (0.5 is the panel's own); its edges are included
+    Parameters
+    ----------
+    shape : (int, int)
+        (H, W), panel pixels.
+    q : int
+        Sub-pixels across a pixel.
+    border_px : float, pixels
+        Least number of empty pixels added to each axis.
+    half_band : float
+        The band's half width, cycles a pixel (0.5 is the panel's own); its edges are included.
     """
 
     def __init__(self, shape: tuple[int, int], q: int, border_px: float, half_band: float) -> None:
@@ -116,9 +122,18 @@ class Band:
 
 
 def walk_px(wavelength_nm: float, pitch_um: float, distance_mm: float, half_band: float) -> float:
-    """How far light at the band's edge walks sideways over a distance, panel pixels.
+    """Sideways distance that light at the band's edge travels.
 
-    half_band : cycles a pixel
+    Parameters
+    ----------
+    wavelength_nm : float, nm
+    pitch_um : float, µm
+    distance_mm : float, mm
+    half_band : float, cycles a pixel
+
+    Returns
+    -------
+    float, panel pixels
     """
     sine = min(half_band * wavelength_nm * 1e-3 / pitch_um, 0.99)
     return abs(distance_mm) * 1e3 / pitch_um * sine / np.sqrt(1 - sine**2)

@@ -90,9 +90,9 @@ def open_devices(spec: str, seed: int = 0) -> Iterator[Devices]:
 @contextmanager
 def open_tables(tables: Mapping[str, Any]) -> Iterator[Devices]:
     """As `open_devices`, for the tables [panel], [lasers] and [camera] of a configuration."""
-    from firmware_iface.assembled import laser_channels, laser_power, open_camera, open_panel
-    from firmware_iface.lasers.guard import open_guarded_lasers
-    from firmware_iface.virtual.served import i2c_bus
+    from firmware_iface.configured_devices import laser_channels, laser_power, open_camera, open_panel
+    from firmware_iface.lasers.guarded_lasers import open_guarded_lasers
+    from firmware_iface.virtual.remote_hardware import i2c_bus
 
     bus = str(tables["lasers"].get("bus"))
     with ExitStack() as stack:
@@ -129,7 +129,7 @@ def emulated(bench: str, seed: int = 0) -> Iterator[Devices]:
         As `open_devices`.
     """
     from firmware_iface.virtual import load_bench
-    from firmware_iface.virtual.served import PREFIX, running
+    from firmware_iface.virtual.remote_hardware import PREFIX, running
 
     colours = [c.name for c in load_bench(bench).channels]
     with TemporaryDirectory(prefix="hololoop-") as folder:

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from firmware_iface.assembled import open_camera
+from firmware_iface.configured_devices import open_camera
 from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
 from runtime.service.child_processes import child_link
 from runtime.service.configuration import read_configuration

@@ -37,7 +37,7 @@ CONFIG is one TOML file:
   kind = "oak"
 
 Without hardware: python -m firmware_iface.virtual.served SOCKET emulates it, and bus = "virtual:SOCKET" in [panel],
-[lasers] and (with kind = "virtual") [camera] leads there. firmware_iface/assembled.py lists all keys of the devices.
+[lasers] and (with kind = "virtual") [camera] leads there. firmware_iface/configured_devices.py lists all keys.
 
 Programs connect as runtime.service.client does in Python; hololoop_service.h, beside it, is for C. The lasers are
 dark until a program clears and arms them, and after every fault until it does so again.
@@ -58,7 +58,7 @@ def arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> dict[str, Any]:
     """Serve until stopped; returns what `--json` prints."""
-    from firmware_iface.assembled import open_lasers
+    from firmware_iface.configured_devices import open_lasers
     from runtime.service.configuration import read_configuration
     from runtime.service.supervisor import Supervisor
 

@@ -7,7 +7,7 @@ bundle = "bundle"                      # folder of the calibrated light path, fr
 socket = "/run/hololoop/service.sock"  # unless systemd passes one
 users = [1000]                         # who may connect, as well as root and the service's own user
 
-[panel]                                # see firmware_iface.assembled for the devices' tables
+[panel]                                # see firmware_iface.configured_devices for the devices' tables
 [lasers]
 [camera]
 """
@@ -20,9 +20,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from firmware_iface.assembled import check_tables
+from firmware_iface.configured_devices import check_tables
 from firmware_iface.errors import InputError, nearest
-from firmware_iface.virtual.tables import parameter, read_table
+from firmware_iface.toml_tables import parameter, read_table
 
 DEVICES = ("panel", "lasers", "camera")
 

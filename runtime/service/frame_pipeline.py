@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from firmware_iface.assembled import open_panel
+from firmware_iface.configured_devices import open_panel
 from firmware_iface.errors import InputError
 from runtime.service import process_messages, protocol
 from runtime.service.configuration import Configuration

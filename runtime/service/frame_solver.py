@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from firmware_iface.assembled import mrad_per_pixel
+from firmware_iface.configured_devices import mrad_per_pixel
 from firmware_iface.errors import InputError
 from firmware_iface.lasers.eye_safety import spot_shares
 from runtime.bundle.bundle_folder import INITIALISER, read_bundle

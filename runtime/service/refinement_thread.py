@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from firmware_iface.assembled import mrad_per_pixel
+from firmware_iface.configured_devices import mrad_per_pixel
 from firmware_iface.errors import InputError
 from firmware_iface.lasers.eye_safety import spot_shares
 from runtime.bundle.bundle_folder import read_bundle

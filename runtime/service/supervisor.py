@@ -12,7 +12,7 @@ import sys
 import time
 from functools import partial
 
-from firmware_iface.assembled import laser_power, open_lasers
+from firmware_iface.configured_devices import laser_power, open_lasers
 from runtime.service import protocol
 from runtime.service.camera_client import CameraClient
 from runtime.service.configuration import Configuration

@@ -1,10 +1,10 @@
 """Thousands of faults over the running service: `python -m tests.campaigns.faults --count N --seed S [--json]`.
 
-Several headsets run beside each other, each with emulated hardware in a process of its own, which notes when
-there is light; the camera of the first is an OAK behind depthai, where that is installed. Each fault strikes a
-headset that is lit and shows pictures; where the fault demands darkness, the time from the fault to the end of
-the light is taken from those notes. Then the cause is taken away, and the headset has to come back to light
-without a restart of the service, other than the one that systemd makes of a service that died.
+Several headsets run in parallel, each with emulated hardware in a process of its own, which records when there is
+light; the camera of the first is an OAK behind depthai, where that is installed. Each fault strikes a headset that is
+lit and shows pictures; where the fault requires darkness, the time from the fault to the end of the light is taken
+from that record. Then the cause is removed, and the headset must return to light without a restart of the service,
+other than the restart by systemd of a service that died.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tests.campaigns.kinds import KINDS, Kind
+from tests.campaigns.fault_kinds import KINDS, FaultKind
 from tests.campaigns.lane import Lane
 
 DARK_WITHIN_S = 0.150
 PATIENCE_S = 1.0  # for darkness that comes too late
-SETTLE_S = 0.03  # what a fault that demands nothing is given to do harm
+SETTLE_S = 0.03  # time in which a fault that requires nothing could do harm
 CHECK_EVERY = 25  # faults
 
 
 @dataclass
 class Tally:
-    """What was seen of one kind, or of all."""
+    """Counts for one kind of fault, or for all."""
 
     faults: int = 0
     dark_required: int = 0
@@ -44,8 +44,8 @@ class Tally:
 
 
 @dataclass
-class Result:
-    """What a headset's share of the campaign came to."""
+class CampaignResult:
+    """Results of one headset, or of all."""
 
     kinds: dict[str, Tally] = field(default_factory=dict)
     torn: int = 0
@@ -53,14 +53,12 @@ class Result:
     accepted: int = 0
     shown: int = 0
     lost: int = 0
-    stored: int = (
-        0  # times that garbage had got into the DAC's EEPROM, which was then written dark with the key off
-    )
+    stored: int = 0  # how often garbage was in the DAC's EEPROM, which was then written dark with the key off
     troubles: list[str] = field(default_factory=list)
 
 
-def strike(lane: Lane, kind: Kind) -> tuple[float | None, bool]:
-    """One fault: seconds to darkness (None: it did not come), and whether the headset came back."""
+def strike(lane: Lane, kind: FaultKind) -> tuple[float | None, bool]:
+    """One fault: seconds to darkness (None: it did not come), and whether the headset recovered."""
     at = kind.strike(lane)
     end = at + (PATIENCE_S if kind.dark else SETTLE_S)
     dark = lane.dark_since(at)
@@ -74,10 +72,10 @@ def strike(lane: Lane, kind: Kind) -> tuple[float | None, bool]:
     return None if dark is None else dark - at, lane.light_up()
 
 
-def run_lane(number: int, plan: list[str], seed: int, oak: bool) -> Result:
+def run_lane(number: int, plan: list[str], seed: int, oak: bool) -> CampaignResult:
     """Strike one headset with the faults of a plan, in its order."""
     known = {kind.name: kind for kind in KINDS}
-    result = Result()
+    result = CampaignResult()
     with tempfile.TemporaryDirectory(prefix="hololoop-") as folder:
         lane = Lane(Path(folder), seed, f"127.0.{os.getpid() % 250 + 1}.{number + 1}" if oak else None)
         try:
@@ -107,7 +105,7 @@ def run_lane(number: int, plan: list[str], seed: int, oak: bool) -> Result:
 def plans(count: int, seed: int, lanes: int, slow_first: bool) -> list[list[str]]:
     """Which faults strike which headset, in which order: every kind at least once where the count allows it.
 
-    slow_first : the first headset gets half as many, because its camera takes a second to come back
+    slow_first : the first headset gets half as many, because its camera needs a second to recover
     """
     rng = random.Random(seed)
     names = [kind.name for kind in KINDS]
@@ -120,9 +118,9 @@ def plans(count: int, seed: int, lanes: int, slow_first: bool) -> list[list[str]
     return shares
 
 
-def campaign(count: int, seed: int, lanes: int, oak: bool) -> Result:
-    """All headsets, beside each other."""
-    total = Result()
+def campaign(count: int, seed: int, lanes: int, oak: bool) -> CampaignResult:
+    """All headsets, in parallel."""
+    total = CampaignResult()
     with ProcessPoolExecutor(lanes) as pool:
         shares = [
             pool.submit(run_lane, number, plan, seed + number, oak and number == 0)
@@ -142,7 +140,7 @@ def campaign(count: int, seed: int, lanes: int, oak: bool) -> Result:
     return total
 
 
-def summary(result: Result) -> dict[str, Any]:
+def summary(result: CampaignResult) -> dict[str, Any]:
     """What `--json` prints."""
     tallies = result.kinds.values()
     faults, recovered = sum(t.faults for t in tallies), sum(t.recovered for t in tallies)
@@ -159,7 +157,7 @@ def summary(result: Result) -> dict[str, Any]:
     }
 
 
-def table(result: Result) -> str:
+def table(result: CampaignResult) -> str:
     """The same by kind, as a table in Markdown."""
     lines = [
         "| Fault | Count | Dark demanded | In time | Worst, ms | Recovered |",
@@ -177,11 +175,11 @@ def table(result: Result) -> str:
 
 
 def main() -> int:
-    """Run the campaign; exit 0 where every promise held, else 1."""
+    """Run the campaign; exit 0 where every guarantee was kept, else 1."""
     parser = argparse.ArgumentParser(prog="python -m tests.campaigns.faults", description=__doc__)
     parser.add_argument("--count", type=int, default=10000, help="faults (default 10000)")
     parser.add_argument("--seed", type=int, default=0, help="of the faults' kinds and order (default 0)")
-    parser.add_argument("--headsets", type=int, default=3, help="beside each other (default 3)")
+    parser.add_argument("--headsets", type=int, default=3, help="in parallel (default 3)")
     parser.add_argument("--table", type=Path, help="also write the table by kind, Markdown, to this file")
     parser.add_argument(
         "--json", action="store_true", help="print one JSON object on stdout and nothing else"

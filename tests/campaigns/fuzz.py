@@ -1,9 +1,9 @@
-"""Coverage-guided fuzzing of every parser of bytes that we wrote: no crash, no hang, no read beyond the message.
+"""Coverage-guided fuzzing of every parser of bytes in the project: no crash, no hang, no read beyond the message.
 
     python -m tests.campaigns.fuzz [--seconds N] [--json] [TARGET ...]
 
-Each target takes any bytes and may refuse them with the errors it documents; anything else, five seconds
-without an end, or two gigabytes is a finding: the run ends with exit code 1 and the input lies in the folder
+Each target takes any bytes and may refuse them with the errors it documents; anything else, a run of
+more than five seconds, or two gigabytes is a finding: the run ends with exit code 1 and the input lies in the folder
 given by --findings. Needs the extra `fuzz` (atheris).
 """
 
@@ -29,7 +29,7 @@ _SCRATCH = tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir
 
 def panel_replies() -> Target:
     """Replies of the panel board, as they are and with a right CRC."""
-    from firmware_iface.panel.board import parse_identity, parse_status, parse_timing
+    from firmware_iface.panel.panel_board_messages import parse_identity, parse_status, parse_timing
 
     def one(data: bytes) -> None:
         for parse in (parse_identity, parse_status, parse_timing):
@@ -43,7 +43,7 @@ def panel_replies() -> Target:
 def panel_board() -> Target:
     """The board's model: any requests and frames; what it displays is whole and was committed."""
     from firmware_iface.virtual.usb import BoardModel
-    from firmware_iface.virtual.usb.device import Nak, Stall
+    from firmware_iface.virtual.usb.usb_model import Nak, Stall
 
     def one(data: bytes) -> None:
         now = [0.0]
@@ -68,7 +68,7 @@ def panel_board() -> Target:
 
 def modulator_answers() -> Target:
     """Answers of the DLPC900."""
-    from firmware_iface.panel.dlpc900 import parse_answer
+    from firmware_iface.panel.dlpc900_commands import parse_answer
 
     def one(data: bytes) -> None:
         with suppress(ValueError):
@@ -82,14 +82,14 @@ def modulator_model() -> Target:
     """The DLPC900's model: any packets, any compressed images."""
     import numpy as np
 
-    from firmware_iface.panel import erle
+    from firmware_iface.panel import run_length_encoding
     from firmware_iface.virtual.usb import Dlpc900Model
-    from firmware_iface.virtual.usb.dlpc900 import _Refused, decode_image
+    from firmware_iface.virtual.usb.run_length_decoding import CommandError, decode_image
 
-    header = erle.encode(np.zeros((2, 3), np.uint32))[: erle.HEADER_BYTES]
+    header = run_length_encoding.encode(np.zeros((2, 3), np.uint32))[: run_length_encoding.HEADER_BYTES]
 
     def one(data: bytes) -> None:
-        with suppress(_Refused):
+        with suppress(CommandError):
             assert decode_image(header + data, 2, 3).shape == (2, 3)
         model = Dlpc900Model((4, 6))
         model.control(0, 9, 1, 0, b"", lambda: True)
@@ -102,8 +102,8 @@ def modulator_model() -> Target:
 
 def camera_messages() -> Target:
     """What the camera's process sends, cut anywhere, and the pictures in it."""
-    from firmware_iface.camera.pipe import Frame, Messages
-    from firmware_iface.camera.pixels import unpack
+    from firmware_iface.camera.pixel_unpacking import unpack
+    from firmware_iface.camera.process_messages import Frame, Messages
 
     def one(data: bytes) -> None:
         parser = Messages()
@@ -120,7 +120,7 @@ def camera_messages() -> Target:
 
 def camera_pixels() -> Target:
     """Packed pixels under any geometry."""
-    from firmware_iface.camera.pixels import unpack
+    from firmware_iface.camera.pixel_unpacking import unpack
 
     def one(data: bytes) -> None:
         if len(data) < 4:
@@ -135,11 +135,11 @@ def camera_pixels() -> Target:
 
 def camera_link() -> Target:
     """libnop values, as the emulated camera reads them from the host."""
-    from firmware_iface.virtual.oak import nop
+    from firmware_iface.virtual.oak import libnop
 
     def one(data: bytes) -> None:
         with suppress(ValueError):
-            nop.decode(data)
+            libnop.decode(data)
 
     return one
 
@@ -195,7 +195,7 @@ def service_messages() -> Target:
 def bundles() -> Target:
     """A bundle's manifest and its arrays, also where the hashes are right."""
     from firmware_iface.errors import InputError
-    from runtime.bundle.bundle_folder import bundle_folder as bundle
+    from runtime.bundle import bundle_folder as bundle
 
     folder = Path(_SCRATCH.name)
 

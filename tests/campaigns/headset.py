@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_iface.virtual.served import Remote, running
+from firmware_iface.virtual.remote_hardware import RemoteHardware, running
 from runtime.bundle.bundle_folder import write_bundle
 from runtime.bundle.light_path_arrays import pack_light_paths
 from runtime.service.client import Client, connect
@@ -27,7 +27,7 @@ DISTANCE_MM = 6.0
 
 @contextmanager
 def urgent() -> Iterator[None]:
-    """What is started in the block is scheduled as the unit file asks, where that is allowed."""
+    """Schedule processes that start in the block as the unit file does, where that is allowed."""
     with suppress(PermissionError):
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(10))
     try:
@@ -72,8 +72,15 @@ def write_configuration(
 ) -> Path:
     """A bundle, a bench and a configuration in `folder`; returns the configuration's path.
 
-    oak : loopback address of an emulated OAK camera; none: the camera without a link
-    The limits are wide at first, so that a busy machine does not look like a fault.
+    The default limits are wide, so that a busy machine is not taken for a fault.
+
+    Parameters
+    ----------
+    folder : Path
+    refresh_hz : float, Hz
+    solve_ms, stale_limit_ms : float, ms
+    oak : str or None
+        Loopback address of an emulated OAK camera; None: the camera without a link.
     """
     path = converted(ideal_path(SHAPE, DISTANCE_MM * 1e-3), np.float32)
     records, arrays = pack_light_paths([("green", DISTANCE_MM, 520.0, path)])
@@ -96,7 +103,7 @@ def write_configuration(
 
 
 @contextmanager
-def hardware(folder: Path, seed: int = 0, oak: str | None = None) -> Iterator[Remote]:
+def hardware(folder: Path, seed: int = 0, oak: str | None = None) -> Iterator[RemoteHardware]:
     """Emulated hardware for the configuration in `folder`, in a process of its own."""
     with ExitStack() as stack:
         with urgent():
@@ -153,7 +160,7 @@ def picture(client: Client, seed: int = 0) -> np.ndarray:
 
 
 def knock(file: Path, messages: list[bytes]) -> None:
-    """Send the service of a configuration messages of whatever kind, and go."""
+    """Send messages of any kind to the service of a configuration, and disconnect."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
         connection.connect(str(file.parent / "service.sock"))
         for message in messages:

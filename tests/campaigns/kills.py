@@ -1,8 +1,8 @@
 """kill -9 of any process at any moment: `python -m tests.campaigns.kills --count N --seed S [--json]`.
 
-The service, its solver, its camera process, and a program that replaces the bundle over and over as a calibration
-does. A victim is killed while the headset starts, arms, ramps or shows, at a moment drawn by chance; after each
-kill the light has to be out within 150 ms, the bundle whole, and at the end the headset back at light.
+The service, its solver, its camera process, and a program that replaces the bundle again and again, as a calibration
+does. A victim is killed while the headset starts, arms, ramps or shows, at a random moment. After each kill,
+the light must be out within 150 ms and the bundle whole; at the end the headset must return to light.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from tests.campaigns.headset import ENVIRONMENT
 from tests.campaigns.lane import Lane
 
 VICTIMS = ("service", "solver", "camera", "calibration")
-LONGEST_S = 0.8  # from one kill to the next: starting takes about half of it
+LONGEST_S = 0.8  # from one kill to the next: a start takes about half of it
 REPLACING = """
 import ctypes, sys
 from runtime.bundle.bundle_folder import read_bundle, write_bundle
@@ -53,7 +53,7 @@ def is_whole(bundle: Path) -> bool:
 
 
 def live(lane: Lane, until_s: float) -> None:
-    """Go towards light and show pictures, whatever the service is just able to do."""
+    """Return to light and show pictures, as far as the service allows."""
     while time.monotonic() < until_s:
         try:
             lane.light_up(within_s=0.05)
@@ -65,7 +65,7 @@ def live(lane: Lane, until_s: float) -> None:
 
 
 def kills(count: int, seed: int) -> dict[str, Any]:
-    """Kill so often and say what came of it."""
+    """Kill `count` processes; the results."""
     rng = random.Random(seed)
     victims: Counter[str] = Counter()
     lit = dark_in_time = whole = 0
@@ -118,7 +118,7 @@ def kills(count: int, seed: int) -> dict[str, Any]:
 
 
 def main() -> int:
-    """Run it; exit 0 where every promise held."""
+    """Run it; exit 0 where every guarantee was kept."""
     parser = argparse.ArgumentParser(prog="python -m tests.campaigns.kills", description=__doc__)
     parser.add_argument("--count", type=int, default=500, help="kills (default 500)")
     parser.add_argument("--seed", type=int, default=0, help="of victims and moments (default 0)")

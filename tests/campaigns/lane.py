@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_iface.virtual.served import Remote, i2c_bus
+from firmware_iface.virtual.remote_hardware import RemoteHardware, i2c_bus
 from runtime.service.client import Client, LostFrame, RefusedError
 from runtime.service.protocol import LaserState, PartState, Shown
 from tests.campaigns.headset import ENVIRONMENT, connected, hardware, picture, urgent, write_configuration
@@ -27,11 +27,27 @@ LOST_FOR_S = 1.0  # without the safety controller, before a person looks at the 
 class Lane:
     """A running headset in a folder of its own.
 
-    oak : loopback address of an emulated OAK camera, or none for the camera without a link
+    Parameters
+    ----------
+    folder : Path
+    seed : int
+    oak : str or None
+        Loopback address of an emulated OAK camera; None: the camera without a link.
+    refresh_hz : float, Hz
 
-    Attributes: remote (the hardware), client, service (the process), accepted, shown and lost (numbers of frames),
-    latest (number of the frame that was accepted last), outcomes (those that were taken last), stored (how often the
-    DAC's EEPROM was written dark again).
+    Attributes
+    ----------
+    remote : RemoteHardware
+    client : Client
+    service : subprocess.Popen
+    accepted, shown, lost : int
+        Frames.
+    latest : int
+        Number of the frame that was accepted last.
+    outcomes : list of Shown or Lost
+        Those that were taken last.
+    stored : int
+        How often the DAC's EEPROM was written dark again.
     """
 
     def __init__(
@@ -44,7 +60,7 @@ class Lane:
         self.outcomes: list[Shown | LostFrame] = []
         self.latest = self.stored = 0
         self._stack = ExitStack()
-        self.remote: Remote = self._stack.enter_context(hardware(folder, seed, oak))
+        self.remote: RemoteHardware = self._stack.enter_context(hardware(folder, seed, oak))
         self.service = self.start_service()
         self.client: Client = connected(self.file)
         self.pictures = [picture(self.client, k) for k in range(PICTURES)]
@@ -91,7 +107,7 @@ class Lane:
     # --- the program
 
     def frame(self) -> None:
-        """Show one picture and take what has become of earlier ones."""
+        """Show one picture and take the outcomes of earlier ones."""
         self._next = (self._next + 1) % PICTURES
         try:
             self.latest = self.client.show(self.pictures[self._next])
@@ -108,7 +124,7 @@ class Lane:
         return self.outcomes
 
     def reconnect(self, within_s: float = RECOVERY_S) -> None:
-        """A new program in place of the one that went."""
+        """A new program in place of the one that ended."""
         with suppress(OSError):
             self.client.close()
         self.client = connected(self.file, within_s)
@@ -155,7 +171,7 @@ class Lane:
         return False
 
     def store_dark(self) -> None:
-        """What a person is asked to do where noise on the bus has got into the DAC's EEPROM: write it dark, key off."""
+        """Write the DAC's EEPROM dark with the key off, as a person does after noise on the bus has changed it."""
         bus = i2c_bus(f"virtual:{self.folder / 'hardware.sock'}")
         self.remote.set_to("key", False)
         command = [sys.executable, "-m", "firmware_iface.lasers.store_dark", bus]

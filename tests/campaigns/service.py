@@ -1,6 +1,6 @@
-"""The service as it is, with a solver that also notes its patterns: `python -m tests.campaigns.service CONFIG`.
+"""The service, unchanged, with a solver that also records its patterns: `python -m tests.campaigns.service CONFIG`.
 
-The notes are what the panel's frames are compared with: CRC-32 by CRC-32, written before the service sees it.
+The panel's frames are compared with this record: CRC-32 by CRC-32, written before the service gets the pattern.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ if __name__ == "__main__":
         except ConnectionError:
             os._exit(0)
     else:
-        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # it is not to outlive its campaign
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # it ends with its campaign
         supervisor = Supervisor(read_configuration(sys.argv[1]))
         supervisor.pipeline.solver.process.module = "tests.campaigns.service"
         supervisor.run()

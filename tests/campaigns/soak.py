@@ -1,6 +1,6 @@
 """A long run without faults: `python -m tests.campaigns.soak --frames 100000 [--json]`.
 
-One program shows pictures without pause. What is reported: frames shown, late and lost, latency from End to the
+One program shows pictures without pause. The report: frames shown, late and lost, latency from End to the
 panel, and the memory of each process over time.
 """
 
@@ -24,7 +24,7 @@ SAMPLES = 50
 
 
 def memory_mb(pid: int) -> float:
-    """Memory of a process that is its own, MB."""
+    """Private memory of a process, MB."""
     for line in Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines():
         if line.startswith("Private_Dirty:"):
             return int(line.split()[1]) / 1024
@@ -32,7 +32,7 @@ def memory_mb(pid: int) -> float:
 
 
 def soak(frames: int, refresh_hz: float) -> dict[str, Any]:
-    """Show so many frames and say how that went."""
+    """Show `frames` frames; the results."""
     latency_ms: list[float] = []
     grown: dict[str, list[tuple[int, float]]] = {"service": [], "solver": [], "camera": []}
     late = lost = 0

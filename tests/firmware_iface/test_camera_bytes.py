@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from firmware_iface.camera.pipe import Frame, Messages, frame_message, state_message
-from firmware_iface.camera.pixels import unpack
-from firmware_iface.virtual.oak import nop, pack_raw10
+from firmware_iface.camera.pixel_unpacking import unpack
+from firmware_iface.camera.process_messages import Frame, Messages, frame_message, state_message
+from firmware_iface.virtual.oak import libnop, pack_raw10
 
 
 def test_raw10_of_known_bytes() -> None:
@@ -53,7 +55,7 @@ def test_any_picture_is_unpacked_within_its_bytes_or_refused(
     try:
         counts = unpack(data, encoding, height, width, stride)
     except ValueError as error:
-        assert str(error)
+        assert re.search("not known|whole groups of four|do not hold", str(error))
         return
     assert counts.shape == (height, width) and counts.max() <= (1023 if encoding == "raw10" else 255)
     assert stride * (height - 1) < len(data)
@@ -102,7 +104,7 @@ def test_an_exposure_begins_before_it_ends() -> None:
 values = st.recursive(
     st.one_of(
         st.integers(-(2**63), 2**63 - 1),
-        st.integers(0, 2**64 - 1).map(nop.Unsigned),
+        st.integers(0, 2**64 - 1).map(libnop.Unsigned),
         st.floats(width=32, allow_nan=False),
         st.text(max_size=8),
         st.none(),
@@ -114,19 +116,21 @@ values = st.recursive(
 
 @given(values)
 def test_libnop_values_come_back(value: object) -> None:
-    assert nop.decode(nop.encode(value)) == value
+    assert libnop.decode(libnop.encode(value)) == value
 
 
 @given(st.binary(max_size=60))
 def test_any_bytes_are_a_libnop_value_or_a_value_error(data: bytes) -> None:
     try:
-        nop.decode(data)
+        libnop.decode(data)
     except ValueError as error:
         assert "libnop" in str(error)
 
 
 def test_libnop_bytes_of_known_values() -> None:
     """Fixed integers, sized integers of either sign, and a structure."""
-    assert nop.encode(127) == b"\x7f" and nop.encode(-1) == b"\xff" and nop.encode(-65) == b"\x84\xbf"
-    assert nop.encode(200) == b"\x85\xc8\x00" and nop.encode(nop.Unsigned(200)) == b"\x80\xc8"
-    assert nop.encode((1, [2.0], "a", None)) == bytes.fromhex("b904 01 ba01 8800000040 bd0161 be")
+    assert (
+        libnop.encode(127) == b"\x7f" and libnop.encode(-1) == b"\xff" and libnop.encode(-65) == b"\x84\xbf"
+    )
+    assert libnop.encode(200) == b"\x85\xc8\x00" and libnop.encode(libnop.Unsigned(200)) == b"\x80\xc8"
+    assert libnop.encode((1, [2.0], "a", None)) == bytes.fromhex("b904 01 ba01 8800000040 bd0161 be")

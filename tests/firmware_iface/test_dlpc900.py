@@ -10,11 +10,13 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
-from firmware_iface.panel import Panel, erle, open_dlpc900, plm
-from firmware_iface.panel.dlpc900 import Dlpc900Control, PatternUpload, parse_answer
-from firmware_iface.panel.plm import P47, P67, Modulator
+from firmware_iface.panel import Panel, open_dlpc900, run_length_encoding
+from firmware_iface.panel import phase_light_modulator as plm
+from firmware_iface.panel.dlpc900 import PatternUpload
+from firmware_iface.panel.dlpc900_commands import Dlpc900Control, parse_answer
+from firmware_iface.panel.phase_light_modulator import P47, P67, Modulator
 from firmware_iface.virtual.usb import Dlpc900Model, VirtualUsb
-from firmware_iface.virtual.usb.dlpc900 import _Refused, decode_image
+from firmware_iface.virtual.usb.run_length_decoding import CommandError, decode_image
 
 from .usb_transcript import Transcript
 
@@ -95,8 +97,10 @@ def test_the_bytes_of_one_upload() -> None:
         "08 00 2a 1a",
     ]
     assert sent[1][6:18].hex(" ") == "00 00 80 3e 00 71 00 00 00 00 00 00"  # pattern 0, 16000 us, 1 bit
-    assert sent[2][6:12].hex(" ") == "01 00 00 00 00 00"  # one pattern, for ever
-    encoded = erle.encode(plm.bit_plane(np.array([[0, 240]], np.uint8), mirror).astype(np.uint32))
+    assert sent[2][6:12].hex(" ") == "01 00 00 00 00 00"  # one pattern, without end
+    encoded = run_length_encoding.encode(
+        plm.bit_plane(np.array([[0, 240]], np.uint8), mirror).astype(np.uint32)
+    )
     assert sent[3][6:12] == b"\0\0" + len(encoded).to_bytes(4, "little")
     assert sent[4][2:8] == (len(encoded) + 4).to_bytes(2, "little") + b"\x2b\x1a" + len(encoded).to_bytes(
         2, "little"
@@ -108,7 +112,7 @@ def test_the_bytes_of_one_upload() -> None:
 def test_encoded_rows_of_known_bytes() -> None:
     """A run, single pixels, a row like the one above; the header's size, length and compression."""
     image = np.array([[7, 7, 7, 1, 2], [7, 7, 7, 1, 2]], np.uint32)
-    data = erle.encode(image)
+    data = run_length_encoding.encode(image)
     assert data[:12].hex(" ") == "53 70 6c 64 05 00 02 00 48 00 00 00" and len(data) == 0x48
     assert data[24:27] == bytes([0, 2, 1])
     first, second = "03 000007  00 02 000001 000002  0000", "00 01 05  0000"
@@ -127,23 +131,23 @@ images = arrays(
 @given(images)
 @settings(max_examples=60)
 def test_every_image_comes_back_from_its_encoding(image: np.ndarray) -> None:
-    np.testing.assert_array_equal(decode_image(erle.encode(image), *image.shape), image)
+    np.testing.assert_array_equal(decode_image(run_length_encoding.encode(image), *image.shape), image)
 
 
 def test_smooth_images_shrink_and_noise_does_not_grow_by_more_than_its_rows() -> None:
     smooth = np.zeros((64, 1920), np.uint32)
     smooth[10:50, 300:900] = 0xFFFFFF
-    assert len(erle.encode(smooth)) < 0.005 * smooth.size * 3
+    assert len(run_length_encoding.encode(smooth)) < 0.005 * smooth.size * 3
     noise = np.random.default_rng(0).integers(0, 1 << 24, (16, 1920)).astype(np.uint32)
-    assert len(erle.encode(noise)) <= 3 * noise.size + 16 * 5 + 48 + 8
+    assert len(run_length_encoding.encode(noise)) <= 3 * noise.size + 16 * 5 + 48 + 8
 
 
 @given(st.binary(max_size=120))
 def test_any_bytes_are_decoded_or_refused_by_the_model(body: bytes) -> None:
-    header = erle.encode(np.zeros((2, 3), np.uint32))[:48]
+    header = run_length_encoding.encode(np.zeros((2, 3), np.uint32))[:48]
     try:
         assert decode_image(header + body, 2, 3).shape == (2, 3)
-    except _Refused as refused:
+    except CommandError as refused:
         assert refused.number in (6, 9)
 
 
@@ -192,7 +196,7 @@ def test_power_mode_and_status() -> None:
         (0x1A24, b"\2", "not for this mode"),
     ],
 )
-def test_the_controllers_reason_is_told(code: int, data: bytes, reason: str) -> None:
+def test_the_controllers_reason_is_reported(code: int, data: bytes, reason: str) -> None:
     control = opened(small_model()).control
     assert isinstance(control, Dlpc900Control)
     with pytest.raises(DeviceError, match=f"0x{code:04x}: .*{reason}"):

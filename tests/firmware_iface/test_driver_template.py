@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from firmware_iface.driver_template import Thermometer, parse_temperature
 from firmware_iface.errors import DeviceError, DeviceGoneError
 from firmware_iface.virtual.usb import UsbModel, VirtualUsb
-from firmware_iface.virtual.usb.device import (
+from firmware_iface.virtual.usb.usb_model import (
     Stall,
     configuration_descriptor,
     device_descriptor,
@@ -70,6 +70,7 @@ def test_unplugged_and_replugged() -> None:
 @given(st.binary(max_size=8))
 def test_any_reply_is_a_temperature_or_refused(reply: bytes) -> None:
     try:
-        assert abs(parse_temperature(reply)) <= 327.68
+        hundredths = round(100 * parse_temperature(reply))
+        assert reply == struct.pack("<hh", hundredths, ~hundredths)
     except ValueError as error:
         assert "garbled" in str(error)

@@ -22,7 +22,7 @@ import json, sys
 import numpy as np, usb.backend.libusb1
 from firmware_iface.errors import DeviceError
 from firmware_iface.panel import open_board
-from firmware_iface.panel.board import Timing
+from firmware_iface.panel.panel_board_messages import Timing
 
 assert usb.backend.libusb1.get_backend() is not None
 panel = open_board(timing=Timing(2000, 500, 1000), timeout_s=0.3)

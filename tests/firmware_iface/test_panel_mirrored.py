@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
-from firmware_iface.panel import MirroredDisplay, Panel, dlpc900, open_dlpc900, plm
+from firmware_iface.panel import MirroredDisplay, Panel, dlpc900, dlpc900_commands, open_dlpc900
+from firmware_iface.panel import phase_light_modulator as plm
 from firmware_iface.virtual.usb import Dlpc900Model, VirtualUsb
 
 SHAPE = (6, 10)
@@ -114,7 +115,7 @@ def test_control_over_usb_and_frames_over_the_display_link_make_one_panel(
     def opened() -> Panel:
         return open_dlpc900(1, modulator=modulator, backend=VirtualUsb(model), timeout_s=0.1)
 
-    monkeypatch.setattr(dlpc900, "LOCK_S", 0.05)
+    monkeypatch.setattr(dlpc900_commands, "LOCK_S", 0.05)
     with pytest.raises(DeviceError, match="no picture on displayport"):
         opened()
     model.video = lambda: screen.scanned_out((12, 20)).astype(np.uint32) @ [1 << 16, 1 << 8, 1, 0]

@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from firmware_iface.panel import plm
+from firmware_iface.panel import phase_light_modulator as plm
 from firmware_iface.virtual.usb import Dlpc900Model, VirtualUsb
 
 pytestmark = pytest.mark.slow

@@ -11,10 +11,10 @@ import pytest
 
 from firmware_iface.camera import open_oak
 from firmware_iface.panel import open_board
-from firmware_iface.panel.board import Timing
+from firmware_iface.panel.panel_board_messages import Timing
 from firmware_iface.virtual import open_headset
-from firmware_iface.virtual.description import CameraDescription
-from firmware_iface.virtual.oak import OakModel, looking_at
+from firmware_iface.virtual.bench_description import CameraDescription
+from firmware_iface.virtual.oak import OakModel, expose_bench
 from firmware_iface.virtual.usb import BoardModel, VirtualUsb
 
 WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
@@ -22,7 +22,7 @@ WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
 
 def test_counts_are_brought_to_ten_bits_and_gain_acts_above_black() -> None:
     camera = CameraDescription(bit_depth=12, black_level=64.0)
-    expose = looking_at(lambda exposure_ms: np.array([[64, 164, 4095, 0]], np.uint16), camera)
+    expose = expose_bench(lambda exposure_ms: np.array([[64, 164, 4095, 0]], np.uint16), camera)
     assert expose(1.0, 1.0).tolist() == [[16, 41, 1023, 0]]
     assert expose(1.0, 4.0).tolist() == [[16, 116, 1023, 0]]
 
@@ -39,7 +39,7 @@ def test_a_pattern_sent_over_usb_is_the_picture_that_comes_over_the_cameras_link
         return bench.camera.capture()
 
     described = bench.description.camera
-    oak = OakModel(looking_at(capture, described), bench.camera.shape, f"127.0.9.{WORKER + 1}", 20)
+    oak = OakModel(expose_bench(capture, described), bench.camera.shape, f"127.0.9.{WORKER + 1}", 20)
     panel = open_board(backend=VirtualUsb(board), timing=Timing(4000, 500, 3000))
     camera = open_oak(oak.address, frames_per_s=20, exposure_ms=10.0, timeout_s=30.0, start_s=60.0)
     try:

@@ -1,9 +1,10 @@
-"""Benches in TOML and by name: what is read, what is refused, what is told."""
+"""Benches in TOML and by name: what is read, what is refused, what is reported."""
 
 from __future__ import annotations
 
 import ast
 import json
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -108,7 +109,8 @@ def test_the_nominal_part_tells_nothing_of_the_defects(name):
 
 def test_defects_have_units_or_meanings():
     for cls in DEFECT_KINDS.values():
-        assert cls.__doc__ and cls.stage in ("drive", "panel", "pupil", "sensor")
+        assert cls.stage in ("drive", "panel", "pupil", "sensor")
+        assert fields(cls) and all(field.metadata["about"] for field in fields(cls))
 
 
 def test_the_bench_imports_nothing_but_numpy():

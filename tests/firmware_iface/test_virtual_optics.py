@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from firmware_iface.virtual import BenchDescription, VirtualHeadset, load_bench, make_defect
+from firmware_iface.virtual.bench_description import IrisDescription, SimulationDescription
 from firmware_iface.virtual.bench_optics import BenchOptics
-from firmware_iface.virtual.description import IrisDescription, SimulationDescription
-from firmware_iface.virtual.simulated_panel import Drive, smear_weights
+from firmware_iface.virtual.simulated_drive import Drive, smear_weights
 from firmware_iface.virtual.simulated_sensor import Integrator, interpolate
 from firmware_iface.virtual.subpixel_propagation import Band
 

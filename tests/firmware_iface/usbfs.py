@@ -21,22 +21,22 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from firmware_iface.virtual.usb import UsbModel
-from firmware_iface.virtual.usb.device import Gone, Nak, Stall
+from firmware_iface.virtual.usb.usb_model import Nak, NoDevice, Stall
 
 _WORDS = struct.Struct("<QQQ")
 _IOCTL, _DONE, _READ_MEMORY, _WRITE_MEMORY = 1, 3, 5, 6
 _URB = struct.Struct("<BB2xiI4xQii")  # type, endpoint, status, flags, buffer, length, done
 _CONTROL = 2
-_MEANINGS = {Stall: errno.EPIPE, Gone: errno.ENODEV, Nak: errno.ENOENT}
+_MEANINGS = {Stall: errno.EPIPE, NoDevice: errno.ENODEV, Nak: errno.ENOENT}
 
 
-class _Fails(Exception):
+class _IoctlError(Exception):
     def __init__(self, number: int) -> None:
         self.number = number
 
 
 @dataclass
-class _Opened:
+class _OpenFile:
     """One file descriptor of the program."""
 
     connection: socket.socket
@@ -154,10 +154,10 @@ class UsbFs:
     def _accept(self) -> None:
         while True:
             connection, _ = self._server.accept()
-            opened = _Opened(connection, self.model.generation if self.model.present else -1)
+            opened = _OpenFile(connection, self.model.generation if self.model.present else -1)
             threading.Thread(target=self._serve, args=(opened,), daemon=True).start()
 
-    def _serve(self, opened: _Opened) -> None:
+    def _serve(self, opened: _OpenFile) -> None:
         try:
             while True:
                 command, request, argument = _WORDS.unpack(opened.receive(_WORDS.size))
@@ -165,29 +165,29 @@ class UsbFs:
                 if command == _IOCTL:
                     try:
                         result = self._ioctl(opened, request & 0xFFFFFFFF, argument)
-                    except _Fails as failure:
+                    except _IoctlError as failure:
                         result, number = -1, failure.number
                 opened.connection.sendall(_WORDS.pack(_DONE, result & (1 << 64) - 1, number))
         except (EOFError, OSError):
             opened.cancelled.update(opened.running)
 
-    def _ioctl(self, opened: _Opened, request: int, argument: int) -> int:
+    def _ioctl(self, opened: _OpenFile, request: int, argument: int) -> int:
         model = self.model
-        gone = not model.present or model.generation != opened.generation
+        unplugged = not model.present or model.generation != opened.generation
         match request & 0xFF:
             case 10:
-                if gone:
-                    raise _Fails(errno.ENODEV)
+                if unplugged:
+                    raise _IoctlError(errno.ENODEV)
                 return self._submit(opened, argument)
             case 11:  # discard
                 with opened.lock:
                     if argument not in opened.running:
-                        raise _Fails(errno.EINVAL)
+                        raise _IoctlError(errno.EINVAL)
                     opened.cancelled.add(argument)
             case 12 | 13:  # reap, at once
-                return self._reap(opened, argument, gone)
-            case _ if gone:
-                raise _Fails(errno.ENODEV)
+                return self._reap(opened, argument, unplugged)
+            case _ if unplugged:
+                raise _IoctlError(errno.ENODEV)
             case (
                 26
             ):  # capabilities: zero packets, continued bulk, no packet limit, scatter-gather, reap after loss
@@ -201,19 +201,19 @@ class UsbFs:
             case 20:
                 model.reset()
             case 8 | 18:  # no kernel driver has it
-                raise _Fails(errno.ENODATA)
+                raise _IoctlError(errno.ENODATA)
             case 31:
                 return 3  # high speed
             case 4 | 15 | 16:  # alternate setting, claim, release
                 pass
             case _:
-                raise _Fails(errno.ENOTTY)
+                raise _IoctlError(errno.ENOTTY)
         return 0
 
     def _standard(self, kind: int, request: int, value: int, index: int) -> None:
         self.model.control(kind, request, value, index, b"", lambda: True)
 
-    def _submit(self, opened: _Opened, urb: int) -> int:
+    def _submit(self, opened: _OpenFile, urb: int) -> int:
         kind, endpoint, _, _, buffer, length, _ = _URB.unpack(opened.memory(urb, _URB.size))
         data = opened.memory(buffer, length) if kind == _CONTROL or not endpoint & 0x80 else b""
         with opened.lock:
@@ -239,20 +239,20 @@ class UsbFs:
         threading.Thread(target=self._complete, args=(opened, urb, act), daemon=True).start()
         return 0
 
-    def _complete(self, opened: _Opened, urb: int, act: Callable[[], tuple[int, bytes]]) -> None:
+    def _complete(self, opened: _OpenFile, urb: int, act: Callable[[], tuple[int, bytes]]) -> None:
         status, done, reply = 0, 0, b""
         try:
             done, reply = act()
-        except (Stall, Gone, Nak) as cause:
+        except (Stall, NoDevice, Nak) as cause:
             status = -_MEANINGS[type(cause)]
         with opened.lock:
             opened.finished.append((urb, status, done, reply))
 
-    def _reap(self, opened: _Opened, argument: int, gone: bool) -> int:
+    def _reap(self, opened: _OpenFile, argument: int, unplugged: bool) -> int:
         with opened.lock:
             if not opened.finished:
                 time.sleep(0.0002)  # libusb polls without a pause here
-                raise _Fails(errno.ENODEV if gone and not opened.running else errno.EAGAIN)
+                raise _IoctlError(errno.ENODEV if unplugged and not opened.running else errno.EAGAIN)
             urb, status, done, reply = opened.finished.popleft()
             buffer = opened.running.pop(urb)
             opened.cancelled.discard(urb)

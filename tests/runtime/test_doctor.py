@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from firmware_iface.virtual.served import Remote
+from firmware_iface.virtual.remote_hardware import RemoteHardware
 from runtime.cli import main
 from tests.campaigns.headset import connected, hardware, served, write_configuration
 
@@ -20,7 +20,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def remote(file: Path) -> Iterator[Remote]:
+def remote(file: Path) -> Iterator[RemoteHardware]:
     with hardware(file.parent) as remote:
         yield remote
 
@@ -35,7 +35,7 @@ def part(result: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def test_a_whole_headset_is_ready_and_dark(
-    capsys: pytest.CaptureFixture[str], file: Path, remote: Remote
+    capsys: pytest.CaptureFixture[str], file: Path, remote: RemoteHardware
 ) -> None:
     result = asked(capsys, file)
     assert result["ready"] and result["problems"] == 0
@@ -45,7 +45,7 @@ def test_a_whole_headset_is_ready_and_dark(
 
 
 def test_every_open_condition_is_named_with_what_to_do(
-    capsys: pytest.CaptureFixture[str], file: Path, remote: Remote
+    capsys: pytest.CaptureFixture[str], file: Path, remote: RemoteHardware
 ) -> None:
     remote.set_to("interlock", False)
     remote.set_to("key", False)
@@ -61,13 +61,13 @@ def test_every_open_condition_is_named_with_what_to_do(
 
 @pytest.mark.parametrize("name", ["panel", "lasers", "camera"])
 def test_a_device_that_is_unplugged_is_told_from_one_that_answers(
-    capsys: pytest.CaptureFixture[str], file: Path, remote: Remote, name: str
+    capsys: pytest.CaptureFixture[str], file: Path, remote: RemoteHardware, name: str
 ) -> None:
     remote.break_part(name, "unplug")
     try:
         result = asked(capsys, file)
     finally:
-        remote.mend(name)
+        remote.repair(name)
     for found in result["devices"]:
         assert found["answers"] == (found["part"] != name)
         assert bool(found["problems"]) == (found["part"] == name)
@@ -81,7 +81,7 @@ def test_a_broken_bundle_is_found(capsys: pytest.CaptureFixture[str], tmp_path: 
 
 
 def test_a_service_that_runs_is_asked_and_not_disturbed(
-    capsys: pytest.CaptureFixture[str], file: Path, remote: Remote
+    capsys: pytest.CaptureFixture[str], file: Path, remote: RemoteHardware
 ) -> None:
     with served(file), connected(file):
         result = asked(capsys, file)
@@ -95,7 +95,9 @@ def test_the_host_alone_is_looked_at_without_a_configuration(capsys: pytest.Capt
     assert all(found["answers"] or found["problems"] or not found["attached"] for found in result["devices"])
 
 
-def test_people_get_a_line_a_device(capsys: pytest.CaptureFixture[str], file: Path, remote: Remote) -> None:
+def test_people_get_a_line_a_device(
+    capsys: pytest.CaptureFixture[str], file: Path, remote: RemoteHardware
+) -> None:
     assert main(["devices", str(file)]) == 0
     out = capsys.readouterr().out
     assert out.count("ok  ") == 4 and "everything is well" in out

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from firmware_iface.virtual import BenchDescription, VirtualHeadset, make_defect
-from firmware_iface.virtual.description import ChannelDescription
+from firmware_iface.virtual.bench_description import ChannelDescription
 from trainer.captures.acquire import capture_set
 from trainer.captures.bench_file import Bench
 from trainer.captures.capture_set import CaptureSet, read_captures

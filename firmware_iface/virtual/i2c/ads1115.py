@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from firmware_iface.virtual.i2c.words import WordRegisters, signed
+from firmware_iface.virtual.i2c.word_registers import WordRegisters, signed
 
 CONVERSION, CONFIG, LOW, HIGH = range(4)
 FULL_SCALE_V = (6.144, 4.096, 2.048, 1.024, 0.512, 0.256, 0.256, 0.256)
@@ -15,10 +15,17 @@ PAIRS = ((0, 1), (0, 3), (1, 3), (2, 3))
 class Ads1115(WordRegisters):
     """The converter.
 
-    clock : seconds
-    volts : voltage at input 0 to 3
+    Parameters
+    ----------
+    clock : callable
+        Gives the time, s.
+    volts : callable
+        Gives the voltage at input 0 to 3, V.
 
-    Attributes: alert (whether the ALERT pin is asserted).
+    Attributes
+    ----------
+    alert : bool
+        Whether the ALERT pin is asserted.
     """
 
     def __init__(self, clock: Callable[[], float], volts: Callable[[int], float]) -> None:

@@ -1,4 +1,4 @@
-"""An I2C bus as its wires see it: addresses, bytes, acknowledgements."""
+"""An emulated I2C bus: addresses, bytes, acknowledgements, faults."""
 
 from __future__ import annotations
 
@@ -27,37 +27,76 @@ class Message(NamedTuple):
 
 
 class Part(Protocol):
-    """What a model offers the bus."""
+    """A model on the bus."""
 
     def write(self, data: bytes) -> None:
-        """Take the bytes of one write message; raises NackError."""
+        """Take the bytes of one write message.
+
+        Raises
+        ------
+        NackError
+            Where a byte is not acknowledged.
+        """
 
     def read(self, length: int) -> bytes:
-        """The bytes of one read message; raises NackError."""
+        """The bytes of one read message.
+
+        Raises
+        ------
+        NackError
+            Where the address is not acknowledged.
+        """
 
     def stop(self) -> None:
         """The transfer is over (STOP on the wires)."""
 
 
-class Transferring(Protocol):
-    """Anything that carries transfers: this bus, or the far end of a socket."""
+class MessageBus(Protocol):
+    """A carrier of transfers: this bus, or the connection to one in another process."""
 
     def transfer(self, messages: Sequence[Message]) -> list[bytes]:
-        """Carry the messages between one START and one STOP; the bytes read. Raises OSError as an adapter."""
+        """Carry messages between one START and one STOP.
+
+        Parameters
+        ----------
+        messages : sequence of Message
+
+        Returns
+        -------
+        list of bytes
+            One for each read message.
+
+        Raises
+        ------
+        OSError
+            As from an adapter.
+        """
 
 
 def failure(number: int) -> OSError:
-    """The OSError that the kernel would give."""
+    """The kernel's OSError for an error number."""
     return OSError(number, os.strerror(number))
 
 
 class I2cBus:
     """Parts at their addresses, with faults and a transcript.
 
-    settle : called before and after every transfer, so that the rest of the board follows the bus
-    faults : script that every transfer asks; a fault hits the whole transfer
+    Parameters
+    ----------
+    settle : callable
+        Called before and after every transfer, so that the rest of the board follows the bus.
+    faults : Faults or None
+        Script that every transfer asks; a fault hits the whole transfer.
 
-    Attributes: parts (by address), transcript (every byte that went over the wires since `record` was set).
+    Attributes
+    ----------
+    parts : dict of int to Part
+        By address.
+    transcript : list of str
+        Every byte on the wires while `record` is set.
+    record : bool
+    sleep : callable
+        For delays, s.
     """
 
     ADAPTER_TIMEOUT_S = 0.02
@@ -69,10 +108,25 @@ class I2cBus:
         self.transcript: list[str] = []
         self.sleep: Callable[[float], None] = time.sleep
         self._settle = settle
-        self.lock = threading.RLock()  # whoever touches the parts from outside the bus takes it too
+        self.lock = threading.RLock()  # also for changes to the parts from outside the bus
 
     def transfer(self, messages: Sequence[Message]) -> list[bytes]:
-        """Carry the messages between one START and one STOP; the bytes read. Raises OSError as an adapter."""
+        """Carry messages between one START and one STOP.
+
+        Parameters
+        ----------
+        messages : sequence of Message
+
+        Returns
+        -------
+        list of bytes
+            One for each read message.
+
+        Raises
+        ------
+        OSError
+            As from an adapter.
+        """
         self._settle()
         kinds = ("unplug", "nack", "timeout", "stall", "hang", "late", "short_write", "garbage", "die")
         fault = self.faults.take(*kinds)

@@ -1,4 +1,4 @@
-"""The laser board: the parts on their bus, wired to three laser diodes, as light comes out of them.
+"""The emulated laser board: its parts on the bus, three laser diodes, and the light that they emit.
 
 DAC -> limiter of the safety controller -> laser-diode controller (50 mA/V, enabled by the gate and by a pin of the
 expander) -> diode -> photodiode -> converter, whose ALERT goes back to the safety controller.
@@ -25,10 +25,19 @@ KEY_PIN, INTERLOCK_PIN, ALERT_PIN = 4, 5, 6
 
 @dataclass
 class Diode:
-    """One laser: what it emits at the exit pupil, and what its photodiode makes of that.
+    """One laser and its photodiode.
 
-    offset_ma : what the set-point knob of its controller adds; should be 0
-    efficiency : a factor on what it emits, for ageing and faults
+    Attributes
+    ----------
+    name : str
+    threshold_ma : float, mA
+    slope_uw_per_ma : float, µW/mA
+        Light at the exit pupil beyond the threshold.
+    photodiode_v_per_uw : float, V/µW
+    offset_ma : float, mA
+        Added by the set-point knob of its controller; should be 0.
+    efficiency : float
+        A factor on the light, for ageing and faults.
     """
 
     name: str
@@ -39,7 +48,7 @@ class Diode:
     efficiency: float = 1.0
 
     def power_uw(self, current_ma: float) -> float:
-        """Light at a current."""
+        """Light at a current, µW."""
         return self.efficiency * self.slope_uw_per_ma * max(0.0, current_ma - self.threshold_ma)
 
 
@@ -55,11 +64,25 @@ def diodes() -> list[Diode]:
 class LaserBoard:
     """The board, powered on: dark.
 
-    clock : seconds; tests give their own
-    emission : told (time s, {laser: µW}) whenever the light changes
-    faults : script of the bus
+    Parameters
+    ----------
+    clock : callable
+        Gives the time, s.
+    emission : callable
+        Called with (time s, {laser: µW}) whenever the light changes.
+    faults : Faults or None
+        Script of the bus.
 
-    Attributes: bus, dac, expander, converter, thermometer, controller (the models), diodes, celsius.
+    Attributes
+    ----------
+    bus : I2cBus
+    dac, expander, converter, thermometer, controller
+        The models.
+    diodes : list of Diode
+    key, interlock : bool
+        On, and closed.
+    celsius : float, °C
+        Of the lasers' heat sink.
     """
 
     def __init__(
@@ -89,7 +112,7 @@ class LaserBoard:
         }
 
     def power_cycle(self) -> None:
-        """Off and on again: every part in its power-on state, the DAC as its EEPROM says."""
+        """Off and on again: every part in its power-on state, the DAC as stored in its EEPROM."""
         with self.bus.lock:
             self._power_on()
         self.settle()
@@ -99,7 +122,7 @@ class LaserBoard:
             part.power_on()
 
     def settle(self) -> None:
-        """Let every part do what is due by now, and tell of a change of light."""
+        """Let every part do what is due by now, and report a change of light."""
         with self.bus.lock:
             if self.bus.faults.standing("unplug"):
                 self._power_on()
@@ -120,14 +143,14 @@ class LaserBoard:
         return dict(self._emitted)
 
     def power_uw(self, laser: int) -> float:
-        """Light of one laser, 0 to 2."""
+        """Light of one laser, 0 to 2, µW."""
         enabled = self.expander.registers[0] >> laser & 1 == 0 and self.expander.pins() >> laser & 1
         if not (self.controller.gate and enabled):
             return 0.0
         diode = self.diodes[laser]
         return diode.power_uw(CONTROLLER_MA_PER_V * self.controller.output_v(laser) + diode.offset_ma)
 
-    # --- what happens to the board
+    # --- the board's surroundings
 
     @property
     def key(self) -> bool:
@@ -163,19 +186,19 @@ class LaserBoard:
         self.settle()
 
     def break_photodiode(self, laser: int, broken: bool = True) -> None:
-        """Cut (or mend) a photodiode's wire: it then shows no light."""
+        """Cut (or repair) a photodiode's wire: without it the voltage is 0."""
         self.settle()
         self._photodiode_broken[laser] = broken
         self.settle()
 
-    # --- what the safety controller's and the expander's pins see
+    # --- levels at the pins of the safety controller and the expander
 
     def requested_v(self, laser: int) -> float:
-        """Voltage from the DAC."""
+        """Voltage from the DAC, V."""
         return self.dac.volts(laser)
 
     def photodiode_v(self, laser: int) -> float:
-        """Voltage from a photodiode."""
+        """Voltage from a photodiode, V."""
         if self._photodiode_broken[laser]:
             return 0.0
         return self.power_uw(laser) * self.diodes[laser].photodiode_v_per_uw

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-IODIR, IPOL, GPPU, INTF, INTCAP, GPIO, OLAT = 0x00, 0x01, 0x06, 0x07, 0x08, 0x09, 0x0A
+IODIR, IPOL, INTF, INTCAP, GPIO, OLAT = 0x00, 0x01, 0x07, 0x08, 0x09, 0x0A
 COUNT = 11
 
 
 class Mcp23008:
     """The expander.
 
-    outside : levels that the board puts on the pins, bit by bit
+    Parameters
+    ----------
+    outside : callable
+        Gives the levels that the board puts on the pins, bit by bit.
     """
 
     def __init__(self, outside: Callable[[], int]) -> None:

@@ -13,7 +13,19 @@ EEPROM_WRITE_S = 0.05
 
 @dataclass(frozen=True)
 class Setting:
-    """One channel: internal reference or supply, power-down mode (0: on), gain of two, code."""
+    """Setting of one channel.
+
+    Attributes
+    ----------
+    internal : bool
+        Internal reference; else the supply.
+    power_down : int
+        Mode; 0: on.
+    doubled : bool
+        Gain of two.
+    code : int
+        0 to 4095.
+    """
 
     internal: bool = False
     power_down: int = 0
@@ -32,7 +44,7 @@ class Setting:
 
     @property
     def volts(self) -> float:
-        """What the pin carries."""
+        """Voltage of the pin."""
         if self.power_down:
             return 0.0
         full = REFERENCE_V * (1 + self.doubled) if self.internal else SUPPLY_V
@@ -42,8 +54,12 @@ class Setting:
 class Mcp4728:
     """Channels A to D.
 
-    clock : seconds, for the EEPROM's write time
-    eeprom : settings at power-on; none: as written dark
+    Parameters
+    ----------
+    clock : callable
+        Gives the time, s, for the EEPROM's write time.
+    eeprom : list of Setting or None
+        Settings at power-on; none: as written dark.
     """
 
     def __init__(self, clock: Callable[[], float], eeprom: list[Setting] | None = None) -> None:
@@ -53,11 +69,11 @@ class Mcp4728:
         self.power_on()
 
     def power_on(self) -> None:
-        """Outputs as the EEPROM says."""
+        """Outputs as stored in the EEPROM."""
         self.channels = list(self.eeprom)
 
     def volts(self, channel: int) -> float:
-        """Output of channel 0 (A) to 3 (D)."""
+        """Output of channel 0 (A) to 3 (D), V."""
         return self.channels[channel].volts
 
     def write(self, data: bytes) -> None:

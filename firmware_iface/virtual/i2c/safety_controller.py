@@ -7,7 +7,7 @@ from enum import IntEnum, IntFlag
 from typing import Protocol
 
 from firmware_iface.virtual.i2c.bus import NackError
-from firmware_iface.virtual.i2c.pec import pec
+from firmware_iface.virtual.i2c.packet_error_code import pec
 
 ADDRESS = 0x36
 WINDOW_S, SOONEST_S, ARM_WITHIN_S = 0.100, 0.005, 1.0
@@ -32,7 +32,7 @@ class Fault(IntFlag):
 
 
 class Wiring(Protocol):
-    """What the controller's pins see."""
+    """Levels at the controller's pins."""
 
     key: bool
     interlock: bool
@@ -53,11 +53,22 @@ class Wiring(Protocol):
 class SafetyController:
     """Gate, limiter and latch.
 
-    clock : seconds
-    wiring : the board
-    built_for : (highest drive ceiling, highest photodiode ceiling, threshold) of each laser, 0.1 mV
+    Parameters
+    ----------
+    clock : callable
+        Gives the time, s.
+    wiring : Wiring
+        The board.
+    built_for : tuple of (int, int, int)
+        (highest drive ceiling, highest photodiode ceiling, threshold) of each laser, 0.1 mV.
 
-    Attributes: faults (latched), armed, ceilings ((drive, photodiode) for each laser; None: not written).
+    Attributes
+    ----------
+    faults : Fault
+        Latched faults.
+    armed : bool
+    ceilings : list of [int or None, int or None]
+        (drive, photodiode) for each laser; None: not written.
     """
 
     def __init__(
@@ -67,7 +78,7 @@ class SafetyController:
         self.power_on()
 
     def power_on(self) -> None:
-        """Dark, unconfigured, nothing heard."""
+        """Dark, not configured, no token received."""
         self.faults = Fault(0)
         self.armed = False
         self.ceilings: list[list[int | None]] = [[None, None] for _ in LASERS]
@@ -78,7 +89,7 @@ class SafetyController:
         self._ticked = self._clock()
         self._pointer: int | None = None
 
-    # --- what it does to the light
+    # --- the light
 
     @property
     def gate(self) -> bool:
@@ -104,7 +115,7 @@ class SafetyController:
     def _threshold_v(self, laser: int) -> float:
         return self.built_for[laser][2] * 1e-4
 
-    # --- what it does in time
+    # --- time
 
     def settle(self) -> None:
         """Do what is due by now."""
@@ -126,7 +137,7 @@ class SafetyController:
             self._ticked = max(self._ticked, time_s)
 
     def _next_limits_v(self) -> list[float]:
-        """Where the limits may be in a tick from now; they fall there at once, and rise there with the tick."""
+        """The limits of the next tick; they fall at once, and rise with the tick."""
         limits = []
         for k in LASERS:
             ceiling, threshold = (self.ceilings[k][0] or 0) * 1e-4, self._threshold_v(k)
@@ -178,7 +189,7 @@ class SafetyController:
         )
         return sum(bool(holding) << bit for bit, holding in enumerate(holds))
 
-    # --- what the host asks
+    # --- commands of the host
 
     def _command(self, value: int) -> None:
         now = self._clock()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from firmware_iface.virtual.i2c.words import WordRegisters, signed
+from firmware_iface.virtual.i2c.word_registers import WordRegisters, signed
 
 TEMPERATURE, CONFIG, HIGH, LOW, OFFSET, IDENTITY = 0, 1, 2, 3, 7, 0xF
 STEP_C = 7.8125e-3
@@ -12,9 +12,12 @@ SOFT_RESET, THERM_MODE, WRITABLE, DATA_READY = 0x0002, 0x0010, 0x0FFC, 0x2000
 
 
 class Tmp117(WordRegisters):
-    """The thermometer. Its averaging and its modes are taken, and have no effect: data is always fresh.
+    """The thermometer. It accepts averaging and modes, which have no effect: data is always fresh.
 
-    celsius : the temperature it feels
+    Parameters
+    ----------
+    celsius : callable
+        Gives the temperature, °C.
     """
 
     def __init__(self, celsius: Callable[[], float]) -> None:

@@ -12,39 +12,56 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.virtual.fault_injection import Faults
-from firmware_iface.virtual.oak import nop
-from firmware_iface.virtual.oak.nop import Encoded, Unsigned
-from firmware_iface.virtual.oak.xlink import Link, LinkDown, discovery_answer, listen
+from firmware_iface.virtual.oak.libnop import decode
+from firmware_iface.virtual.oak.oak_messages import (
+    CALLS,
+    CONTROL,
+    FIXED_ANSWERS,
+    SERIAL,
+    SensorExposure,
+    camera_features,
+    frame_message,
+    split_message,
+)
+from firmware_iface.virtual.oak.xlink import Link, discovery_answer, listen
 
 Expose = Callable[[float, float], NDArray[np.uint16]]
 
-_SERIAL = "14442C10EMU0000001"
-_MARKER = bytes.fromhex("abcdef0123456789123456789abcdef0")
-_FRAME, _CONTROL = 2, 8  # kinds of message on a stream
-_RAW10, _GRAY8 = 17, 30  # pixel formats
 _MANUAL_EXPOSURE = 6  # bit of a control's command mask
 
 
 class OakModel:
-    """The camera; frames run from when a host has started a pipeline until it goes.
+    """The camera; frames run from the start of a host's pipeline until the host ends the link.
 
-    expose : given exposure in ms and gain, one picture, 10-bit counts uint16 [h, w] with w a multiple of 4;
-        called when an exposure begins
-    shape : (h, w), pixels
-    address : loopback address, so that several can run side by side
-    frames_per_s : rate, unless the exposure is longer
-    faults : asked for each frame (hang, timeout: not sent; late; garbage, short_write: malformed, which
-        ends the stream in the host) and each remote call (stall: refused); "unplug" drops the link and
-        lets nobody in
+    Parameters
+    ----------
+    expose : callable
+        From exposure in ms and gain to 10-bit counts, uint16 array [h, w], w a multiple of 4; called
+        when an exposure begins.
+    shape : (int, int)
+        (h, w), pixels.
+    address : str
+        Loopback address, so that several can run side by side.
+    frames_per_s : float
+        Rate, unless the exposure is longer.
+    faults : Faults or None
+        Asked for each frame (hang, timeout: not sent; late; garbage, short_write: malformed, which ends
+        the stream in the host) and each remote call (stall: refused); "unplug" drops the link and refuses
+        every host.
 
-    Attributes: exposure_ms and gain (as the host set them), frames (how many were sent).
+    Attributes
+    ----------
+    exposure_ms : float, ms
+    gain : float
+        As the host set them.
+    frames : int
+        How many were sent.
     """
 
     def __init__(
@@ -82,7 +99,7 @@ class OakModel:
         while not self._closed.is_set():
             try:
                 question, host = self._discovery.recvfrom(64)
-                answer = discovery_answer(question, _SERIAL)
+                answer = discovery_answer(question, SERIAL)
                 if answer and not self.faults.standing("unplug"):
                     self._discovery.sendto(answer, host)
             except OSError:
@@ -148,10 +165,10 @@ class OakModel:
             _, _, call, arguments = msgpack.unpackb(link.receive(stream), strict_map_key=False)
             if self.faults.take("stall"):
                 reply: list[Any] = [1, 2, 0, "refused"]
-            elif call not in _CALLS:
+            elif call not in CALLS:
                 reply = [1, 2, 0, f"no function {call}"]
             else:
-                result = self._call(_CALLS[call], arguments)
+                result = self._call(CALLS[call], arguments)
                 reply = [1, 2, 1, [True, ""] + ([] if result is None else [result])]
             link.send(stream, msgpack.packb(reply, use_bin_type=True))
 
@@ -160,22 +177,22 @@ class OakModel:
             self._pipeline = arguments[0]
             for _, node in arguments[0]["nodes"]:
                 if node["name"] == "Camera":  # its properties begin with the initial control
-                    self._control(nop.decode(bytes(node["properties"]))[0])
+                    self._control(decode(bytes(node["properties"]))[0])
         elif name == "startPipeline":
             self._started.set()
         elif name == "isPipelineRunning":
             return self._started.is_set()
         elif name == "getConnectedCameraFeatures":
-            return [_features(*self.shape)]
+            return [camera_features(*self.shape)]
         else:
-            return _ANSWERS[name]
+            return FIXED_ANSWERS[name]
         return None
 
     def _take_controls(self, link: Link, name: str, stream: int) -> None:
         while True:
-            kind, metadata = _opened_message(link.receive(stream))
-            if kind == _CONTROL:
-                self._control(nop.decode(metadata))
+            kind, metadata = split_message(link.receive(stream))
+            if kind == CONTROL:
+                self._control(decode(metadata))
 
     def _control(self, control: Any) -> None:
         if control[0] >> _MANUAL_EXPOSURE & 1:
@@ -188,23 +205,23 @@ class OakModel:
         if source is None:
             return
         number = 0
-        taken: _Taken | None = None
-        coming: Future[_Taken] | None = None
+        newest: SensorExposure | None = None
+        coming: Future[SensorExposure] | None = None
         with ThreadPoolExecutor(1, "oak exposure") as sensor:
             while link.alive:
                 begin = time.monotonic()
                 coming = coming or sensor.submit(self._take)
                 wait([coming], max(self._period_s, self.exposure_ms / 1000))
                 if coming.done():
-                    taken, coming = coming.result(), None
-                # a bench that takes longer than a frame to compute must not silence the stream: meanwhile the
+                    newest, coming = coming.result(), None
+                # a bench that takes longer than a frame to compute must not interrupt the stream: meanwhile the
                 # frame before is sent again, with the time at which it was exposed
-                if taken is not None and self._send(link, stream, _frame_message(taken, source, number)):
+                if newest is not None and self._send(link, stream, frame_message(newest, source, number)):
                     number += 1
                 self._sleep_until(begin + self._period_s)
 
     def _send(self, link: Link, stream: int, frame: bytes) -> bool:
-        """Send a frame as the faults say; whether it was sent."""
+        """Send a frame, with its faults; whether it was sent."""
         fault = self.faults.take("hang", "timeout", "late", "garbage", "short_write")
         if fault in ("hang", "timeout"):
             return False
@@ -218,13 +235,13 @@ class OakModel:
         self.frames += 1
         return True
 
-    def _take(self) -> _Taken:
-        """One exposure: what is there when it begins, at the time when it ends."""
+    def _take(self) -> SensorExposure:
+        """One exposure: the picture at its begin, with the time of its end."""
         exposure_ms, gain = self.exposure_ms, self.gain
         end_s = time.monotonic() + exposure_ms / 1000
         counts = self._expose(exposure_ms, gain)
         self._sleep_until(end_s)
-        return _Taken(counts, end_s, exposure_ms, gain)
+        return SensorExposure(counts, end_s, exposure_ms, gain)
 
     def _sleep_until(self, moment: float) -> None:
         self._closed.wait(max(0, moment - time.monotonic()))
@@ -236,116 +253,7 @@ class OakModel:
         for connection in self._pipeline["connections"]:
             if nodes[connection["node2Id"]]["name"] != "XLinkOut":
                 continue
-            properties = nop.decode(bytes(nodes[connection["node2Id"]]["properties"]))
+            properties = decode(bytes(nodes[connection["node2Id"]]["properties"]))
             if name in properties and nodes[connection["node1Id"]]["name"] == "Camera":
                 return str(connection["node1Output"])
         return None
-
-
-def pack_raw10(counts: NDArray[np.uint16]) -> bytes:
-    """MIPI RAW10: of four pixels the high eight bits each, then a byte of their low two bits."""
-    groups = counts.reshape(-1, 4)
-    out = np.empty((len(groups), 5), np.uint8)
-    out[:, :4] = groups >> 2
-    out[:, 4] = ((groups & 3) << np.arange(0, 8, 2, dtype=np.uint16)).sum(1)
-    return out.tobytes()
-
-
-@dataclass(frozen=True)
-class _Taken:
-    counts: NDArray[np.uint16]
-    end_s: float
-    exposure_ms: float
-    gain: float
-
-
-def _frame_message(taken: _Taken, source: str, number: int) -> bytes:
-    counts = taken.counts
-    height, width = counts.shape
-    if source == "raw":
-        data, stride, kind = pack_raw10(counts), width * 10 // 8, _RAW10
-    else:
-        data, stride, kind = (counts >> 2).astype(np.uint8).tobytes(), width, _GRAY8
-    second, nanosecond = divmod(int(taken.end_s * 1e9), 10**9)
-    moment = (second, nanosecond)
-    form = (Unsigned(kind), Unsigned(width), Unsigned(height), Unsigned(stride), Unsigned(1), 0, 0, 0)
-    settings = (round(taken.exposure_ms * 1000), round(taken.gain * 100), 0, 0, 0.0, 0, -1, -1.0, None)
-    metadata = (moment, moment, None, number, form, form, settings, 0, 0, _geometry(width, height))
-    body = nop.encode(metadata)
-    return data + body + _FRAME.to_bytes(4, "little") + len(body).to_bytes(4, "little") + _MARKER
-
-
-def _opened_message(message: bytes) -> tuple[int, bytes]:
-    """(kind, metadata) of a message; the data before the metadata is of no use here."""
-    if len(message) < 24 or message[-16:] != _MARKER:
-        raise LinkDown
-    size = int.from_bytes(message[-20:-16], "little")
-    return int.from_bytes(message[-24:-20], "little"), message[-24 - size : -24]
-
-
-def _geometry(width: int, height: int) -> tuple[Any, ...]:
-    """An image that was neither cropped nor turned, and a lens nobody calibrated."""
-    rows = (nop.encode([float(i == j) for j in range(3)]) for i in range(3))
-    unit = Encoded(b"\xba\x03" + b"".join(rows))
-    size = Unsigned(width), Unsigned(height)
-    nowhere = ((0.0,) * 3, (0.0,) * 3)
-    lens: tuple[Any, ...] = ([], *nowhere, -1, 1, "")
-    return (lens, unit, unit, unit, unit, 0, [], *size, *size, [])
-
-
-def _features(height: int, width: int) -> dict[str, Any]:
-    field = {"x": 0.0, "y": 0.0, "width": 1.0, "height": 1.0, "normalized": True, "hasNormalized": True}
-    mode = {"width": width, "height": height, "minFps": 1.0, "maxFps": 120.0, "fov": field, "type": 1}
-    return {
-        "socket": 0,
-        "sensorName": "OV9282",
-        "width": width,
-        "height": height,
-        "orientation": 0,
-        "supportedTypes": [1],
-        "hasAutofocusIC": False,
-        "hasAutofocus": False,
-        "name": "mono",
-        "calibrationResolution": None,
-        "additionalNames": [],
-        "configs": [mode | {"hdr": False, "hfr": False}],
-    }
-
-
-def _call_number(name: str) -> int:
-    number = 1125899906842597
-    for byte in name.encode():
-        number = (31 * number + byte) % 2**64
-    return number
-
-
-# remote calls whose answer never changes
-_ANSWERS: dict[str, Any] = {
-    "buildPipeline": [True, ""],
-    "enableCrashDump": None,
-    "getAnonymousTelemetryId": "",
-    "getCalibration": [False, "none", {}],
-    "getCameraSensorNames": [[0, "OV9282"]],
-    "getChipTemperature": {"css": 45.0, "mss": 45.0, "upa": 45.0, "dss": 45.0, "average": 45.0},
-    "getConnectedCameras": [0],
-    "getMxId": _SERIAL,
-    "getNodeLogLevel": 3,
-    "getOSVersion": "0.0.0",
-    "getUsbSpeed": 0,
-    "getXLinkChunkSize": -1,
-    "hasCrashDump": False,
-    "isRunning": True,
-    "onInit": None,
-    "readAssetStorageFromXLink": None,
-    "readFromEeprom": [False, "none", {}],
-    "readFromEepromFactory": [False, "none", {}],
-    "setAssets": None,
-    "setLogLevel": None,
-    "setNodeLogLevel": None,
-    "setSystemInformationLoggingRate": None,
-    "setTimesync": None,
-    "setXLinkChunkSize": None,
-    "waitForDeviceReady": [True, ""],
-}
-_LIVE = ("setPipelineSchema", "startPipeline", "isPipelineRunning", "getConnectedCameraFeatures")
-_CALLS = {_call_number(name): name for name in (*_ANSWERS, *_LIVE)}

@@ -25,14 +25,18 @@ _LONGEST = 64 * 1024 * 1024
 
 
 class LinkDown(ConnectionError):
-    """The host has gone, or the link was dropped."""
+    """The host has ended the link, or it was dropped."""
 
 
 class Link:
     """One host's connection.
 
-    connection : the accepted socket
-    on_stream : called with (this link, name, stream id) for each stream that the host opens
+    Parameters
+    ----------
+    connection : socket.socket
+        The accepted socket.
+    on_stream : callable
+        Called with (this link, name, stream id) for each stream that the host opens.
     """
 
     def __init__(self, connection: socket.socket, on_stream: Callable[[Link, str, int], None]) -> None:
@@ -48,7 +52,7 @@ class Link:
         self._last_id = 0
 
     def run(self) -> None:
-        """Serve the host until it goes."""
+        """Serve the host until it ends the link."""
         with suppress(OSError):
             while self._serve_one():
                 pass
@@ -89,7 +93,7 @@ class Link:
                 return False
             data = self._exactly(size)
             self._answer(number, kind, name, stream, size)
-            self._request(READ_RELEASE, name, stream, size)  # taken at once, so the host may go on
+            self._request(READ_RELEASE, name, stream, size)  # taken at once, so the host may send more
             self._received[stream].put(data)
         elif kind == CREATE:
             self._names[stream], self._received[stream] = name, Queue()
@@ -149,7 +153,7 @@ def listen(address: str) -> tuple[socket.socket, socket.socket]:
 
 
 def discovery_answer(question: bytes, serial: str) -> bytes | None:
-    """What a booted device answers to a discovery datagram; None where it is none."""
+    """The answer of a booted device to a discovery datagram; None where the question is none."""
     if len(question) < 4 or question[:4] != struct.pack("<I", 1):
         return None
     return struct.pack("<I32sI", 1, serial.encode(), BOOTED)

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.virtual.fault_injection import Faults
-from firmware_iface.virtual.usb.device import (
+from firmware_iface.virtual.usb.run_length_decoding import CommandError, decode_image
+from firmware_iface.virtual.usb.usb_model import (
     INTERRUPT,
     Nak,
     Stall,
@@ -34,15 +35,8 @@ _HEIGHT = {3: 0.0, 2: 0.0126, 1: 0.0259, 7: 0.0495, 0: 0.071, 6: 0.0878, 5: 0.13
 _HEIGHT |= {11: 0.3274, 10: 0.361, 9: 0.4204, 8: 0.5046, 15: 0.5916, 14: 0.673, 13: 0.8254, 12: 1.0}
 
 
-class _Refused(Exception):
-    """The command fails with this error number."""
-
-    def __init__(self, number: int) -> None:
-        self.number = number
-
-
 @dataclass(frozen=True)
-class Entry:
+class PatternEntry:
     """One line of the pattern table."""
 
     exposure_us: int
@@ -54,12 +48,33 @@ class Entry:
 class Dlpc900Model(UsbModel):
     """The controller and its mirrors.
 
-    memory_shape : (rows, columns) of memory bits; four of them, 2 x 2, are one mirror
-    electrodes : which bit of a mirror's value lies top left, top right, bottom left, bottom right
-    controllers : 2 where a second one holds the right half
+    Parameters
+    ----------
+    memory_shape : (int, int)
+        (rows, columns) of memory bits; four of them, 2 x 2, are one mirror.
+    electrodes : (int, int, int, int)
+        Which bit of a mirror's value lies top left, top right, bottom left, bottom right.
+    mirrored : bool
+        Whether the memory's columns run the other way.
+    controllers : int
+        2 where a second one holds the right half.
+    faults : Faults or None
+        See UsbModel.
 
-    Attributes: video (gives what is on the display link, uint32 [rows, columns] of 24 bits, or None for no
-    signal); gray, shape; power, mode, running, entries, images (as loaded), commands (their count).
+    Attributes
+    ----------
+    video : callable or None
+        Gives the picture on the display link, uint32 array [rows, columns] of 24 bits; None: no signal.
+    gray : uint8 array [H, W]
+    shape : (int, int)
+        (H, W), mirrors.
+    power, mode : int
+    running : bool
+    entries : dict of int to PatternEntry
+    images : dict of (int, int) to uint32 array
+        By image and controller, as loaded.
+    commands : int
+        How many were received.
     """
 
     def __init__(
@@ -113,7 +128,7 @@ class Dlpc900Model(UsbModel):
     def on_reset(self) -> None:
         self.power = self.mode = self.error = self.commands = 0
         self.running = False
-        self.entries: dict[int, Entry] = {}
+        self.entries: dict[int, PatternEntry] = {}
         self.images: dict[tuple[int, int], NDArray[np.uint32]] = {}
         self._table = (0, 0)
         self._loading: dict[int, tuple[int, int, bytearray]] = {}
@@ -144,8 +159,8 @@ class Dlpc900Model(UsbModel):
         code = int.from_bytes(command[:2], "little")
         try:
             reply = self._answer(code) if flags & 0x80 else self._do(code, command[2:])
-        except _Refused as refused:
-            self.error, failed = refused.number, 0x20
+        except CommandError as error:
+            self.error, failed = error.number, 0x20
         except (struct.error, IndexError):
             self.error, failed = 6, 0x20
         else:
@@ -169,7 +184,7 @@ class Dlpc900Model(UsbModel):
             0x1A1B: bytes([self.mode]),
         }
         if code not in known:
-            raise _Refused(3)
+            raise CommandError(3)
         return known[code]
 
     def _do(self, code: int, data: bytes) -> bytes:
@@ -183,7 +198,7 @@ class Dlpc900Model(UsbModel):
                 pass
             case 0x1A1B:
                 if self.running:
-                    raise _Refused(5)
+                    raise CommandError(5)
                 self.mode = _within(data[0], 3)
             case 0x1A24:
                 self._run(_within(data[0], 2))
@@ -194,30 +209,30 @@ class Dlpc900Model(UsbModel):
             case 0x1A2A | 0x1A2C:
                 side, (image, length) = int(code == 0x1A2C), struct.unpack_from("<HI", data)
                 if self.mode != 3 or side >= self._controllers:
-                    raise _Refused(5)
+                    raise CommandError(5)
                 self._loading[side] = (image, length, bytearray())
             case 0x1A2B | 0x1A2D:
                 self._load(int(code == 0x1A2D), data)
             case _:
-                raise _Refused(3)
+                raise CommandError(3)
         return b""
 
     def _define(self, data: bytes) -> None:
         index, low, high, options = struct.unpack_from("<HHBB", data)
         exposure_us, where = low | high << 16, struct.unpack_from("<H", data, 10)[0]
         if index >= 400:
-            raise _Refused(15)
+            raise CommandError(15)
         if exposure_us < 105:
-            raise _Refused(14)
-        self.entries[index] = Entry(exposure_us, (options >> 1 & 7) + 1, where & 0x7FF, where >> 11)
+            raise CommandError(14)
+        self.entries[index] = PatternEntry(exposure_us, (options >> 1 & 7) + 1, where & 0x7FF, where >> 11)
 
     def _load(self, side: int, data: bytes) -> None:
         if side not in self._loading:
-            raise _Refused(5)
+            raise CommandError(5)
         image, length, got = self._loading[side]
         (size,) = struct.unpack_from("<H", data)
         if size > 504 or size > len(data) - 2:
-            raise _Refused(6)
+            raise CommandError(6)
         got += data[2 : 2 + size]
         if len(got) >= length:
             del self._loading[side]
@@ -230,75 +245,11 @@ class Dlpc900Model(UsbModel):
             sides = range(self._controllers)
             loaded = all(e and all((e.image, side) in self.images for side in sides) for e in used)
             if (self.mode >= 2 and not (used and all(used))) or (self.mode == 3 and not loaded):
-                raise _Refused(5)
+                raise CommandError(5)
         self.running = what == 2
 
 
 def _within(value: int, highest: int) -> int:
     if value > highest:
-        raise _Refused(6)
+        raise CommandError(6)
     return value
-
-
-def decode_image(data: bytes, height: int, width: int) -> NDArray[np.uint32]:
-    """The pixels of a compressed image with its header, uint32 [height, width]; refuses what is none."""
-    if len(data) < 48 or data[:4] != b"Spld" or struct.unpack_from("<HH", data, 4) != (width, height):
-        raise _Refused(6)
-    if data[25] != 2:
-        raise _Refused(9)
-    try:
-        return _decode_rows(data[48:], height, width)
-    except (IndexError, ValueError):
-        raise _Refused(9) from None
-
-
-def _decode_rows(data: bytes, height: int, width: int) -> NDArray[np.uint32]:
-    out = np.zeros(height * width, np.uint32)
-    at = done = 0
-
-    def count() -> int:
-        nonlocal at
-        number = data[at]
-        at += 1
-        if number >= 128:
-            number = number & 0x7F | data[at] << 7
-            at += 1
-        return number
-
-    def pixels(number: int) -> NDArray[np.uint32]:
-        nonlocal at
-        raw = np.frombuffer(data, np.uint8, 3 * number, at).reshape(number, 3).astype(np.uint32)
-        at += 3 * number
-        return np.asarray(raw[:, 0] << 16 | raw[:, 1] << 8 | raw[:, 2], np.uint32)
-
-    def room(number: int) -> int:
-        if done + number > len(out):
-            raise ValueError("more pixels than the image has")
-        return number
-
-    while True:
-        if data[at]:
-            number = room(count())
-            out[done : done + number] = pixels(1)
-            done += number
-        elif data[at + 1] == 0:  # end of a row
-            at += 2
-        elif data[at + 1] == 1:
-            at += 2
-            number = room(count())
-            if not number:
-                break
-            if done < width:
-                raise ValueError("there is no row above the first")
-            while number:  # a copy that is longer than a row copies what it wrote
-                part = min(number, width)
-                out[done : done + part] = out[done - width : done - width + part]
-                done, number = done + part, number - part
-        else:
-            at += 1
-            number = room(count())
-            out[done : done + number] = pixels(number)
-            done += number
-    if done != len(out):
-        raise ValueError("fewer pixels than the image has")
-    return out.reshape(height, width)

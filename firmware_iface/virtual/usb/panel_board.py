@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.virtual.fault_injection import Faults
-from firmware_iface.virtual.usb.device import (
+from firmware_iface.virtual.usb.usb_model import (
     BULK,
     Nak,
     Stall,
@@ -39,13 +39,26 @@ def _sealed(body: bytes) -> bytes:
 class BoardModel(UsbModel):
     """The board and the panel behind it.
 
-    shape : (H, W), pixels
-    serial : serial number
-    faults : see UsbModel
-    clock : seconds, rising
+    Parameters
+    ----------
+    shape : (int, int)
+        (H, W), pixels.
+    serial : str
+        Serial number.
+    faults : Faults or None
+        See UsbModel.
+    clock : callable
+        Gives the time, s.
 
-    Attributes: gray (what the panel shows now), shown (sequence and CRC-32 of the frames displayed, the
-    newest last, up to 4096), fault_bits and temperature_c (what STATUS reports).
+    Attributes
+    ----------
+    gray : uint8 array [H, W]
+        On the panel now.
+    shown : deque of (int, int)
+        Sequence and CRC-32 of the frames displayed, the newest last, up to 4096.
+    fault_bits : int
+    temperature_c : float, °C
+        As STATUS reports them.
     """
 
     def __init__(
@@ -159,7 +172,7 @@ class BoardModel(UsbModel):
         self._state, self._header = FILLING, (sequence, length, pixels_crc)
 
     def _run(self) -> None:
-        """Let the periods pass that the clock says have passed."""
+        """Carry out what is due after the periods that have passed."""
         if self._state == PENDING and self._periods() >= self._due:
             assert self._header is not None
             self._front = bytes(self._back)

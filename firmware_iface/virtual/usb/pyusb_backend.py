@@ -13,13 +13,13 @@ from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any, TypeVar
 
-from firmware_iface.virtual.usb.device import (
+from firmware_iface.virtual.usb.usb_model import (
     CLEAR_FEATURE,
     GET_CONFIGURATION,
     SET_CONFIGURATION,
     SET_INTERFACE,
-    Gone,
     Nak,
+    NoDevice,
     Stall,
     UsbModel,
 )
@@ -42,7 +42,7 @@ _ENDPOINT = "bLength bDescriptorType bEndpointAddress bmAttributes wMaxPacketSiz
 
 # libusb's code, errno and text for each way a transfer fails
 _FAILURES: dict[type[Exception], tuple[int, int, str]] = {
-    Gone: (-4, errno.ENODEV, "No such device (it may have been disconnected)"),
+    NoDevice: (-4, errno.ENODEV, "No such device (it may have been disconnected)"),
     Stall: (-9, errno.EPIPE, "Pipe error"),
     Nak: (-7, errno.ETIMEDOUT, "Operation timed out"),
 }
@@ -56,7 +56,10 @@ class _Handle:
 class VirtualUsb:
     """A pyusb backend on which the given models are plugged in; its methods are those of usb.backend.IBackend.
 
-    models : UsbModel, any number; more may be added to the attribute `models`
+    Parameters
+    ----------
+    *models : UsbModel
+        More may be added to the attribute `models`.
     """
 
     def __init__(self, *models: UsbModel) -> None:
@@ -70,7 +73,7 @@ class VirtualUsb:
 
     def get_device_descriptor(self, model: UsbModel) -> SimpleNamespace:
         if not model.present:
-            raise _failure(Gone())
+            raise _failure(NoDevice())
         place = {"bus": 1, "address": 1 + self.models.index(model), "port_number": 1, "port_numbers": (1,)}
         return _fields(_DEVICE, "<BBHBBBBHHHBBBB", model.descriptor, speed=3, **place)
 
@@ -94,7 +97,7 @@ class VirtualUsb:
 
     def open_device(self, model: UsbModel) -> _Handle:
         if not model.present:
-            raise _failure(Gone())
+            raise _failure(NoDevice())
         return _Handle(model)
 
     def close_device(self, handle: _Handle) -> None:
@@ -176,9 +179,9 @@ class VirtualUsb:
         end = time.monotonic() + timeout_ms / 1000 if timeout_ms else float("inf")
         try:
             if handle.model.present and handle.generation != handle.model.generation:
-                raise Gone
+                raise NoDevice
             return act(lambda: time.monotonic() >= end)
-        except (Gone, Stall, Nak) as cause:
+        except (NoDevice, Stall, Nak) as cause:
             raise _failure(cause) from None
 
 

@@ -150,14 +150,14 @@ def test_the_dacs_other_commands(bench: Bench) -> None:
 def test_the_comparator_latches_until_the_conversion_is_read(bench: Bench) -> None:
     lasers = bench.armed()
     converter = bench.board.converter
-    lasers.parts.converter.trip_above(0.1)
-    lasers.parts.converter.select(0)
-    lasers.parts.dac.set_code(0, 3000)
+    lasers.board.converter.trip_above(0.1)
+    lasers.board.converter.select(0)
+    lasers.board.dac.set_code(0, 3000)
     bench.pass_time(0.05)
     assert converter.alert and bench.light_uw == 0, "the safety controller followed ALERT"
     bench.pass_time(0.01)
     assert converter.alert, "latched, though it is dark"
-    lasers.parts.converter.volts()
+    lasers.board.converter.volts()
     bench.pass_time(0.01)
     assert not converter.alert
 
@@ -196,7 +196,7 @@ def test_single_shots_and_differences_and_clipping(bench: Bench) -> None:
 
 def test_the_thermometer_holds_its_alert_between_the_limits(bench: Bench) -> None:
     lasers = bench.open()
-    lasers.parts.thermometer.limit(45, 40)
+    lasers.board.thermometer.limit(45, 40)
     for celsius, alert in ((44, False), (46, True), (42, True), (39, False), (42, False)):
         bench.board.celsius = celsius
         assert bench.board.thermometer.alert is alert, celsius

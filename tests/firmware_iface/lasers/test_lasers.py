@@ -52,7 +52,7 @@ def test_the_controllers_limiter_ramps_even_for_a_host_that_jumps(bench: Bench) 
     lasers = bench.armed()
     bench.seen.clear()
     began = bench.now
-    lasers.parts.dac.set_code(0, 3000)
+    lasers.board.dac.set_code(0, 3000)
     bench.pass_time(0.080)
     full = next(t for t, p in bench.seen if p["red"] == pytest.approx(120))
     assert 0.049 <= full - began <= 0.052
@@ -66,7 +66,7 @@ def test_no_code_of_the_dac_passes_the_ceiling(bench: Bench) -> None:
             bench.bus.i2c_rdwr(smbus2.i2c_msg.write(0x60, [0x40 | k << 1, vref | 0x0F, 0xFF]))
         for _ in range(4):
             bench.pass_time(0.03)
-            lasers.parts.controller.beat(lasers._token + 1)
+            lasers.board.controller.beat(lasers._token + 1)
             lasers._token += 1
     for channel in VIRTUAL_CHANNELS:
         assert max(p[channel.name] for _, p in bench.seen) == pytest.approx(channel.full_power_uw)
@@ -94,7 +94,7 @@ def test_the_same_token_again_is_no_heartbeat(bench: Bench) -> None:
     lasers = bench.armed()
     lasers.set_power("green", 1.0)
     bench.pass_time(0.02)
-    lasers.parts.controller.beat(lasers._token)
+    lasers.board.controller.beat(lasers._token)
     assert bench.light_uw == 0
     with pytest.raises(DeviceError, match="heartbeat"):
         lasers.heartbeat()
@@ -108,7 +108,7 @@ def test_a_token_too_soon_is_a_loop_run_wild(bench: Bench) -> None:
     bench.pass_time(0.003)
     lasers.heartbeat()  # the driver itself never does it
     assert bench.light_uw > 0
-    lasers.parts.controller.beat(lasers._token + 1)
+    lasers.board.controller.beat(lasers._token + 1)
     assert bench.light_uw == 0
 
 
@@ -117,7 +117,7 @@ def test_key_and_interlock_latch_and_it_takes_two_acts_to_see_light_again(
     bench: Bench, condition: str
 ) -> None:
     lasers = bench.armed()
-    lasers.parts.controller.command(0)  # type: ignore[arg-type]
+    lasers.board.controller.command(0)  # type: ignore[arg-type]
     with pytest.raises(DeviceError, match="not armed"):
         lasers.set_power("green", 1.0)
     lasers.arm()  # asking too early is no fault
@@ -161,7 +161,7 @@ def test_the_second_arming_word_counts_only_right_after_the_first(bench: Bench) 
     from firmware_iface.lasers.safety_controller import Command, State
 
     bench.ready()
-    controller = (lasers := bench.open()).parts.controller
+    controller = (lasers := bench.open()).board.controller
     for between in (lambda: controller.command(Command.OFF), lambda: bench.pass_time(1.001)):
         lasers.heartbeat()
         controller.command(Command.ARM_FIRST)
@@ -245,8 +245,8 @@ def test_the_ceilings_can_be_written_once_and_only_lowered_from_what_the_board_w
     lasers = Lasers(bench.bus, (replace(RED, full_power_uw=60.0),), lambda: bench.now, bench.pass_time)
     for drive_v in (1.0, 1.5):
         with pytest.raises(OSError, match="Remote I/O"):
-            lasers.parts.controller.set_ceilings(0, drive_v, 1.2)
-    assert lasers.parts.controller.ceilings_v(0)[0] == pytest.approx(1.2)
+            lasers.board.controller.set_ceilings(0, drive_v, 1.2)
+    assert lasers.board.controller.ceilings_v(0)[0] == pytest.approx(1.2)
     with pytest.raises(DeviceError, match="config"):
         lasers.heartbeat()
     with pytest.raises(DeviceError, match=r"holds ceilings of 1\.2000 .* switch the board off and on"):
@@ -259,8 +259,8 @@ def test_lasers_that_are_not_there_get_a_ceiling_of_0(bench: Bench) -> None:
     bench.ready()
     lasers = Lasers(bench.bus, (RED,), lambda: bench.now, bench.pass_time)
     lasers.arm()
-    lasers.parts.expander.enable(0b111)
-    lasers.parts.dac.set_code(2, 1800)
+    lasers.board.expander.enable(0b111)
+    lasers.board.dac.set_code(2, 1800)
     bench.pass_time(0.08)
     assert bench.light_uw == 0
 
@@ -293,7 +293,7 @@ def test_power_on_is_dark_even_with_a_bright_eeprom_and_everything_closed(bench:
     "kind", ["nack", "timeout", "stall", "short_write", "garbage", "unplug", "late", "hang"]
 )
 @pytest.mark.parametrize("after", range(0, 12))
-def test_any_fault_of_the_bus_ends_dark_within_150_ms_and_is_told(
+def test_any_fault_of_the_bus_ends_dark_within_150_ms_and_is_reported(
     bench: Bench, kind: str, after: int
 ) -> None:
     """While showing, wherever in the traffic it strikes: four heartbeats' transfers and a change of power."""
@@ -302,7 +302,7 @@ def test_any_fault_of_the_bus_ends_dark_within_150_ms_and_is_told(
     lasers.set_power("red", 0.5)
     faults, take = bench.board.bus.faults, bench.board.bus.faults.take
     struck_at: list[float] = []
-    told = False
+    reported = False
 
     def watched(*kinds: str) -> str | None:
         hit = take(*kinds)
@@ -321,20 +321,20 @@ def test_any_fault_of_the_bus_ends_dark_within_150_ms_and_is_told(
             lasers.heartbeat()
         lasers.set_power("red", 0.6)
     except DeviceError:
-        told = True
+        reported = True
     assert struck_at
-    assert told or kind in ("garbage", "late"), (
+    assert reported or kind in ("garbage", "late"), (
         "garbage in a write, or lateness within the window, harms nothing"
     )
-    assert (bench.light_uw == 0) == told
-    if told:
+    assert (bench.light_uw == 0) == reported
+    if reported:
         assert lasers.power("red") == 0
         assert bench.seen[-1][0] - struck_at[0] <= 0.150
 
 
 def test_a_reply_of_garbage_is_never_believed(bench: Bench) -> None:
-    """Over many random replies to heartbeats: it is told and dark, or the reply did not matter."""
-    told = 0
+    """Over many random replies to heartbeats: it is reported and dark, or the reply did not matter."""
+    reported = 0
     for _ in range(60):
         lasers = bench.armed()
         lasers.set_power("green", 0.5)
@@ -344,12 +344,12 @@ def test_a_reply_of_garbage_is_never_believed(bench: Bench) -> None:
                 bench.pass_time(0.025)
                 lasers.heartbeat()
         except DeviceError:
-            told += 1
+            reported += 1
             assert bench.light_uw == 0
         bench.board.bus.faults.clear()
         lasers.close()
         bench.board.power_cycle()
-    assert told >= 59, "one in 256 passes the packet error code"
+    assert reported >= 59, "one in 256 passes the packet error code"
 
 
 def bright(bench: Bench) -> Lasers:
@@ -459,7 +459,7 @@ def test_clearing_while_it_emits_is_an_off_that_the_photodiodes_agree_with(bench
         lasers.heartbeat()
 
 
-def test_every_part_is_told_to_go_dark_whatever_the_others_do(
+def test_every_part_is_switched_off_also_where_others_fail(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lasers = bench.armed()
@@ -468,8 +468,8 @@ def test_every_part_is_told_to_go_dark_whatever_the_others_do(
     def fails(*given: object) -> None:
         raise TypeError("not even an error of the bus")
 
-    monkeypatch.setattr(lasers.parts.controller, "command", fails)
-    monkeypatch.setattr(lasers.parts.dac, "dark", fails)
+    monkeypatch.setattr(lasers.board.controller, "command", fails)
+    monkeypatch.setattr(lasers.board.dac, "dark", fails)
     lasers.trip()
     assert bench.light_uw == 0 and bench.board.expander.pins() & 0b111 == 0
 
@@ -536,7 +536,7 @@ def test_a_new_host_goes_on_where_the_last_token_was(bench: Bench) -> None:
     first._token = 0
     bench.pass_time(0.02)
     first._beat()  # token 1, as a new host's first one would be
-    first._closed = True  # the process is gone without a word
+    first._closed = True  # the process was killed
     bench.pass_time(0.2)
     second = bench.open()
     second.clear()

@@ -352,7 +352,7 @@ class FailingBus(RuleBasedStateMachine):
             if act not in ("arm", "clear", "set_power") or self.lasers._fractions == [0.0] * 3:
                 dark_at = self.bench.now + WINDOW_S
                 self.bench.pass_time(max(0.0, dark_at - self.bench.now) + TICK_S)
-                assert self.bench.light_uw == 0, "told of a fault, and light a window later"
+                assert self.bench.light_uw == 0, "a fault was reported, and there is light a window later"
 
     @rule()
     def open(self) -> None:
@@ -420,14 +420,14 @@ class FailingBus(RuleBasedStateMachine):
         self.bench.board.key, self.bench.board.interlock, self.bench.board.celsius = key, interlock, celsius
 
     @rule()
-    def mend(self) -> None:
+    def repair(self) -> None:
         self.bench.board.bus.faults.clear()
         self.surroundings(True, True, 25.0)
 
     @precondition(lambda self: self.lasers is not None)
     @rule(killed=st.booleans())
     def end(self, killed: bool) -> None:
-        """The program ends: by its own will, or without a word."""
+        """The program ends: it closes the lasers, or it is killed."""
         assert self.lasers is not None
         if killed:
             self.lasers._closed = True

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_iface.virtual.simulated_panel import Drive, beam_amplitude, panel_path_nm
+from firmware_iface.virtual.simulated_drive import Drive
+from firmware_iface.virtual.simulated_panel import beam_amplitude, panel_path_nm
 from runtime.bundle.bundle_folder import read_bundle
 from runtime.bundle.light_path_arrays import load_light_path
 from runtime.calibration.drift import Drift

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from firmware_iface.errors import InputError
-from firmware_iface.virtual.simulated_panel import Drive
+from firmware_iface.virtual.simulated_drive import Drive
 from runtime.calibration.drift import Drift, drifted, wavefront_maps
 from runtime.calibration.drift_fit import Base, Estimate, Shot, _columns, _Layout, _stepped_views, predicted
 from runtime.calibration.replacement_rule import replacement_verdict

@@ -11,7 +11,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from firmware_iface.virtual import BenchDescription, VirtualHeadset
-from firmware_iface.virtual.description import ChannelDescription
+from firmware_iface.virtual.bench_description import ChannelDescription
 from firmware_iface.virtual.simulated_panel import panel_path_nm
 from runtime.bundle.bundle_folder import Bundle, read_bundle, write_bundle
 from runtime.bundle.light_path_arrays import load_light_path, pack_light_paths

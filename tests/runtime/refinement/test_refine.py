@@ -254,7 +254,7 @@ def test_three_colours_take_turns_and_each_is_refined(
     """A bench of three colours whose drive is not what the bundle believes; one laser is lit at a time."""
     torch = pytest.importorskip("torch")
     from firmware_iface import virtual
-    from firmware_iface.virtual.description import ChannelDescription
+    from firmware_iface.virtual.bench_description import ChannelDescription
     from runtime.lightpath import ideal_path as ideal
     from runtime.solver import quality
     from trainer.networks.approximator import Approximator as Network

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 import smbus2
 
-from firmware_iface.lasers.wire import open_bus
-from firmware_iface.virtual.served import i2c_bus
+from firmware_iface.lasers.i2c_transfers import open_bus
+from firmware_iface.virtual.remote_hardware import i2c_bus
+from tests.campaigns.fault_kinds import KINDS
 from tests.campaigns.faults import campaign, plans, summary
-from tests.campaigns.kinds import KINDS
 from tests.campaigns.lane import Lane
 from tests.campaigns.soak import soak
 

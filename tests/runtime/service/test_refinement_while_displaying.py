@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from firmware_iface.virtual.served import Remote
+from firmware_iface.virtual.remote_hardware import RemoteHardware
 from runtime.bundle.bundle_folder import read_bundle, write_bundle
 from runtime.service.client import Client, RefusedError
 from runtime.service.protocol import Code, LaserState, PartState, Shown
@@ -27,7 +27,7 @@ kind = "phase_response"
 
 class Headset(NamedTuple):
     file: Path
-    remote: Remote
+    remote: RemoteHardware
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from firmware_iface.virtual.served import Remote
+from firmware_iface.virtual.remote_hardware import RemoteHardware
 from runtime.cli import main
 from runtime.service import protocol
 from runtime.service.client import Client, LostFrame, RefusedError
@@ -32,7 +32,7 @@ from tests.campaigns.headset import ENVIRONMENT, connected, hardware, picture, s
 
 class Headset(NamedTuple):
     file: Path
-    remote: Remote
+    remote: RemoteHardware
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def show(client: Client, frames: int) -> list[Shown | LostFrame]:
     return outcomes
 
 
-def light_up(client: Client, remote: Remote) -> None:
+def light_up(client: Client, remote: RemoteHardware) -> None:
     """Clear, arm and show until there is light; again where something became stale on a busy machine."""
     end = time.monotonic() + 30
     while emitted_uw(remote) == 0:
@@ -89,7 +89,7 @@ def light_up(client: Client, remote: Remote) -> None:
         show(client, 3)
 
 
-def emitted_uw(remote: Remote) -> float:
+def emitted_uw(remote: RemoteHardware) -> float:
     return remote.light()[-1][1]
 
 
@@ -155,7 +155,7 @@ def test_an_unplugged_panel_is_dark_and_works_again_without_a_restart(
     lost = show(client, 3)
     assert lost and all(isinstance(o, LostFrame) and o.code == Code.PANEL for o in lost)
     until(lambda: client.status().panel == PartState.LOST)
-    headset.remote.mend("panel")
+    headset.remote.repair("panel")
     until(lambda: client.status().panel == PartState.FRESH)
     light_up(client, headset.remote)
 

@@ -1,19 +1,17 @@
-"""What a simulated bench is: the nominal part that a person would write down, and its hidden defects.
+"""The description of a simulated bench: the nominal part that a person would write down, and its hidden defects.
 
 The TOML form is bench.toml of a capture set plus `[[defect]]` tables and an optional `[simulation]` table.
 """
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
 from typing import Any, TypeVar
 
 from firmware_iface.errors import InputError, nearest
+from firmware_iface.toml_tables import check_instance, parameter, read_table
 from firmware_iface.virtual.defects import Defect, read_defect
-from firmware_iface.virtual.tables import check_instance, parameter, read_table
 
 D = TypeVar("D", bound=Defect)
 
@@ -70,7 +68,7 @@ class CameraDescription:
 
 @dataclass(frozen=True)
 class SimulationDescription:
-    """How the bench is simulated, and what of it a person would not write in bench.toml."""
+    """How the bench is simulated: settings that are not in a bench.toml."""
 
     subpixels: int = parameter(4, "samples drawn across a panel pixel", 2, 16)
     padding: float = parameter(2.0, "border, in units of the widest walk of light at the band's edge", 1, 20)
@@ -83,7 +81,7 @@ class SimulationDescription:
 
 @dataclass(frozen=True)
 class BenchDescription:
-    """A simulated bench: nominal tables, hidden defects, how to simulate. Use dataclasses.replace."""
+    """A simulated bench: nominal tables, hidden defects, simulation settings. Change it by dataclasses.replace."""
 
     name: str = "ideal"
     panel: PanelDescription = field(default_factory=PanelDescription)
@@ -134,14 +132,20 @@ class BenchDescription:
         return next((d for d in self.defects if isinstance(d, cls)), None)
 
     def channel(self, name: str) -> ChannelDescription:
-        """The channel of this name; raises InputError that suggests the nearest."""
+        """The channel of this name.
+
+        Raises
+        ------
+        InputError
+            For an unknown name; the message suggests the nearest.
+        """
         for c in self.channels:
             if c.name == name:
                 return c
         raise InputError(f"there is no channel '{name}'; {nearest(name, [c.name for c in self.channels])}")
 
     def resized(self, height: int, width: int, distance_mm: float | None = None) -> BenchDescription:
-        """The same bench with another panel size, its camera to match, and perhaps another distance."""
+        """The same bench with another panel size, its camera to match, and another distance where one is given."""
         distance = (
             self.propagation if distance_mm is None else replace(self.propagation, distance_mm=distance_mm)
         )
@@ -156,7 +160,7 @@ class BenchDescription:
         )
 
     def nominal(self) -> dict[str, Any]:
-        """What a person would write in bench.toml; says nothing of defects, nor of the bench's own name."""
+        """The tables of a bench.toml, without the defects and the bench's own name."""
         panel = asdict(self.panel)
         if self.panel.phase_sign == 1:
             del panel["phase_sign"]
@@ -176,7 +180,24 @@ class BenchDescription:
 
 
 def read_bench(tables: Mapping[str, Any], where: str) -> BenchDescription:
-    """A bench from parsed TOML; tables that are left out take their defaults. Raises InputError."""
+    """A bench from parsed TOML; tables that are left out take their defaults.
+
+    Parameters
+    ----------
+    tables : mapping
+        As read from TOML.
+    where : str
+        The file's name in messages.
+
+    Returns
+    -------
+    BenchDescription
+
+    Raises
+    ------
+    InputError
+        For an unknown key, a wrong type, or a value out of range.
+    """
     known = ("schema", "name", "panel", "channel", "propagation", "iris", "camera", "simulation", "defect")
     for key in tables:
         if key not in known:
@@ -218,20 +239,3 @@ def read_bench(tables: Mapping[str, Any], where: str) -> BenchDescription:
             read_defect(d, f"[[defect]] {i} of {where}") for i, d in enumerate(tables.get("defect", []))
         ),
     )
-
-
-def load_bench(spec: str) -> BenchDescription:
-    """A bench from `virtual:NAME` (see `named_benches`) or a TOML file's path. Raises InputError."""
-    from firmware_iface.virtual.named import named_bench
-
-    if spec.startswith("virtual:"):
-        return named_bench(spec.removeprefix("virtual:"))
-    path = Path(spec)
-    if not path.is_file():
-        raise InputError(f"there is no bench '{spec}'; give virtual:NAME or the path of a TOML file.")
-    try:
-        with path.open("rb") as file:
-            tables = tomllib.load(file)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path.name} is not TOML ({error}); correct that place.") from error
-    return read_bench(tables, path.name)

@@ -5,8 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 from firmware_iface.errors import InputError, nearest
+from firmware_iface.virtual.bench_description import (
+    BenchDescription,
+    ChannelDescription,
+    SimulationDescription,
+)
 from firmware_iface.virtual.defects import CATALOGUE_KINDS, make_defect
-from firmware_iface.virtual.description import BenchDescription, ChannelDescription, SimulationDescription
 
 _RGB = (
     ChannelDescription("red", 638.0),
@@ -32,7 +36,7 @@ def _benches() -> dict[str, BenchDescription]:
         BenchDescription("triple", defects=(make("crosstalk"), make("illumination"), make("distance"))),
         BenchDescription("colour", channels=_RGB, defects=(make("phase_response"),)),
         BenchDescription(
-            "mixed",  # small enough to train a dozen networks on
+            "mixed",  # small enough to train a dozen networks on it
             defects=(
                 make("zero_order", fill_factor=0.94, surface_amplitude=0.12),
                 make("illumination", waist_x_share=1.9, waist_y_share=2.1),
@@ -61,7 +65,13 @@ def named_benches() -> list[str]:
 
 
 def named_bench(name: str) -> BenchDescription:
-    """The bench of this name; raises InputError that suggests the nearest."""
+    """The bench of this name.
+
+    Raises
+    ------
+    InputError
+        For an unknown name; the message suggests the nearest.
+    """
     benches = _benches()
     if name not in benches:
         raise InputError(f"there is no virtual bench '{name}'; {nearest(name, benches)}")

@@ -16,9 +16,16 @@ _SHORTEST_RUN = 3  # pixels; shorter runs cost less as single pixels
 
 
 def encode(image: NDArray[np.uint32]) -> bytes:
-    """The image's header and its encoded rows.
+    """Encode an image: its header, then its rows.
 
-    image : uint32 [H, W], 24 bits used: bit position p of the controller is bit p here
+    Parameters
+    ----------
+    image : uint32 array [H, W]
+        24 bits are used: bit position p of the controller is bit p here.
+
+    Returns
+    -------
+    bytes
     """
     height, width = image.shape
     body = bytearray()

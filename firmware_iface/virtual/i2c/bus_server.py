@@ -12,17 +12,21 @@ from pathlib import Path
 from typing import Any
 
 from firmware_iface.virtual.i2c.bus import Message, failure
-from firmware_iface.virtual.i2c.kernel import attach
 from firmware_iface.virtual.i2c.laser_board import LaserBoard
+from firmware_iface.virtual.i2c.smbus2_ioctls import attach
 
 TICK_S = 0.002
 PACKET = 65536
 
 
 class BoardServer:
-    """Serves a board's bus and lets its time run. `close` ends both.
+    """Serves a board's bus and lets the board's time run; `close` ends both.
 
-    path : of the socket; made new
+    Parameters
+    ----------
+    board : LaserBoard
+    path : Path
+        Of the socket, which is created.
     """
 
     def __init__(self, board: LaserBoard, path: Path) -> None:
@@ -80,7 +84,13 @@ class RemoteBus:
         self._socket: socket.socket | None = None
 
     def transfer(self, messages: Sequence[Message]) -> list[bytes]:
-        """Carry the messages; the bytes read. Raises OSError as an adapter."""
+        """Carry messages, as `I2cBus.transfer`.
+
+        Raises
+        ------
+        OSError
+            As from an adapter.
+        """
         asked = [(m.address, None if m.data is None else m.data.hex(), m.length) for m in messages]
         with self._lock:
             answer = self._ask(json.dumps(asked).encode())
@@ -89,7 +99,13 @@ class RemoteBus:
         return [bytes.fromhex(reply) for reply in answer]
 
     def reach(self) -> None:
-        """Connect, unless it is connected. Raises OSError where nobody serves the bus."""
+        """Connect, unless it is connected.
+
+        Raises
+        ------
+        OSError
+            Where nobody serves the bus.
+        """
         if self._socket is None:
             opened = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             try:
@@ -119,7 +135,13 @@ _nodes: dict[str, tuple[RemoteBus, str]] = {}  # by socket: opening a bus again 
 
 
 def connect(path: str) -> str:
-    """A node for smbus2.SMBus, with the bus that is served at `path` behind it. Raises OSError."""
+    """A node for smbus2.SMBus, with the bus that is served at `path` behind it.
+
+    Raises
+    ------
+    OSError
+        Where nobody serves the bus.
+    """
     if path not in _nodes:
         bus = RemoteBus(path)
         bus.reach()

@@ -1,7 +1,7 @@
-"""A headset's hardware, emulated down to the bytes, with a simulated bench between its parts.
+"""A headset's hardware, emulated at the level of its buses' bytes, with a simulated bench between its parts.
 
-What the panel board was sent and what comes out of the laser board make what the camera sees. `served` runs it
-in a process of its own, so that it goes on when the process that drives it dies, as hardware does.
+The frame on the panel board and the light of the laser board give the camera's picture. `served` runs it in a
+process of its own, so that it continues when the process that drives it dies, as hardware does.
 """
 
 from __future__ import annotations
@@ -15,24 +15,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
-from firmware_iface.virtual.description import load_bench
+from firmware_iface.virtual.bench_loading import load_bench
 from firmware_iface.virtual.fault_injection import Faults
-from firmware_iface.virtual.headset import VirtualHeadset
 from firmware_iface.virtual.i2c import LaserBoard
-from firmware_iface.virtual.oak import OakModel, looking_at
+from firmware_iface.virtual.oak import OakModel, expose_bench
 from firmware_iface.virtual.usb.panel_board import BoardModel
+from firmware_iface.virtual.virtual_headset import VirtualHeadset
 
 TICK_S = 0.001
 REMEMBERED = 20000  # changes of light
 
 
-class Hardware:
+class EmulatedHardware:
     """Panel board, laser board and camera around one simulated bench; key on, interlock closed.
 
-    bench : as `virtual.headset.open_headset` takes it
+    Parameters
+    ----------
+    bench : str
+        As `virtual_headset.open_headset` takes it.
+    seed : int
+        Of noise and garbage.
 
-    Attributes: headset, board (of the panel), lasers (their board), faults (script of each part),
-    light ((time s, µW of all lasers) at each change), whole (CRC-32 of each pattern that the panel displayed).
+    Attributes
+    ----------
+    headset : VirtualHeadset
+        The simulated bench.
+    board : BoardModel
+        The panel's.
+    lasers : LaserBoard
+    faults : dict of str to Faults
+        The script of "panel", "lasers" and "camera".
+    light : deque of (float, float)
+        (time s, µW of all lasers) at each change.
+    whole : dict of int to int
+        CRC-32 of each pattern that the panel displayed, and how often.
     """
 
     def __init__(self, bench: str, seed: int = 0) -> None:
@@ -51,7 +67,7 @@ class Hardware:
         self._lock = threading.Lock()
 
     def run(self) -> None:
-        """Let time pass for the parts, for ever: also with nobody on the bus the dead-man acts and frames appear."""
+        """Let time pass for the parts, without end: the dead-man acts and frames appear also without traffic."""
         while True:
             self.lasers.settle()
             self.board.gray  # noqa: B018 - a period that is over displays what was committed
@@ -61,7 +77,17 @@ class Hardware:
             time.sleep(TICK_S)
 
     def capture(self, exposure_ms: float) -> NDArray[np.uint16]:
-        """What the camera sees, uint16 counts [h, w]. Raises DeviceError as its faults say."""
+        """One picture of the camera, with its faults.
+
+        Returns
+        -------
+        uint16 array [h, w], counts
+
+        Raises
+        ------
+        DeviceError
+            Where a fault is armed.
+        """
         faults = self.faults["camera"]
         fault = faults.take("unplug", "hang", "timeout", "late", "garbage", "die")
         if fault == "unplug":
@@ -78,7 +104,7 @@ class Hardware:
         return counts
 
     def exposed(self, exposure_ms: float) -> NDArray[np.uint16]:
-        """What falls on the camera, uint16 counts [h, w]."""
+        """One picture of the camera without its faults, uint16 counts [h, w]."""
         with self._lock:
             emitted = self.lasers.emitted_uw
             self.headset.panel.show(self.board.gray)
@@ -89,8 +115,20 @@ class Hardware:
             return self.headset.camera.capture()
 
     def set_to(self, name: str, value: Any) -> None:
-        """Do something to the laser board: key or interlock (bool), celsius, photodiodes (False: cut), efficiency
-        (of every diode; 1: as calibrated). Raises InputError for another name."""
+        """Change the surroundings of the laser board.
+
+        Parameters
+        ----------
+        name : str
+            "key" or "interlock" (bool), "celsius", "photodiodes" (False: cut), "efficiency" (of every diode; 1: as
+            calibrated).
+        value : bool or float
+
+        Raises
+        ------
+        InputError
+            For another name.
+        """
         if name in ("key", "interlock", "celsius"):
             setattr(self.lasers, name, value)
             return
@@ -104,9 +142,9 @@ class Hardware:
         self.lasers.settle()
 
     def attach_oak(self, address: str) -> None:
-        """Let an emulated OAK camera look at the bench, at a loopback address; its faults are the camera's."""
+        """Emulate an OAK camera in front of the bench, at a loopback address; its faults are the camera's."""
         self.oak = OakModel(
-            looking_at(self.exposed, self.headset.description.camera),
+            expose_bench(self.exposed, self.headset.description.camera),
             self.headset.camera.shape,
             address,
             frames_per_s=120.0,
@@ -114,7 +152,7 @@ class Hardware:
         )
 
     def light_since(self, since_s: float) -> list[tuple[float, float]]:
-        """What the light was at `since_s`, and each change after it."""
+        """(time s, µW of all lasers): the light at `since_s`, and each change after it."""
         self.lasers.settle()
         changes = list(self.light)
         first = max((k for k, (at, _) in enumerate(changes) if at <= since_s), default=0)

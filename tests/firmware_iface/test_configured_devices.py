@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from firmware_iface.assembled import check_tables, open_camera, open_panel
+from firmware_iface.configured_devices import check_tables, open_camera, open_panel
 from firmware_iface.errors import DeviceError, InputError
 
 

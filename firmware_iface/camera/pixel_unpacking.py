@@ -1,4 +1,4 @@
-"""Pixels as the camera packs them, unpacked to counts."""
+"""Packed pixels of the camera (RAW10, GRAY8) unpacked to counts."""
 
 from __future__ import annotations
 
@@ -9,12 +9,26 @@ BIT_DEPTHS = {"raw10": 10, "gray8": 8}
 
 
 def unpack(data: bytes, encoding: str, height: int, width: int, stride: int) -> NDArray[np.uint16]:
-    """Counts, uint16 [height, width].
+    """Unpack one picture.
 
-    encoding : "raw10" (MIPI: four pixels in five bytes, the fifth holds their low two bits, first pixel
-        lowest) or "gray8"
-    stride : bytes from the start of one row to the next
-    Raises ValueError where the data does not hold such a picture.
+    Parameters
+    ----------
+    data : bytes
+    encoding : str
+        "raw10" (MIPI: four pixels in five bytes, the fifth holds their low two bits, first pixel
+        lowest) or "gray8".
+    height, width : int, pixels
+    stride : int
+        Bytes from the start of one row to the next.
+
+    Returns
+    -------
+    uint16 array [height, width], counts
+
+    Raises
+    ------
+    ValueError
+        Where the data does not hold such a picture.
     """
     if encoding not in BIT_DEPTHS:
         raise ValueError(f"pixels of encoding '{encoding}' are not known")

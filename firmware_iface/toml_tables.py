@@ -22,7 +22,19 @@ def parameter(
     high: float = math.inf,
     choices: tuple[Any, ...] = (),
 ) -> Any:
-    """A dataclass field with a meaning and a range (`low` and `high` inclusive, or one of `choices`)."""
+    """A dataclass field with a meaning and a range.
+
+    Parameters
+    ----------
+    default : object
+        Without it, the key is required.
+    about : str
+        What the value means, for messages.
+    low, high : float
+        Range, inclusive.
+    choices : tuple
+        Where given, the only values allowed.
+    """
     metadata = {"about": about, "low": low, "high": high, "choices": choices}
     if default is dataclasses.MISSING:
         return dataclasses.field(metadata=metadata)
@@ -32,11 +44,25 @@ def parameter(
 def read_table(cls: type[T], table: Mapping[str, Any], where: str, ignore: tuple[str, ...] = ()) -> T:
     """Build `cls` from a TOML table.
 
-    cls : dataclass type whose fields were made with `parameter`
-    table : mapping read from TOML
-    where : str, how to name the table in an error, for example "[panel] of bench.toml"
-    ignore : keys of the table that are not fields
-    Raises InputError for an unknown or missing key, a wrong type, or a value out of range.
+    Parameters
+    ----------
+    cls : type
+        A dataclass whose fields were made with `parameter`.
+    table : mapping
+        As read from TOML.
+    where : str
+        How to name the table in an error, for example "[panel] of bench.toml".
+    ignore : tuple of str
+        Keys of the table that are not fields.
+
+    Returns
+    -------
+    cls
+
+    Raises
+    ------
+    InputError
+        For an unknown or missing key, a wrong type, or a value out of range.
     """
     fields = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
     if not isinstance(table, Mapping):
@@ -54,14 +80,26 @@ def read_table(cls: type[T], table: Mapping[str, Any], where: str, ignore: tuple
 
 
 def check_instance(instance: Any, where: str) -> None:
-    """Check the types and ranges of a dataclass made in code; raises InputError as `read_table` does."""
+    """Check the types and ranges of a dataclass made in code.
+
+    Raises
+    ------
+    InputError
+        As `read_table` does.
+    """
     for f in dataclasses.fields(instance):
         if f.metadata:
             checked(f, getattr(instance, f.name), where)
 
 
 def checked(f: dataclasses.Field[Any], value: Any, where: str) -> Any:
-    """The value of one field, converted to its declared type; raises InputError where it does not fit."""
+    """The value of one field, converted to its declared type.
+
+    Raises
+    ------
+    InputError
+        Where it does not fit.
+    """
     kind = str(f.type)
     name = f"'{f.name}' in {where}"
     if kind == "float":

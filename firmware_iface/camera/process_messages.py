@@ -1,4 +1,4 @@
-"""Messages from the camera's process to ours, on a pipe: what it is doing, and frames as they came."""
+"""Messages of the camera's process on its pipe: its state, and frames as the camera packed them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,22 @@ _HEADER = struct.Struct("<4sB3xIHHIIIQQ")  # kind, length, h, w, stride, exposur
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame as the camera packs it; `end_ns` is when its exposure ended, on the monotonic clock."""
+    """One frame as the camera packs it.
+
+    Attributes
+    ----------
+    height, width : int, pixels
+    stride : int
+        Bytes from the start of one row to the next.
+    exposure_us : int, µs
+    iso : int
+        100 at gain 1.
+    number : int
+        Counts frames.
+    end_ns : int, ns
+        End of the exposure, monotonic clock.
+    data : bytes
+    """
 
     height: int
     width: int
@@ -28,18 +43,18 @@ class Frame:
 
     @property
     def begin_ns(self) -> int:
-        """When its exposure began."""
+        """Begin of its exposure, ns, monotonic clock."""
         return self.end_ns - 1000 * self.exposure_us
 
 
 def state_message(text: str) -> bytes:
-    """A word on what the process is doing; also its sign of life."""
+    """The state of the process, as a message; it also shows that the process is alive."""
     data = text.encode()
     return _HEADER.pack(MAGIC, STATE, len(data), 0, 0, 0, 0, 0, 0, 0) + data
 
 
 def frame_message(frame: Frame) -> bytes:
-    """One frame."""
+    """A frame as a message."""
     f = frame
     head = _HEADER.pack(
         MAGIC, FRAME, len(f.data), f.height, f.width, f.stride, f.exposure_us, f.iso, f.number, f.end_ns
@@ -48,13 +63,19 @@ def frame_message(frame: Frame) -> bytes:
 
 
 class Messages:
-    """Takes bytes as they come and gives whole messages; half a message at the end is simply not given."""
+    """Takes bytes as they come and gives whole messages; an incomplete message at the end is kept for later."""
 
     def __init__(self) -> None:
         self._rest = bytearray()
 
     def feed(self, data: bytes) -> Iterator[str | Frame]:
-        """States and frames that are complete with `data`; ValueError where it is no such stream."""
+        """States and frames that are complete with `data`.
+
+        Raises
+        ------
+        ValueError
+            Where the bytes are no such stream.
+        """
         self._rest += data
         while len(self._rest) >= _HEADER.size:
             magic, kind, length, *numbers = _HEADER.unpack_from(self._rest)

@@ -1,6 +1,6 @@
 """A USB device at the level of its bytes: descriptors, setup packets, endpoints, and faults on any of them.
 
-A front end (pyusb's backend in `backend`, or a host controller's) calls `control`, `write` and `read`; a
+A front end (`pyusb_backend`, or a host controller) calls `control`, `write` and `read`; a
 model fills in `on_control`, `on_write` and `on_read` and may raise Stall or Nak there.
 """
 
@@ -27,11 +27,11 @@ class Stall(Exception):
 
 
 class Nak(Exception):
-    """The device has nothing to say or no room yet; raised to the front end once it has given up."""
+    """The device has no data or no room yet; raised to the front end after its time limit."""
 
 
-class Gone(Exception):
-    """The cable is out."""
+class NoDevice(Exception):
+    """The device is unplugged."""
 
 
 def device_descriptor(vendor: int, product: int, release: int = 0x0100) -> bytes:
@@ -56,13 +56,23 @@ def endpoint_descriptor(address: int, kind: int, packet: int, interval: int = 0)
 
 
 class UsbModel:
-    """What every modelled USB device does; thread safe.
+    """Behaviour that every modelled USB device has; thread safe.
 
-    descriptor, configuration : raw descriptors
-    strings : by index from 1
-    faults : the script that each transfer asks: unplug, hang, timeout, late, stall, garbage, short_write
+    Parameters
+    ----------
+    descriptor, configuration : bytes
+        Raw descriptors.
+    strings : tuple of str
+        By index from 1.
+    faults : Faults or None
+        The script that each transfer asks: unplug, hang, timeout, late, stall, garbage, short_write.
 
-    Attributes: generation (counts how often it was plugged in; old handles are dead), configured.
+    Attributes
+    ----------
+    generation : int
+        How often it was plugged in; handles of earlier generations are invalid.
+    configured : int
+        The configuration in force; 0: none.
     """
 
     def __init__(
@@ -78,7 +88,7 @@ class UsbModel:
 
     @property
     def present(self) -> bool:
-        """Whether it is plugged in. A device that was out meanwhile has lost its state."""
+        """Whether it is plugged in. A device that was unplugged meanwhile has lost its state."""
         with self._lock:
             if self.generation != self.faults.ended["unplug"]:
                 self.generation = self.faults.ended["unplug"]
@@ -147,11 +157,11 @@ class UsbModel:
     def _struck(self, give_up: GiveUp, *kinds: str) -> str | None:
         fault = self.faults.take("unplug", "hang", "timeout", "late", *kinds)
         if fault == "unplug":
-            raise Gone
+            raise NoDevice
         if fault in ("hang", "timeout"):
             while not give_up():
                 if not self.present:
-                    raise Gone
+                    raise NoDevice
                 time.sleep(0.001)
             raise Nak
         if fault == "late":
@@ -167,7 +177,7 @@ class UsbModel:
         while True:
             with self._lock:
                 if not self.present:
-                    raise Gone
+                    raise NoDevice
                 if fault == "stall":
                     self.halted.add(endpoint)
                 if endpoint in self.halted or not self.configured:

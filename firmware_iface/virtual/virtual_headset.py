@@ -17,101 +17,36 @@ from numpy.typing import NDArray
 
 from firmware_iface.errors import InputError
 from firmware_iface.panel.panel import Gray, checked_gray
-from firmware_iface.virtual import defects, oracle
+from firmware_iface.virtual.bench_description import BenchDescription
+from firmware_iface.virtual.bench_loading import load_bench
 from firmware_iface.virtual.bench_optics import BenchOptics
-from firmware_iface.virtual.description import BenchDescription, load_bench
+from firmware_iface.virtual.defects import LaserDrift
+from firmware_iface.virtual.oracle_pattern import descend
 from firmware_iface.virtual.simulated_sensor import Drift, Integrator, Sensor
-
-
-class VirtualPanel:
-    """The phase panel. It shows gray 0 until told otherwise.
-
-    shape : (H, W), pixels
-    """
-
-    def __init__(self, shape: tuple[int, int]) -> None:
-        self.shape = shape
-        self._gray: Gray = np.zeros(shape, np.uint8)
-
-    @property
-    def gray(self) -> Gray:
-        """What is shown, uint8 [H, W]; a copy."""
-        return self._gray.copy()
-
-    def show(self, gray: NDArray[np.generic]) -> None:
-        """Show gray levels, uint8 [H, W]; raises InputError for another type or size."""
-        self._gray = checked_gray(gray, self.shape).copy()
-
-
-class VirtualLasers:
-    """The lasers, all off at first.
-
-    channels : names
-    """
-
-    def __init__(self, channels: tuple[str, ...]) -> None:
-        self.channels = channels
-        self._power = dict.fromkeys(channels, 0.0)
-
-    def set_power(self, channel: str, fraction: float) -> None:
-        """Set a laser to a fraction of full power, 0 to 1; raises InputError where either is unknown."""
-        if channel not in self._power:
-            raise InputError(f"there is no laser '{channel}'; use one of {', '.join(self.channels)}.")
-        if not (isinstance(fraction, int | float | np.floating) and 0 <= fraction <= 1):
-            raise InputError(f"power {fraction!r} of laser '{channel}' is not a fraction; give 0 to 1.")
-        self._power[channel] = float(fraction)
-
-    def power(self, channel: str) -> float:
-        """A laser's power, fraction of full."""
-        if channel not in self._power:
-            raise InputError(f"there is no laser '{channel}'; use one of {', '.join(self.channels)}.")
-        return self._power[channel]
-
-    def off(self) -> None:
-        """Switch every laser off."""
-        self._power = dict.fromkeys(self._power, 0.0)
-
-
-class VirtualCamera:
-    """The camera; 10 ms at first.
-
-    shape : (h, w), pixels
-    bit_depth : bits of a count
-    """
-
-    def __init__(
-        self, shape: tuple[int, int], bit_depth: int, take: Callable[[], NDArray[np.uint16]]
-    ) -> None:
-        self.shape, self.bit_depth = shape, bit_depth
-        self._take = take
-        self._exposure_ms = 10.0
-
-    longest_exposure_ms = 10000.0
-
-    @property
-    def exposure_ms(self) -> float:
-        """Exposure time, ms; setting it raises InputError unless above 0 and at most 10 s."""
-        return self._exposure_ms
-
-    @exposure_ms.setter
-    def exposure_ms(self, value: float) -> None:
-        if not (isinstance(value, int | float | np.floating) and 0 < value <= self.longest_exposure_ms):
-            raise InputError(f"exposure {value!r} ms is out of range; give more than 0 and at most 10000.")
-        self._exposure_ms = float(value)
-
-    def capture(self) -> NDArray[np.uint16]:
-        """One picture, uint16 counts [h, w], black level included."""
-        return self._take()
+from firmware_iface.virtual.virtual_devices import VirtualCamera, VirtualLasers, VirtualPanel
 
 
 class VirtualHeadset:
-    """All devices of one headset and the simulated bench they stand on.
+    """All devices of one headset, on a simulated bench.
 
-    description : the bench
-    seed : fixes noise and drift; a capture's noise depends on the seed and on how many captures came before
+    Parameters
+    ----------
+    description : BenchDescription
+        The bench.
+    seed : int
+        Fixes noise and drift; a capture's noise depends on the seed and on the number of captures before.
 
-    Attributes: panel, lasers, camera, plane_mm (where the camera focuses), time_s (clock; runs on with each
-    capture), captures (how many were taken). The focus is the bench's distance at first.
+    Attributes
+    ----------
+    panel : VirtualPanel
+    lasers : VirtualLasers
+    camera : VirtualCamera
+    plane_mm : float, mm
+        Focus of the camera; the bench's distance at first.
+    time_s : float, s
+        Clock; each capture advances it.
+    captures : int
+        How many were taken.
     """
 
     def __init__(self, description: BenchDescription, seed: int = 0) -> None:
@@ -125,12 +60,18 @@ class VirtualHeadset:
         self.captures = 0
         self._optics = BenchOptics(description)
         self._sensor = Sensor(description)
-        self._drift = Drift(description.defect(defects.LaserDrift), seed)
-        self._seen: dict[str, tuple[Gray, float, NDArray[np.float64]]] = {}
+        self._drift = Drift(description.defect(LaserDrift), seed)
+        self._recent: dict[str, tuple[Gray, float, NDArray[np.float64]]] = {}
         self._integrators: OrderedDict[tuple[int, int, int], Integrator] = OrderedDict()
 
     def move_to_plane(self, plane_mm: float) -> None:
-        """Focus the camera on another plane, mm from the panel; raises InputError unless within 2 m."""
+        """Focus the camera on another plane, mm from the panel.
+
+        Raises
+        ------
+        InputError
+            Unless within 2 m.
+        """
         self.plane_mm = checked_plane(plane_mm)
 
     def _capture(self) -> NDArray[np.uint16]:
@@ -160,7 +101,12 @@ class VirtualHeadset:
     ) -> NDArray[np.float64]:
         """Noise-free irradiance over panel-sized pixels, [H, W], before any fault of the camera.
 
-        A perfect panel under a uniform beam gives about 1. Raises InputError for a wrong size or channel.
+        A perfect panel under a uniform beam gives about 1.
+
+        Raises
+        ------
+        InputError
+            For a wrong size or channel.
         """
         gray, plane = checked_gray(gray, self.panel.shape), self._plane(plane_mm)
         return (
@@ -178,11 +124,24 @@ class VirtualHeadset:
         start: NDArray[np.generic] | None = None,
         progress: Callable[[int, float], None] | None = None,
     ) -> Gray:
-        """The best pattern, uint8 [H, W], by someone who knows the true bench. For tests and demonstrations.
+        """The best pattern where the true bench is known. For tests and demonstrations.
 
-        target_irradiance : [H, W], any unit, not negative
-        start : gray levels to start from; none: a smooth random phase at the image
-        progress : called with the iteration and the loss
+        Parameters
+        ----------
+        target_irradiance : float array [H, W]
+            Any unit, not negative.
+        start : array or None
+            Gray levels to start from; None: a smooth random phase at the image.
+        channel : str
+        plane_mm : float or None, mm
+            None: the camera's focus.
+        iterations : int
+        progress : callable or None
+            Called with the iteration and the loss.
+
+        Returns
+        -------
+        uint8 array [H, W]
         """
         target = np.asarray(target_irradiance, np.float64)
         if (
@@ -197,7 +156,7 @@ class VirtualHeadset:
             )
         first = None if start is None else checked_gray(start, self.panel.shape).astype(np.float64)
         plane = self._plane(plane_mm)
-        return oracle.descend(
+        return descend(
             self._optics,
             self._integrator(channel, plane),
             target,
@@ -212,14 +171,14 @@ class VirtualHeadset:
         return self.plane_mm if plane_mm is None else checked_plane(plane_mm)
 
     def _camera_irradiance(self, gray: Gray, channel: str, plane_mm: float) -> NDArray[np.float64]:
-        """Irradiance on camera pixels; kept for each channel, since a camera that runs sees most of it again."""
-        last = self._seen.get(channel)
+        """Irradiance on camera pixels; kept for each channel, since a running camera repeats most of it."""
+        last = self._recent.get(channel)
         if last is not None and last[1] == plane_mm and np.array_equal(last[0], gray):
             return last[2]
         optics = self._optics.irradiance(gray, channel, plane_mm)
         seen = self._integrator(channel, plane_mm).camera(optics)
         seen.flags.writeable = False
-        self._seen[channel] = gray.copy(), plane_mm, seen
+        self._recent[channel] = gray.copy(), plane_mm, seen
         return seen
 
     def _integrator(self, channel: str, plane_mm: float) -> Integrator:
@@ -233,7 +192,13 @@ class VirtualHeadset:
 
 
 def checked_plane(plane_mm: float) -> float:
-    """A plane in mm; raises InputError unless it is a finite number within 2 m."""
+    """A plane in mm.
+
+    Raises
+    ------
+    InputError
+        Unless it is a finite number within 2 m.
+    """
     number = isinstance(plane_mm, int | float | np.floating | np.integer) and not isinstance(plane_mm, bool)
     if not number or not math.isfinite(plane_mm) or abs(plane_mm) > 2000:
         raise InputError(f"plane {plane_mm!r} mm is out of range; give a number from -2000 to 2000.")
@@ -241,5 +206,11 @@ def checked_plane(plane_mm: float) -> float:
 
 
 def open_headset(spec: str, seed: int = 0) -> VirtualHeadset:
-    """Open the virtual headset of `virtual:NAME` or of a bench's TOML file. Raises InputError."""
+    """Open the virtual headset of `virtual:NAME` or of a bench's TOML file.
+
+    Raises
+    ------
+    InputError
+        Where there is no such bench.
+    """
     return VirtualHeadset(load_bench(spec), seed)

@@ -21,11 +21,25 @@ from firmware_iface.panel.panel import Gray, Panel
 class MirroredDisplay:
     """A frame buffer whose screen the panel mirrors, gray levels in all colours.
 
-    number : N of /dev/fbN
-    shape : (H, W), the panel's pixels; they are drawn at the screen's top left
-    settle_s : from the start of a frame on the link until the panel has followed
-    draw : makes the screen's pixels, uint8 [rows, columns], of gray levels [H, W]; none: they are the same
-    devices, settings : where the kernel shows frame buffers; tests give folders of their own
+    Parameters
+    ----------
+    number : int
+        N of /dev/fbN.
+    shape : (int, int)
+        (H, W), the panel's pixels, drawn at the screen's top left.
+    settle_s : float, s
+        From the start of a frame on the link until the panel has followed.
+    draw : callable
+        From gray levels [H, W] to the screen's pixels, uint8 array [rows, columns]; by default the same.
+    devices, settings : Path
+        Folders where the kernel shows frame buffers.
+
+    Raises
+    ------
+    InputError
+        Where the screen cannot carry the panel.
+    DeviceError, DeviceGoneError
+        Where it cannot be opened.
     """
 
     def __init__(
@@ -75,7 +89,13 @@ class MirroredDisplay:
         time.sleep(max(0.0, self._shown_s - time.monotonic()))
 
     def status(self) -> dict[str, Any]:
-        """Mode of the screen; raises DeviceGoneError where it is off the link."""
+        """Mode of the screen.
+
+        Raises
+        ------
+        DeviceGoneError
+            Where the screen is disconnected.
+        """
         return {"mode": self._get("mode"), "pan": self._get("pan"), "bits_per_pixel": 8 * self._bytes}
 
     def close(self) -> None:
@@ -117,6 +137,6 @@ class MirroredDisplay:
 
 
 def open_mirrored(number: int, shape: tuple[int, int], settle_s: float = 0.05) -> Panel:
-    """A panel that is nothing but a screen. See MirroredDisplay."""
+    """A panel that is a screen and has no other control. See MirroredDisplay."""
     display = MirroredDisplay(number, shape, settle_s)
     return Panel(display, display)

@@ -23,12 +23,18 @@ MEMORY = (3, 2, 1, 7, 0, 6, 5, 4, 11, 10, 9, 8, 15, 14, 13, 12)
 
 @dataclass(frozen=True)
 class Modulator:
-    """One device.
+    """One kind of modulator.
 
-    shape : (H, W), mirrors
-    electrodes : which memory bit lies where under a mirror, 2 x 2
-    mirrored : whether the memory's columns run the other way
-    controllers : 1, or 2 where a second one has the right half
+    Attributes
+    ----------
+    shape : (int, int)
+        (H, W), mirrors.
+    electrodes : ((int, int), (int, int))
+        Which memory bit lies where under a mirror.
+    mirrored : bool
+        Whether the memory's columns run the other way.
+    controllers : int
+        1, or 2 where a second one has the right half.
     """
 
     shape: tuple[int, int]
@@ -53,8 +59,8 @@ def phase_waves() -> NDArray[np.float64]:
 
 def states(gray: Gray) -> NDArray[np.uint8]:
     """The state, 0 to 15, whose phase is nearest on the circle to gray / 256 of a wave."""
-    asked = np.arange(256)[:, None] / 256
-    apart = np.abs(asked - phase_waves())
+    requested = np.arange(256)[:, None] / 256
+    apart = np.abs(requested - phase_waves())
     nearest = np.minimum(apart, 1 - apart).argmin(1).astype(np.uint8)
     return nearest[gray]
 

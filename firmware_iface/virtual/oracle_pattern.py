@@ -1,4 +1,4 @@
-"""The best pattern that someone could show who knew the true bench: for tests and demonstrations only.
+"""The best pattern for a bench whose defects are known exactly (an oracle): for tests and demonstrations only.
 
 Adam on gray levels through the sub-pixel simulation; the loss is 1 less the squared correlation of amplitude,
 which is the amplitude error with its best scale, free of the total light.
@@ -68,9 +68,25 @@ def descend(
 ) -> NDArray[np.uint8]:
     """Gray levels [H, W] whose irradiance on panel pixels is nearest to `target` in amplitude, up to scale.
 
-    target : irradiance wanted, [H, W], any unit
-    start : gray levels to better, in small steps; none: a smooth random phase at the image, in long ones
-    progress : called with the iteration and the loss
+    Parameters
+    ----------
+    optics : BenchOptics
+    integrator : Integrator
+    target : float64 array [H, W]
+        Target irradiance, any unit.
+    channel : str
+    plane_mm : float, mm
+    iterations : int
+    start : float64 array [H, W], or None
+        Gray levels that small steps improve; None: a smooth random phase at the image, and large steps.
+    seed : int
+        Of that random phase.
+    progress : callable or None
+        Called with the iteration and the loss.
+
+    Returns
+    -------
+    uint8 array [H, W]
     """
     drive = optics.drive(channel)
     gray = ideal_start(optics, target, channel, plane_mm, seed) if start is None else start.astype(np.float64)

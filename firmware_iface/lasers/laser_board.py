@@ -1,4 +1,4 @@
-"""The laser board's parts together: how they are set up, and how each is told to go dark."""
+"""The laser board: its five parts set up together and switched off together."""
 
 from __future__ import annotations
 
@@ -22,10 +22,21 @@ TRIP_V = 1.2  # of every photodiode, whose amplifier gives 1 V at full power
 HOT_CELSIUS, COOL_CELSIUS = 45.0, 40.0
 
 
-class Parts:
+class LaserBoard:
     """DAC, expander, converter, thermometer and safety controller on one bus.
 
-    bus : an open smbus2.SMBus
+    Parameters
+    ----------
+    bus : smbus2.SMBus
+        Open.
+
+    Attributes
+    ----------
+    dac : Mcp4728
+    expander : Mcp23008
+    converter : Ads1115
+    thermometer : Tmp117
+    controller : SafetyController
     """
 
     def __init__(self, bus: SMBus) -> None:
@@ -36,9 +47,19 @@ class Parts:
     def set_up(self, lasers: Sequence[LaserChannel]) -> None:
         """Make everything dark, verify that it is and would be at power-on, and set every limit.
 
-        lasers : one to three, in the order of the DAC's outputs
-        Raises InputError where the board was not built for these lasers, DeviceError where a part is not what it
-        should be, and OSError where one does not answer.
+        Parameters
+        ----------
+        lasers : sequence of LaserChannel
+            One to three, in the order of the DAC's outputs.
+
+        Raises
+        ------
+        InputError
+            Where the board was not built for these lasers.
+        DeviceError
+            Where a part is not what it should be.
+        OSError
+            Where one does not answer.
         """
         self.controller.check_identity()
         self.controller.command(Command.OFF)
@@ -46,7 +67,7 @@ class Parts:
         self.dac.dark()
         now, at_power_on = self.dac.read()
         if not all(output.dark for output in now):
-            raise DeviceError("the DAC does not go dark when told to; have the laser board mended.")
+            raise DeviceError("the DAC does not go dark on command; have the laser board repaired.")
         if not all(output.dark for output in at_power_on):
             raise DeviceError(
                 "the DAC's EEPROM would light lasers at power-on; with the key off, write it dark once: "
@@ -65,20 +86,20 @@ class Parts:
         self._set_ceilings(lasers)
 
     def _set_ceilings(self, lasers: Sequence[LaserChannel]) -> None:
-        """Write the ceilings, or where that has been done see that they are these; lasers not there get 0."""
+        """Write the ceilings, or check them where they are written already; lasers that are missing get 0."""
         full = [math.ceil(laser.drive_v(1.0) / VOLTS_PER_STEP - 1e-6) for laser in lasers]
-        wanted = [(steps * VOLTS_PER_STEP, TRIP_V) for steps in full] + [(0.0, 0.0)] * (3 - len(lasers))
+        required = [(steps * VOLTS_PER_STEP, TRIP_V) for steps in full] + [(0.0, 0.0)] * (3 - len(lasers))
         for k, laser in enumerate(lasers):
             most = self.controller.maxima_v(k)
-            if not (_at_most(wanted[k][0], most[0]) and _at_most(wanted[k][1], most[1])):
+            if not (_at_most(required[k][0], most[0]) and _at_most(required[k][1], most[1])):
                 raise InputError(
-                    f"laser '{laser.name}' needs {wanted[k][0]:.4f} V for full power and the board was built for "
+                    f"laser '{laser.name}' needs {required[k][0]:.4f} V for full power and the board was built for "
                     f"{most[0]:.4f} V; lower its full_power_uw."
                 )
         if not self.controller.inputs() & Input.CEILINGS:
-            for k, pair in enumerate(wanted):
+            for k, pair in enumerate(required):
                 self.controller.set_ceilings(k, *pair)
-        for k, pair in enumerate(wanted):
+        for k, pair in enumerate(required):
             found = self.controller.ceilings_v(k)
             if any(abs(f - w) > VOLTS_PER_STEP / 2 for f, w in zip(found, pair, strict=True)):
                 raise DeviceError(
@@ -87,9 +108,12 @@ class Parts:
                 )
 
     def go_dark(self, command: Command) -> None:
-        """Tell every part to go dark, each by itself, whatever happens to the others. Raises nothing.
+        """Switch off every part, each by itself, also where another one fails. Raises nothing.
 
-        command : what the safety controller is told, OFF or FAULT
+        Parameters
+        ----------
+        command : Command
+            For the safety controller, OFF or FAULT.
         """
         acts: tuple[Callable[[], None], ...] = (
             lambda: self.controller.command(command),
@@ -97,7 +121,7 @@ class Parts:
             lambda: self.expander.enable(0),
         )
         for act in acts:
-            with suppress(Exception):  # of whatever kind: it may not keep the next part from being told
+            with suppress(Exception):  # of any kind: the next part is switched off all the same
                 act()
 
 

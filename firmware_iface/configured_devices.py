@@ -1,4 +1,4 @@
-"""The devices that a configuration names, opened: one table each, one function each.
+"""Open the devices that a configuration names: one table and one function for each.
 
 [panel]                       a panel board over USB (firmware_iface/panel/PROTOCOL.md)
 kind = "board"                or "dlpc900", TI's phase light modulator, or "mirrored", a panel that is a screen, or
@@ -41,7 +41,7 @@ from firmware_iface.errors import InputError, nearest
 from firmware_iface.lasers import VIRTUAL_CHANNELS, LaserChannel
 from firmware_iface.lasers.eye_safety import exposure
 from firmware_iface.own_device import check_kind, open_own
-from firmware_iface.virtual.tables import parameter, read_table
+from firmware_iface.toml_tables import parameter, read_table
 
 Table = Mapping[str, Any]
 
@@ -50,7 +50,7 @@ KINDS = {"panel": ("board", "dlpc900", "mirrored"), "camera": ("oak", "virtual")
 
 @dataclass(frozen=True)
 class PanelTable:
-    """[panel]"""
+    """Keys of [panel]."""
 
     kind: str = parameter("board", "which panel")
     bus: str = parameter("usb", "usb, or virtual:SOCKET")
@@ -65,7 +65,7 @@ class PanelTable:
 
 @dataclass(frozen=True)
 class LasersTable:
-    """[lasers] without power and channel."""
+    """Keys of [lasers] except power and channel."""
 
     bus: str = parameter(about="/dev/i2c-N, or virtual:SOCKET")
     mrad_per_pixel: float = parameter(
@@ -75,7 +75,7 @@ class LasersTable:
 
 @dataclass(frozen=True)
 class CameraTable:
-    """[camera]"""
+    """Keys of [camera]."""
 
     kind: str = parameter("oak", "which camera")
     bus: str = parameter("", "virtual:SOCKET")
@@ -85,66 +85,99 @@ class CameraTable:
 
 
 def open_panel(table: Table) -> Any:
-    """The panel of a configuration's [panel]. Raises InputError or DeviceError."""
-    from firmware_iface.panel import open_board, open_dlpc900, open_mirrored, plm
-    from firmware_iface.panel.board import Timing
+    """The panel of a configuration's [panel].
 
-    asked = _panel_table(table)
-    if asked.kind not in KINDS["panel"]:
-        return open_own(asked.kind, "panel")
-    if asked.kind == "mirrored":
-        return open_mirrored(max(0, asked.display), (asked.height, asked.width))
-    if asked.kind == "dlpc900":
+    Raises
+    ------
+    InputError
+        Where the table is wrong.
+    DeviceError
+        Where the panel cannot be opened.
+    """
+    from firmware_iface.panel import open_board, open_dlpc900, open_mirrored
+    from firmware_iface.panel.panel_board_messages import Timing
+    from firmware_iface.panel.phase_light_modulator import P47, P67
+
+    settings = _panel_table(table)
+    if settings.kind not in KINDS["panel"]:
+        return open_own(settings.kind, "panel")
+    if settings.kind == "mirrored":
+        return open_mirrored(max(0, settings.display), (settings.height, settings.width))
+    if settings.kind == "dlpc900":
         return open_dlpc900(
-            None if asked.display < 0 else asked.display,
-            modulator={"p47": plm.P47, "p67": plm.P67}[asked.modulator],
-            serial=asked.serial or None,
-            timeout_s=asked.timeout_ms / 1000,
+            None if settings.display < 0 else settings.display,
+            modulator={"p47": P47, "p67": P67}[settings.modulator],
+            serial=settings.serial or None,
+            timeout_s=settings.timeout_ms / 1000,
         )
-    period_us = round(1e6 / asked.refresh_hz)
+    period_us = round(1e6 / settings.refresh_hz)
     timing = Timing(period_us, light_delay_us=period_us // 4, light_width_us=period_us // 2)
     backend = None
-    if asked.bus.startswith("virtual:"):
-        from firmware_iface.virtual.served import usb_backend
+    if settings.bus.startswith("virtual:"):
+        from firmware_iface.virtual.remote_hardware import usb_backend
 
-        backend = usb_backend(asked.bus)
-    return open_board(asked.serial or None, backend=backend, timing=timing, timeout_s=asked.timeout_ms / 1000)
+        backend = usb_backend(settings.bus)
+    return open_board(
+        settings.serial or None, backend=backend, timing=timing, timeout_s=settings.timeout_ms / 1000
+    )
 
 
 def open_lasers(table: Table) -> Any:
-    """The lasers of a configuration's [lasers], dark. Raises InputError or DeviceError."""
-    from firmware_iface.lasers import open_lasers as open_board
-    from firmware_iface.virtual.served import i2c_bus
+    """The lasers of a configuration's [lasers], dark.
 
-    asked = _lasers_table(table)
-    bus = i2c_bus(asked.bus) if asked.bus.startswith("virtual:") else asked.bus
+    Raises
+    ------
+    InputError
+        Where the table is wrong.
+    DeviceError
+        Where the board cannot be opened.
+    """
+    from firmware_iface.lasers import open_lasers as open_board
+    from firmware_iface.virtual.remote_hardware import i2c_bus
+
+    settings = _lasers_table(table)
+    bus = i2c_bus(settings.bus) if settings.bus.startswith("virtual:") else settings.bus
     return open_board(bus, laser_channels(table))
 
 
 def open_camera(table: Table) -> Any:
-    """The camera of a configuration's [camera]. Raises InputError or DeviceError."""
-    asked = _camera_table(table)
-    if asked.kind not in KINDS["camera"]:
-        return open_own(asked.kind, "camera", exposure_ms=asked.exposure_ms)
-    if asked.kind == "oak":
+    """The camera of a configuration's [camera].
+
+    Raises
+    ------
+    InputError
+        Where the table is wrong.
+    DeviceError
+        Where the camera cannot be opened.
+    """
+    settings = _camera_table(table)
+    if settings.kind not in KINDS["camera"]:
+        return open_own(settings.kind, "camera", exposure_ms=settings.exposure_ms)
+    if settings.kind == "oak":
         from firmware_iface.camera import open_oak
 
         return open_oak(
-            asked.address,
-            frames_per_s=asked.frames_per_s,
-            exposure_ms=asked.exposure_ms,
+            settings.address,
+            frames_per_s=settings.frames_per_s,
+            exposure_ms=settings.exposure_ms,
             timeout_s=1.0,
             starved_s=0.5,
         )
-    from firmware_iface.virtual.served import RemoteCamera, reach
+    from firmware_iface.virtual.remote_hardware import RemoteCamera, reach
 
-    camera = RemoteCamera(reach(asked.bus))
-    camera.exposure_ms = asked.exposure_ms
+    camera = RemoteCamera(reach(settings.bus))
+    camera.exposure_ms = settings.exposure_ms
     return camera
 
 
 def check_tables(tables: Mapping[str, Table]) -> None:
-    """Check [panel], [lasers] and [camera] without opening anything. Raises InputError."""
+    """Check [panel], [lasers] and [camera] without opening anything.
+
+    Raises
+    ------
+    InputError
+        Where a table is wrong, or the power exceeds the Class 1 budget.
+    """
     if "panel" in tables:
         _panel_table(tables["panel"])
     if "camera" in tables:
@@ -154,9 +187,9 @@ def check_tables(tables: Mapping[str, Table]) -> None:
 
 
 def _panel_table(table: Table) -> PanelTable:
-    asked = read_table(PanelTable, table, "[panel]")
-    check_kind(asked.kind, "panel", KINDS["panel"])
-    return asked
+    settings = read_table(PanelTable, table, "[panel]")
+    check_kind(settings.kind, "panel", KINDS["panel"])
+    return settings
 
 
 def _lasers_table(table: Table) -> LasersTable:
@@ -164,13 +197,13 @@ def _lasers_table(table: Table) -> LasersTable:
 
 
 def _camera_table(table: Table) -> CameraTable:
-    asked = read_table(CameraTable, table, "[camera]")
-    check_kind(asked.kind, "camera", KINDS["camera"])
-    return asked
+    settings = read_table(CameraTable, table, "[camera]")
+    check_kind(settings.kind, "camera", KINDS["camera"])
+    return settings
 
 
 def _check_budget(table: Table) -> None:
-    """Without a prediction, all light counts as one spot, and must be within the budget as it is."""
+    """Check the power: without a prediction, all light counts as one spot."""
     power, lasers = laser_power(table), {laser.name: laser for laser in laser_channels(table)}
     if mrad_per_pixel(table):
         return
@@ -186,12 +219,18 @@ def _check_budget(table: Table) -> None:
 
 
 def mrad_per_pixel(table: Table) -> float:
-    """The angle of a pixel at the eye, for the prediction of bright spots; 0: none is to be made."""
+    """The angle of a pixel at the eye, mrad, for the prediction of bright spots; 0: no prediction."""
     return _lasers_table(table).mrad_per_pixel
 
 
 def laser_channels(table: Table) -> Sequence[LaserChannel]:
-    """The lasers of [[lasers.channel]]; on an emulated board, where there are none, its own. Raises InputError."""
+    """The lasers of [[lasers.channel]]; on an emulated board, where there are none, its own.
+
+    Raises
+    ------
+    InputError
+        Where there is none, or a value is out of range.
+    """
     given = table.get("channel", [])
     if not given and str(table.get("bus")).startswith("virtual:"):
         return VIRTUAL_CHANNELS
@@ -201,7 +240,13 @@ def laser_channels(table: Table) -> Sequence[LaserChannel]:
 
 
 def laser_power(table: Table) -> dict[str, float]:
-    """The power of each channel while something is shown, fraction of full. Raises InputError."""
+    """The power of each channel while something is shown, fraction of full.
+
+    Raises
+    ------
+    InputError
+        Where none is given, a channel is unknown or a value is no fraction.
+    """
     power = table.get("power")
     if not isinstance(power, Mapping) or not power:
         raise InputError(

@@ -22,7 +22,13 @@ _FLOAT, _DOUBLE, _VARIANT = 0x88, 0x89, 0xB8
 
 
 def encode(value: Any) -> bytes:
-    """One value as bytes; TypeError for what the format has no place for."""
+    """One value as bytes.
+
+    Raises
+    ------
+    TypeError
+        For a type or a number that the format cannot hold.
+    """
     match value:
         case Encoded():
             return bytes(value)
@@ -46,7 +52,13 @@ def encode(value: Any) -> bytes:
 
 
 def decode(data: bytes) -> Any:
-    """The value that `data` begins with; ValueError where it is not one."""
+    """The value that `data` begins with.
+
+    Raises
+    ------
+    ValueError
+        Where the data is no value.
+    """
     try:
         return _decode(data, 0, 0)[0]
     except (IndexError, struct.error, UnicodeDecodeError) as error:

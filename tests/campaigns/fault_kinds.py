@@ -1,4 +1,4 @@
-"""Every kind of fault of the campaign: how it is made, whether it demands darkness, how it is over."""
+"""Every kind of fault of the campaign: how it is made, whether it requires darkness, how it ends."""
 
 from __future__ import annotations
 
@@ -15,11 +15,22 @@ from tests.campaigns.lane import Lane
 
 
 @dataclass(frozen=True)
-class Kind:
+class FaultKind:
     """A kind of fault.
 
-    weight : how often, of all. strike : makes the fault; when, monotonic s. dark : light is not allowed after it.
-    heal : takes the cause away, or nothing. shows : the program goes on showing meanwhile (it would wait otherwise).
+    Attributes
+    ----------
+    name : str
+    weight : float
+        Relative frequency.
+    strike : callable
+        Makes the fault; returns the time, monotonic s.
+    dark : bool
+        Light is not allowed after it.
+    heal : callable
+        Removes the cause.
+    shows : bool
+        Whether the program shows pictures meanwhile; it would wait otherwise.
     """
 
     name: str
@@ -30,20 +41,20 @@ class Kind:
     shows: bool = True
 
 
-def _part(part: str, kind: str, weight: float, dark: bool, count: int | None = 1) -> Kind:
+def _part(part: str, kind: str, weight: float, dark: bool, count: int | None = 1) -> FaultKind:
     lasting = count is None
-    return Kind(
+    return FaultKind(
         f"{part} {kind.replace('_', ' ')}",
         weight,
         lambda lane: lane.remote.break_part(part, kind, count),
         dark,
-        lambda lane: lane.remote.mend(part),
+        lambda lane: lane.remote.repair(part),
         shows=not (part == "lasers" and lasting),
     )
 
 
-def _board(name: str, setting: str, bad: object, good: object, weight: float) -> Kind:
-    return Kind(
+def _board(name: str, setting: str, bad: object, good: object, weight: float) -> FaultKind:
+    return FaultKind(
         name,
         weight,
         lambda lane: lane.remote.set_to(setting, bad),
@@ -52,8 +63,8 @@ def _board(name: str, setting: str, bad: object, good: object, weight: float) ->
     )
 
 
-def _child(name: str, what: str, number: int, weight: float, dark: bool) -> Kind:
-    return Kind(
+def _child(name: str, what: str, number: int, weight: float, dark: bool) -> FaultKind:
+    return FaultKind(
         what,
         weight,
         lambda lane: lane.signal_child(name, number),
@@ -82,7 +93,7 @@ def _service_killed(lane: Lane) -> float:
 def _service_again(lane: Lane) -> None:
     try:
         lane.client.status()
-    except OSError:  # so the program knows that what was on its way is lost
+    except OSError:  # so the program knows that its frames under way are lost
         lane.service = lane.start_service()
         lane.reconnect()
         return
@@ -95,19 +106,18 @@ def _service_stopped(lane: Lane) -> float:
     return at
 
 
-def _program_gone(lane: Lane) -> float:
+def _program_ends(lane: Lane) -> float:
     at = time.monotonic()
     lane.client.close()
     return at
 
 
 def _program_pauses(lane: Lane) -> float:
-    at = time.monotonic()
-    return at
+    return time.monotonic()
 
 
 def _torn_slot(lane: Lane) -> float:
-    """A slot that is not what End announced: the frame must come back as torn, and never be seen."""
+    """A slot that is not what End announced: the frame must be reported as torn, and never be displayed."""
     client, at = lane.client, time.monotonic()
     timing = client.wait()
     client._ask(Begin(timing.frame), Done)
@@ -127,7 +137,7 @@ def _torn_slot(lane: Lane) -> float:
 
 
 def _garbage_program(lane: Lane) -> float:
-    """Another program says what is no message."""
+    """Another program sends bytes that are no message."""
     at = time.monotonic()
     with suppress(OSError):
         knock(lane.file, [b"\xff" * 64, PROTOCOL.pack(Begin(1), 1)[:-1]])
@@ -162,9 +172,9 @@ KINDS = (
     _child("camera", "camera process killed", signal.SIGKILL, 0.7, True),
     _child("solver", "solver process killed", signal.SIGKILL, 0.7, True),
     _child("solver", "solver process hangs", signal.SIGSTOP, 1, True),
-    Kind("late frames", 3, _late_solver, False),
-    Kind("service killed", 0.4, _service_killed, True, _service_again, shows=False),
-    Kind(
+    FaultKind("late frames", 3, _late_solver, False),
+    FaultKind("service killed", 0.4, _service_killed, True, _service_again, shows=False),
+    FaultKind(
         "service hangs",
         1,
         _service_stopped,
@@ -172,8 +182,8 @@ KINDS = (
         lambda lane: lane.service.send_signal(signal.SIGCONT),
         shows=False,
     ),
-    Kind("program gone", 1, _program_gone, True, Lane.reconnect, shows=False),
-    Kind("program pauses", 2, _program_pauses, True, shows=False),
-    Kind("torn slot", 3, _torn_slot, False),
-    Kind("garbage from a program", 3, _garbage_program, False),
+    FaultKind("program gone", 1, _program_ends, True, Lane.reconnect, shows=False),
+    FaultKind("program pauses", 2, _program_pauses, True, shows=False),
+    FaultKind("torn slot", 3, _torn_slot, False),
+    FaultKind("garbage from a program", 3, _garbage_program, False),
 )

@@ -1,7 +1,7 @@
 """Emulated adapters behind the real smbus2: its ioctls, decoded from its own C structures.
 
-`attach` makes an ordinary file that stands for /dev/i2c-N. smbus2 opens and closes it as it would the device;
-only `ioctl` on that file, and on no other, ends here instead of in the kernel.
+`attach` makes an ordinary file in place of /dev/i2c-N. smbus2 opens and closes it as it would the device; only
+`ioctl` on such a file is handled here instead of in the kernel.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ import os
 import tempfile
 from typing import Any
 
-from firmware_iface.virtual.i2c.bus import Message, Transferring, failure
-from firmware_iface.virtual.i2c.pec import pec
+from firmware_iface.virtual.i2c.bus import Message, MessageBus, failure
+from firmware_iface.virtual.i2c.packet_error_code import pec
 
 # I2C | SMBUS_EMUL (which has PEC), as <linux/i2c.h> numbers them
 FUNCTIONS = 0x00000001 | 0x0EFF0008
 
-_nodes: dict[tuple[int, int], Transferring] = {}  # (device, inode) of an open node: its bus
+_nodes: dict[tuple[int, int], MessageBus] = {}  # (device, inode) of an open node: its bus
 _opened: dict[tuple[int, int, int], list[int]] = {}  # (fd, device, inode): [address, PEC on]
 _paths: dict[str, tuple[int, int]] = {}
 
 
-def attach(bus: Transferring) -> str:
+def attach(bus: MessageBus) -> str:
     """A path that smbus2.SMBus can open, with `bus` behind it. `detach` removes it."""
     _patch()
     fd, path = tempfile.mkstemp(prefix="i2c-")
@@ -37,11 +37,11 @@ def attach(bus: Transferring) -> str:
 def detach(path: str) -> None:
     """Remove a node; transfers on files that are still open then fail with ENODEV."""
     inode = _paths.pop(path)
-    _nodes[inode] = _Removed()
+    _nodes[inode] = _MissingBus()
     os.unlink(path)
 
 
-class _Removed:
+class _MissingBus:
     def transfer(self, messages: object) -> list[bytes]:
         raise failure(errno.ENODEV)
 
@@ -66,7 +66,7 @@ def _patch() -> None:
     library.ioctl = ioctl
 
 
-def _ioctl(library: Any, bus: Transferring, state: list[int], request: int, argument: Any) -> int:
+def _ioctl(library: Any, bus: MessageBus, state: list[int], request: int, argument: Any) -> int:
     if request in (library.I2C_SLAVE, library.I2C_SLAVE_FORCE):
         state[0] = int(argument)
     elif request == library.I2C_PEC:
@@ -103,7 +103,7 @@ I2C_BLOCK_DATA = 8
 
 
 def _smbus(
-    bus: Transferring, address: int, with_pec: bool, read: int, command: int, size: int, union: Any
+    bus: MessageBus, address: int, with_pec: bool, read: int, command: int, size: int, union: Any
 ) -> bytes:
     """One SMBus call as the kernel composes it from I2C messages; the bytes for the caller's union."""
     start, given = bytes([command]), bytes(union)
@@ -135,12 +135,12 @@ def _smbus(
     raise failure(errno.EOPNOTSUPP)
 
 
-def _send(bus: Transferring, address: int, data: bytes, with_pec: bool) -> None:
+def _send(bus: MessageBus, address: int, data: bytes, with_pec: bool) -> None:
     check = bytes([pec(bytes([address << 1]) + data)]) if with_pec else b""
     bus.transfer([Message(address, data + check)])
 
 
-def _receive(bus: Transferring, address: int, written: bytes, length: int, with_pec: bool) -> bytes:
+def _receive(bus: MessageBus, address: int, written: bytes, length: int, with_pec: bool) -> bytes:
     messages = [Message(address, written)] if written else []
     messages.append(Message(address, None, length + with_pec))
     reply = bus.transfer(messages)[0]

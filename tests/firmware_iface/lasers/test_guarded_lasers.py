@@ -16,9 +16,9 @@ import pytest
 
 from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
 from firmware_iface.lasers import VIRTUAL_CHANNELS
-from firmware_iface.lasers.guard import GuardedLasers, open_guarded_lasers
+from firmware_iface.lasers.guarded_lasers import GuardedLasers, open_guarded_lasers
 from firmware_iface.virtual.i2c import LaserBoard
-from firmware_iface.virtual.i2c.server import BoardServer
+from firmware_iface.virtual.i2c.bus_server import BoardServer
 
 ROOT = Path(__file__).resolve().parents[3]
 SLACK_S = 0.15  # for a machine that has other work: everything is measured by the clock on the wall
@@ -27,7 +27,7 @@ CLIENT = """
 import os, sys, time
 from firmware_iface.lasers import VIRTUAL_CHANNELS, open_lasers
 from firmware_iface.errors import DeviceError
-from firmware_iface.lasers.guard import open_guarded_lasers
+from firmware_iface.lasers.guarded_lasers import open_guarded_lasers
 opened = {open}(sys.argv[1], VIRTUAL_CHANNELS)
 with opened as lasers:
     for attempt in range(5):  # a machine that stalls for 100 ms may need more than one
@@ -218,7 +218,7 @@ def test_the_interface_of_the_lasers(light: Light, lasers: GuardedLasers) -> Non
 
 
 @patient
-def test_a_fault_is_told_with_the_next_heartbeat_and_until_it_is_armed_again(
+def test_a_fault_is_reported_with_the_next_heartbeat_and_until_it_is_armed_again(
     light: Light, lasers: GuardedLasers
 ) -> None:
     lasers.arm()

@@ -1,4 +1,4 @@
-"""What the ADS1115 and the TMP117 share: a pointer to 16-bit registers, high byte first."""
+"""Access to 16-bit registers by a pointer, high byte first, as the ADS1115 and the TMP117 have it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class WordRegisters(ABC):
 
     @abstractmethod
     def store(self, register: int, value: int) -> None:
-        """Take what is written."""
+        """Store a written value."""
 
     def write(self, data: bytes) -> None:
         """Pointer alone, or pointer and value."""
@@ -26,7 +26,7 @@ class WordRegisters(ABC):
             self.store(self._pointer, int.from_bytes(data[1:3], "big"))
 
     def read(self, length: int) -> bytes:
-        """The register, again and again."""
+        """The register, repeated."""
         value = self.fetch(self._pointer).to_bytes(2, "big") if length else b""
         return (value * (length // 2 + 1))[:length]
 

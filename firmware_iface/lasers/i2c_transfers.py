@@ -1,4 +1,4 @@
-"""The one way to the bus: plain I2C messages through smbus2. Every driver of a part uses these three functions."""
+"""I2C transfers through smbus2: open a bus, write, read. Every driver of a part uses these functions."""
 
 from __future__ import annotations
 
@@ -9,28 +9,52 @@ if TYPE_CHECKING:
 
 
 def open_bus(bus: str) -> SMBus:
-    """Open a bus: a path such as `/dev/i2c-1`, or `virtual:SOCKET` for a board that another process emulates.
+    """Open a bus.
 
-    Raises OSError where it cannot be opened.
+    Parameters
+    ----------
+    bus : str
+        A path such as `/dev/i2c-1`, or `virtual:SOCKET` for a board that another process emulates.
+
+    Returns
+    -------
+    smbus2.SMBus
+
+    Raises
+    ------
+    OSError
+        Where it cannot be opened.
     """
     from smbus2 import SMBus
 
     if bus.startswith("virtual:"):
-        from firmware_iface.virtual.i2c.server import connect
+        from firmware_iface.virtual.i2c.bus_server import connect
 
         return SMBus(connect(bus.removeprefix("virtual:")))
     return SMBus(bus)
 
 
 def write(bus: SMBus, address: int, data: bytes) -> None:
-    """One write message. Raises OSError where the part or the adapter does not do it."""
+    """One write message.
+
+    Raises
+    ------
+    OSError
+        Where the part or the adapter does not carry it out.
+    """
     from smbus2 import i2c_msg
 
     bus.i2c_rdwr(i2c_msg.write(address, data))
 
 
 def read(bus: SMBus, address: int, length: int) -> bytes:
-    """One read message of `length` bytes. Raises OSError."""
+    """One read message of `length` bytes.
+
+    Raises
+    ------
+    OSError
+        As `write` does.
+    """
     from smbus2 import i2c_msg
 
     message = i2c_msg.read(address, length)
@@ -39,7 +63,13 @@ def read(bus: SMBus, address: int, length: int) -> bytes:
 
 
 def write_read(bus: SMBus, address: int, data: bytes, length: int) -> bytes:
-    """Write, then read `length` bytes after a repeated START. Raises OSError."""
+    """Write, then read `length` bytes after a repeated START.
+
+    Raises
+    ------
+    OSError
+        As `write` does.
+    """
     from smbus2 import i2c_msg
 
     message = i2c_msg.read(address, length)

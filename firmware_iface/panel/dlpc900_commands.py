@@ -1,0 +1,204 @@
+"""Commands of TI's DLPC900 controller over USB HID (DLPU018): power, mode, pattern table, status, errors."""
+
+from __future__ import annotations
+
+import struct
+import time
+from contextlib import suppress
+from typing import Any
+
+from firmware_iface.errors import DeviceError, InputError
+from firmware_iface.usb_link import UsbLink
+
+OUT, IN, PACKET = 0x01, 0x81, 64
+LOCK_S = 2.0  # until the receiver has found the picture
+LONGEST_DATA = 504  # bytes of an image in one command
+
+POWER, LAST_ERROR, FIRMWARE = 0x0200, 0x0100, 0x0206
+HARDWARE_STATUS, SYSTEM_STATUS, MAIN_STATUS = 0x1A0A, 0x1A0B, 0x1A0C
+RECEIVER, SOURCE = 0x1A01, 0x1A00
+DISPLAY_MODE, PATTERN, PATTERN_LUT, PATTERN_ENTRY = 0x1A1B, 0x1A24, 0x1A31, 0x1A34
+IMAGE_BEGIN, IMAGE_DATA = (0x1A2A, 0x1A2C), (0x1A2B, 0x1A2D)  # primary and secondary controller
+STOP, START = 0, 2
+POWERS = ("normal", "standby")
+RECEIVERS = ("off", "hdmi", "displayport")
+MODES = ("video", "pre-stored", "video-pattern", "on-the-fly")
+ERRORS = {
+    1: "a batch file's checksum is wrong",
+    3: "it does not know the command",
+    5: "the command is not for this mode",
+    6: "a parameter is wrong",
+    9: "the image's compression is wrong",
+    14: "the exposure is out of range",
+    15: "the pattern's number is out of range",
+    255: "an internal error",
+}
+HARDWARE = {2: "DMD reset controller error", 3: "forced swap", 6: "sequence aborted", 7: "sequence error"}
+
+_READ, _REPLY, _FAILED = 0x80, 0x40, 0x20
+
+
+class Dlpc900Control:
+    """Commands of the controller: power, mode, status, errors.
+
+    Parameters
+    ----------
+    link : UsbLink
+    receiver : str
+        "hdmi" or "displayport" for frames that come over that link, "off" for uploaded ones.
+    exposure_us : int, µs
+        Exposure of each pattern.
+    """
+
+    def __init__(self, link: UsbLink, receiver: str = "off", exposure_us: int = 16667) -> None:
+        if receiver not in RECEIVERS:
+            raise InputError(f"there is no receiver '{receiver}'; use one of {', '.join(RECEIVERS)}.")
+        if not 105 <= exposure_us < 1 << 24:
+            raise InputError(f"exposure {exposure_us} µs is out of range; give 105 to {(1 << 24) - 1} µs.")
+        self.name = link.name
+        self._link = link
+        self._receiver, self._exposure_us = receiver, exposure_us
+        self._sequence = 0
+        self._incomplete = False  # whether the last command broke off
+        link.opened.append(self._set_up)
+        link.open()
+
+    def command(self, code: int, data: bytes = b"", read: bool = False) -> bytes:
+        """Send one command and return the data of its answer; DeviceError with the controller's reason."""
+        flags, answer = self._exchange(code, data, read)
+        if flags & _FAILED:
+            number = self._exchange(LAST_ERROR, b"", True)[1][:1]
+            reason = ERRORS.get(number[0], f"error {number[0]}") if number else "it gives no reason"
+            raise DeviceError(f"{self.name} refused command 0x{code:04x}: {reason}.")
+        return answer
+
+    def set_power(self, power: str) -> None:
+        """Switch to one of POWERS."""
+        if power not in POWERS:
+            raise InputError(f"{self.name} has no power mode '{power}'; use one of {', '.join(POWERS)}.")
+        self.command(POWER, bytes([POWERS.index(power)]))
+
+    def set_mode(self, mode: str) -> None:
+        """Go into one of MODES; patterns are stopped first, as the controller demands."""
+        if mode not in MODES:
+            raise InputError(f"{self.name} has no mode '{mode}'; use one of {', '.join(MODES)}.")
+        self.command(PATTERN, bytes([STOP]))
+        self.command(DISPLAY_MODE, bytes([MODES.index(mode)]))
+        end = time.monotonic() + 2
+        while self._byte(DISPLAY_MODE) != MODES.index(mode):
+            if time.monotonic() > end:
+                raise DeviceError(f"{self.name} does not go into mode {mode}; power it off and on.")
+            time.sleep(0.05)
+
+    def define(self, count: int) -> None:
+        """Fill the pattern table with the first `count` bits of image 0, in turn and without end."""
+        exposure = self._exposure_us.to_bytes(3, "little")
+        for position in range(count):
+            # one bit, all colours, cleared afterwards; no trigger, no dark time; image 0, this bit position
+            line = struct.pack("<H", position) + exposure + struct.pack("<B3xBH", 0x71, 0, position << 11)
+            self.command(PATTERN_ENTRY, line)
+        self.command(PATTERN_LUT, struct.pack("<HI", count, 0))
+
+    def status(self) -> dict[str, Any]:
+        hardware, system, main = map(self._byte, (HARDWARE_STATUS, SYSTEM_STATUS, MAIN_STATUS))
+        mode, power = self._byte(DISPLAY_MODE), self._byte(POWER)
+        faults = [text for bit, text in HARDWARE.items() if hardware >> bit & 1]
+        faults += [] if hardware & 1 else ["not initialised"]
+        faults += [] if system & 1 else ["memory test failed"]
+        return {
+            "mode": MODES[mode] if mode < len(MODES) else f"mode {mode}",
+            "power": POWERS[power] if power < len(POWERS) else f"power {power}",
+            "parked": bool(main & 1),
+            "running": bool(main & 2),
+            "frozen": bool(main & 4),
+            "video_locked": bool(main & 8),
+            "faults": faults,
+            "firmware": self.command(FIRMWARE, read=True)[1:].split(b"\0")[0].decode("ascii", "replace"),
+        }
+
+    def close(self) -> None:
+        if self._link.is_open:
+            with suppress(DeviceError):  # an unplugged controller shows nothing
+                self.command(PATTERN, bytes([STOP]))
+                self.set_power("standby")
+        self._link.close()
+
+    def _set_up(self) -> None:
+        self.set_power("normal")
+        if self._receiver == "off":
+            self.set_mode("on-the-fly")
+            return
+        self.command(RECEIVER, bytes([RECEIVERS.index(self._receiver)]))
+        self.command(SOURCE, bytes([0]))  # the receiver's parallel port, 24 bits
+        self.set_mode("video")
+        end = time.monotonic() + LOCK_S
+        while not self._byte(MAIN_STATUS) & 8:
+            if time.monotonic() > end:
+                raise DeviceError(f"{self.name} detects no picture on {self._receiver}; check that cable.")
+            time.sleep(0.05)
+        self.set_mode("video-pattern")
+        self.define(1)
+        self.command(PATTERN, bytes([START]))
+
+    def _byte(self, code: int) -> int:
+        answer = self.command(code, read=True)
+        if not answer:
+            raise DeviceError(f"{self.name} answered command 0x{code:04x} with nothing; power it off and on.")
+        return answer[0]
+
+    def _exchange(self, code: int, data: bytes, read: bool) -> tuple[int, bytes]:
+        """One command and its answer, (flags, data); answers to earlier commands that come late are dropped."""
+        self._link.open()  # before the number is drawn: setting up has commands of its own
+        if self._incomplete:
+            self._recover()
+        self._sequence = sequence = (self._sequence + 1) % 256
+        flags = _REPLY | (_READ if read else 0)
+        packets = struct.pack("<BBHH", flags, sequence, len(data) + 2, code) + data
+        self._incomplete = True
+        for at in range(0, len(packets), PACKET):
+            self._link.write(OUT, packets[at : at + PACKET].ljust(PACKET, b"\0"))
+        for _ in range(8):
+            try:
+                flags, answered, answer = parse_answer(self._link.read(IN, PACKET))
+            except ValueError as error:
+                raise DeviceError(f"{self.name}: {error}; check its cable.") from error
+            if answered == sequence:
+                self._incomplete = False
+                return flags, answer
+        raise DeviceError(f"{self.name} answers other commands than were sent; power it off and on.")
+
+    def _recover(self) -> None:
+        """After an incomplete command: send empty commands for the bytes that the controller may still wait for.
+
+        They request no answer and do nothing. Not tried on hardware.
+        """
+        self._link.clear_halt(OUT)
+        self._link.clear_halt(IN)
+        for _ in range(LONGEST_DATA // PACKET + 2):
+            self._link.write(OUT, bytes(PACKET))
+        self._incomplete = False
+
+
+def parse_answer(packet: bytes) -> tuple[int, int, bytes]:
+    """Parse an answer.
+
+    Parameters
+    ----------
+    packet : bytes
+
+    Returns
+    -------
+    (int, int, bytes)
+        Flags, sequence, data.
+
+    Raises
+    ------
+    ValueError
+        Where the packet is no answer.
+    """
+    if len(packet) < 4:
+        raise ValueError(f"its answer has {len(packet)} bytes")
+    flags, sequence, length = struct.unpack_from("<BBH", packet)
+    if length > len(packet) - 4:
+        raise ValueError(f"its answer claims {length} bytes and has {len(packet) - 4}")
+    return flags, sequence, packet[4 : 4 + length]
