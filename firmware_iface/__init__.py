@@ -1,6 +1,7 @@
-"""Devices of a holographic headset, and virtual ones with a simulated bench behind them.
+"""Devices of a holographic display: panel (spatial light modulator, SLM), lasers and camera, real or simulated.
 
-At most numpy is imported here; vendor libraries are imported when a device is opened.
+At most numpy is imported here; vendor libraries are imported when a device is opened. firmware_iface/README.md is its
+guide.
 """
 
 from firmware_iface.errors import DeviceError, DeviceGoneError, InputError

@@ -71,7 +71,7 @@ def _draw_ladder(axes: Axes, ladder: Sequence[Mapping[str, Any]], noise: float) 
     rows = np.arange(len(ladder))
     axes.plot(errors, rows, marker="o")
     for error, row in zip(errors, rows, strict=True):
-        axes.annotate(percent(error), (error, float(row)), xytext=(8, -3), textcoords="offset points")
+        axes.annotate(percent(error), (error, float(row)), xytext=(8, 5), textcoords="offset points")
     if noise > 0:
         axes.axvline(noise, color="tab:orange", linestyle="--", label=f"camera noise {percent(noise)}")
         axes.legend(loc="lower right", frameon=False)
