@@ -298,6 +298,12 @@ def test_the_readme_is_short_and_leads_to_every_guide() -> None:
     assert guides <= linked
 
 
+def test_make_quick_names_tests_that_exist() -> None:
+    named = re.findall(r"tests/\S+\.py", (ROOT / "Makefile").read_text(encoding="utf-8"))
+    assert len(named) > 10
+    assert [name for name in named if not (ROOT / name).is_file()] == []
+
+
 def test_the_table_of_effects_is_the_catalogue() -> None:
     from trainer.effects.catalogue import BUILT_IN
 

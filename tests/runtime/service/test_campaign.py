@@ -34,7 +34,7 @@ def test_every_kind_of_fault_is_survived() -> None:
     assert set(found["by_kind"]) == {kind.name for kind in KINDS}
     assert found["torn_frames"] == found["lost_without_error"] == found["not_recovered"] == 0
     assert found["dark_required"] > 30
-    # a machine that does other things may steal some milliseconds; the table in the README is of a quiet one
+    # a machine that does other things may steal some milliseconds; the table in the guide is of a quiet one
     assert found["dark_in_time"] >= 0.9 * found["dark_required"]
     assert found["worst_dark_ms"] < 900
 
