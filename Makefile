@@ -5,11 +5,30 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 NEW_ENOUGH := -c 'import sys; sys.exit(sys.version_info < (3, 11))'
 
-.PHONY: help install test demo benchmark clean
+# What `make quick` tests: files in which nothing fits a model, trains a network or starts a service.
+QUICK := tests/test_layers.py \
+	tests/test_guides.py \
+	tests/firmware_iface/test_dlpc900.py \
+	tests/firmware_iface/test_panel_board.py \
+	tests/firmware_iface/test_virtual_description.py \
+	tests/runtime/test_bundle.py \
+	tests/runtime/test_files.py \
+	tests/runtime/test_lightpath.py \
+	tests/runtime/test_propagation.py \
+	tests/runtime/test_solver.py \
+	tests/runtime/test_targets.py \
+	tests/trainer/test_captures.py \
+	tests/trainer/test_check.py \
+	tests/trainer/test_conventions.py \
+	tests/trainer/test_model_file.py \
+	tests/trainer/test_verdict.py
+
+.PHONY: help install quick test demo benchmark clean
 
 help:
 	@echo "make install     make .venv and install hololoop in it, with exactly the versions of constraints.txt"
-	@echo "make test        check the style and the types, run the tests"
+	@echo "make quick       check the style and the types, run the tests that take about a minute"
+	@echo "make test        check the style and the types, run all tests"
 	@echo "make demo        the whole loop on a virtual bench"
 	@echo "make benchmark   measure how fast the trainer is on this machine (hololoop-runtime benchmark: the solver)"
 	@echo "make clean       remove caches and build products (.venv stays; rm -r .venv removes it)"
@@ -37,6 +56,11 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install -c constraints.txt torch==2.13.0
 	$(BIN)/python -m pip install -c constraints.txt -e '.[trainer,cluster,camera,dev]'
 	@touch $@
+
+quick: install
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest --deselect tests/test_guides.py::test_what_a_guide_shows_works $(QUICK)
 
 test: install
 	$(BIN)/ruff check .

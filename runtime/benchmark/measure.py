@@ -31,7 +31,7 @@ PICTURES = ("astronaut", "coffee")
 TUNED = {
     "rate": 0.1,
     "betas": (0.9, 0.999),
-}  # the best of a search over rates 0.01 to 0.2 and betas, see the README
+}  # the best of a search over rates 0.01 to 0.2 and betas, see the guide
 SOLVERS: dict[str, tuple[str, dict[str, Any], int]] = {
     "bfgs": ("bfgs", {}, 50),
     "adam": ("adam", {}, 100),

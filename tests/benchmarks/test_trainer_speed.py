@@ -1,4 +1,6 @@
-"""How fast the trainer is: `pytest tests/benchmarks -s` prints the README's table. Nothing here fails for being slow.
+"""How fast the trainer is: `pytest tests/benchmarks -s` prints the table of trainer/README.md.
+
+Nothing here fails for being slow.
 
 Figures are medians, and ratios within this one run.
 """

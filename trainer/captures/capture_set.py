@@ -17,6 +17,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from functools import lru_cache
+from html import escape
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -151,6 +152,19 @@ class CaptureSet:
         gain = self.bench.camera.counts_per_electron
         floor = (self.bench.camera.read_noise_e * gain) ** 2 + 1 / 12
         return np.maximum(signal, 0) * gain + floor
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        planes = ", ".join(f"{z:g} mm" for z in self.planes)
+        rows = (
+            ("folder", str(self.folder)),
+            ("bench", self.bench.name),
+            ("captures", str(len(self))),
+            ("channels", ", ".join(self.channels)),
+            ("planes", planes),
+            ("panel", f"{self.bench.panel.height} x {self.bench.panel.width}"),
+        )
+        return "<table>" + "".join(f"<tr><th>{k}</th><td>{escape(v)}</td></tr>" for k, v in rows) + "</table>"
 
     def content_hash(self) -> str:
         """SHA-256, hex, over bench.toml, captures.csv, and the ids and files of this selection.

@@ -32,6 +32,7 @@ DARK_SHARE = 1e-3  # of the pixels that lie well below the stated black level
 NOISE_FACTOR = 2.25  # measured noise variance over the camera model's
 FEWEST_PATTERNS = 4
 MOST_PAIRS = 12  # pairs of repeated pictures that are compared
+MISREAD = ("convention", "left_justified", "bit_depth")  # kinds of problem after which every number is wrong
 
 Progress = Callable[[int, int], None]
 

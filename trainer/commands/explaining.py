@@ -38,8 +38,6 @@ from trainer.commands.showing import (
 if TYPE_CHECKING:
     from trainer.model.model import Model
 
-MISREAD = ("convention", "left_justified", "bit_depth")  # problems after which every number is wrong
-
 
 def run_check(args: Namespace, screen: Screen) -> Result:
     """Everything that is wrong with a capture set."""
@@ -192,7 +190,7 @@ def refuse_misread(folder: Path, screen: Screen) -> None:
     """Raises InputError where the captures are not what bench.toml says, so that every number would be wrong; a
     line on stderr for other errors of the set, which may be what is to be explained.
     """
-    from trainer.captures.check_set import check_captures
+    from trainer.captures.check_set import MISREAD, check_captures
 
     errors = [p for p in check_captures(folder) if p.severity == "error"]
     for problem in errors:
