@@ -305,7 +305,7 @@ def test_make_quick_names_tests_that_exist() -> None:
 
 
 def test_the_table_of_effects_is_the_catalogue() -> None:
-    from trainer.effects.catalogue import BUILT_IN
+    from trainer.effects.effect_catalogue import BUILT_IN
 
     text = (ROOT / "trainer/effects/README.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `(\w+)` \| (\w+) \|.*\| (\w+) \|$", text, re.MULTILINE)

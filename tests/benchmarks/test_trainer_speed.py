@@ -28,7 +28,7 @@ from trainer.captures.capture_set import read_captures
 from trainer.captures.held_out import capture_roles
 from trainer.diagnosis.explain import add_from
 from trainer.diagnosis.screen import screen_batches
-from trainer.effects import effect_catalogue as catalogue
+from trainer.effects import catalogue
 from trainer.fitting.gains import with_gains
 from trainer.fitting.gauss_newton import fit
 from trainer.fitting.predictor import evaluate_captures

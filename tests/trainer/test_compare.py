@@ -16,7 +16,7 @@ from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet, read_captures, write_captures
 from trainer.diagnosis import compare as module
 from trainer.diagnosis.compare import Comparison, compare
-from trainer.effects import effect_catalogue as catalogue
+from trainer.effects import catalogue
 from trainer.fitting.gains import with_gains
 from trainer.fitting.predictor import evaluate
 from trainer.model.model import Model, absent

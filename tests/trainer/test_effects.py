@@ -16,7 +16,7 @@ from runtime.lightpath.fft import irfft2
 from runtime.lightpath.grid import FINE
 from runtime.lightpath.legendre import legendre_maps
 from trainer.captures.bench_file import Bench, read_bench
-from trainer.effects import effect_catalogue as catalogue
+from trainer.effects import catalogue
 from trainer.effects.zernike import zernike_maps
 from trainer.model.model import EffectInstance, Model, absent
 from trainer.model.model_stages import scene_for, stages_for

@@ -19,7 +19,7 @@ from runtime.lightpath.light_path import irradiance, panel_phase
 from tests.trainer.test_effects import HEIGHT, PLANE, WIDTH, bench, gray, present
 from tests.trainer.test_networks import disturbed
 from trainer.captures.capture_set import read_captures, write_captures
-from trainer.effects import effect_catalogue as catalogue
+from trainer.effects import catalogue
 from trainer.model.export import export_bundle
 from trainer.model.model import EffectInstance, Model, absent
 from trainer.model.model_stages import scene_for, stages_for

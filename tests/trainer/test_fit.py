@@ -10,7 +10,7 @@ import pytest
 from runtime.lightpath.legendre import legendre_count
 from trainer.captures.batches import Batch, load
 from trainer.captures.capture_set import CaptureSet
-from trainer.effects import effect_catalogue as catalogue
+from trainer.effects import catalogue
 from trainer.effects.testing import captures_with, placed
 from trainer.fitting.gauss_newton import fit
 from trainer.fitting.refit import least_for_order, raise_order

@@ -12,7 +12,7 @@ import pytest
 
 from tests.trainer.hidden import captured, ran
 from trainer.cli import main
-from trainer.effects import effect_catalogue as catalogue
+from trainer.effects import catalogue
 
 ALONE = {name: f'kind = "{name}"' for name in catalogue()}
 

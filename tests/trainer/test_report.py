@@ -16,7 +16,7 @@ from PIL import Image
 
 from firmware_iface.errors import InputError
 from trainer.captures.bench_file import read_bench
-from trainer.effects import effect_catalogue as catalogue
+from trainer.effects import catalogue
 from trainer.formatting import measured, number, parameters, percent
 from trainer.model.model import Model, absent
 from trainer.report import write_report

@@ -23,7 +23,7 @@ from trainer.captures.batches import load_batch
 from trainer.captures.bench_file import read_bench
 from trainer.captures.capture_set import CaptureSet, read_captures, write_captures
 from trainer.cli import main
-from trainer.effects import effect_catalogue as catalogue
+from trainer.effects import catalogue
 from trainer.fitting.gains import with_gains
 from trainer.model.model import Model, absent
 from trainer.model.model_stages import scene_for, stages_for

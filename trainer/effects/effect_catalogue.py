@@ -40,6 +40,13 @@ BUILT_IN: tuple[Effect, ...] = (
     sensor.ghost,
 )
 
+FORMER_MODULES = {
+    "trainer.pull": "trainer.effects.pull",
+    "trainer.stages": "trainer.prediction.stages",
+    "trainer.starts": "trainer.effects.starts",
+    "trainer.scene": "trainer.model.model_stages",
+}
+
 Catalogue = dict[str, Effect]
 
 _files: dict[
@@ -93,7 +100,7 @@ def _of_entry_point(point: EntryPoint) -> list[Effect]:
     try:
         loaded = point.load()
     except Exception as error:
-        raise InputError(f"{where} cannot be loaded ({error}): mend or uninstall its package") from error
+        raise InputError(f"{where} cannot be loaded ({error}): repair or uninstall its package") from error
     found = _defined_in(loaded) if isinstance(loaded, ModuleType) else loaded
     if isinstance(found, Effect):
         return [found]
@@ -119,6 +126,8 @@ def load_effects(path: Path) -> list[Effect]:
         raise InputError(f"effects file {path} is not a Python file: its name must end in .py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
+    for former, present in FORMER_MODULES.items():  # files that were written for version 0.1 import these
+        sys.modules.setdefault(former, importlib.import_module(present))
     try:
         spec.loader.exec_module(module)
     except InputError as error:

@@ -19,7 +19,7 @@ from trainer.diagnosis.compare import compare as compare_model
 from trainer.diagnosis.diagnose import diagnose as diagnose_model
 from trainer.diagnosis.explain import explain as explain_captures
 from trainer.diagnosis.verdict import Thresholds
-from trainer.effects.catalogue import Catalogue, catalogue
+from trainer.effects.effect_catalogue import Catalogue, catalogue
 from trainer.fitting.pool import open_pool
 from trainer.model import model_file
 from trainer.model.export import export_bundle

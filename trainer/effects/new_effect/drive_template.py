@@ -14,9 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from trainer.effects import Parameter, effect
-from trainer.effects.pull import pull, waves
-from trainer.prediction.stages import Drive
+from trainer.effects import Drive, Parameter, effect, pull, waves
 
 
 def _starts(evidence: Sequence[Any]) -> list[dict[str, float]]:

@@ -13,9 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from trainer.effects import Parameter, effect
-from trainer.effects.pull import pull, waves
-from trainer.prediction.stages import Panel
+from trainer.effects import Panel, Parameter, effect, pull, waves
 
 
 def _starts(evidence: Sequence[Any]) -> list[dict[str, float]]:

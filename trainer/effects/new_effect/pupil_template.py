@@ -15,10 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from trainer.effects import Parameter, effect
-from trainer.effects.pull import pull
-from trainer.model.model_stages import stages_for
-from trainer.prediction.stages import Pupil
+from trainer.effects import Parameter, Pupil, bare_stages, effect, pull
 
 
 def _absorbing(pupil: Pupil, transmission: Tensor) -> Pupil:
@@ -29,7 +26,7 @@ def _absorbing(pupil: Pupil, transmission: Tensor) -> Pupil:
 
 def _starts(evidence: Sequence[Any]) -> list[dict[str, float]]:
     """Where fits start: the darkest row and the darkest column that the residual asks for."""
-    pupil = stages_for(evidence[0].scene, ()).pupil
+    pupil = bare_stages(evidence[0].scene).pupil
     v, u = pupil.v.reshape(-1).numpy(), pupil.u.reshape(-1).numpy()
     asked = pull(evidence, "pupil", lambda p, m: _absorbing(p, 1 + m), (v.size, u.size))
     found = []
