@@ -12,8 +12,8 @@ from firmware_iface.errors import InputError
 from runtime.solver import quality
 from trainer.captures.capture_set import read_captures
 from trainer.commands.making import first_free
-from trainer.cycle.demo import run_demo
-from trainer.report.displayed import Shown, display_section, with_display
+from trainer.cycle.demo_run import run_demo
+from trainer.report.display_section import DisplayedPicture, display_section, with_display
 
 
 def test_a_folder_that_holds_something_is_refused(tmp_path: Path) -> None:
@@ -28,7 +28,7 @@ def test_a_folder_that_holds_something_is_refused(tmp_path: Path) -> None:
 def test_the_display_goes_to_the_end_of_the_reports_main_part() -> None:
     target = np.random.default_rng(0).random((12, 16))
     light = 3 * target**1.1
-    shown = [Shown("a <picture>", target, {"before": light}, {"before": quality(light, target)})]
+    shown = [DisplayedPicture("a <picture>", target, {"before": light}, {"before": quality(light, target)})]
     html = with_display("<main><p>x</p></main></body>", shown, "better & better")
     assert html.index("<p>x</p>") < html.index("<section>") < html.index("</main>")
     assert "better &amp; better" in html

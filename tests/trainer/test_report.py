@@ -20,7 +20,7 @@ from trainer.effects import catalogue
 from trainer.formatting import measured, number, parameters, percent
 from trainer.model.model import Model, absent
 from trainer.report import write_report
-from trainer.report.array_pictures import blocks, draw, place
+from trainer.report.heat_maps import blocks, heat_map, place
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 HOSTILE = '<script>alert("1")</script> & $\\frac{a}$'
@@ -273,7 +273,7 @@ def test_large_pictures_become_small_and_keep_a_detail(tmp_path: Path) -> None:
 
 def test_colours_span_the_stated_scale() -> None:
     array = np.array([[-5.0, 0.0], [5.0, np.nan]])
-    drawn = draw("t", array, "alt", "counts", (-5.0, 5.0), "RdBu_r")
+    drawn = heat_map("t", array, "alt", "counts", (-5.0, 5.0), "RdBu_r")
     data = base64.b64decode(drawn.uri.split(",")[1])
     pixels = np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(int)
     assert pixels[0, 0, 2] > pixels[0, 0, 0] and pixels[1, 0, 0] > pixels[1, 0, 2]

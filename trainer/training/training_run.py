@@ -1,16 +1,16 @@
-"""Training: one process or many, resumable to the bit.
+"""A training run: one process or many, resumable to the bit.
 
-Everything that a step depends on is the seed, its number and the state of networks and optimisers; the order of
-pictures and every random draw are functions of the first two. So a run that was killed goes on from its last
-checkpoint as if nothing had happened. Many processes are started by torchrun or `fabric run`; each sees its own
-pictures, and gradients are averaged.
+A step depends on nothing but the seed, its number and the state of networks and optimisers. The order of pictures and
+every random draw are functions of the seed and the step's number. So a run that was killed continues from its last
+checkpoint to the same result. torchrun or `fabric run` starts several processes; each has its own pictures, and
+gradients are averaged.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -21,24 +21,23 @@ from torch import Tensor
 from firmware_iface.errors import InputError
 from runtime.bundle.whole_files import whole_file
 from trainer.networks.approximator import Approximator, Architecture, write_approximator
-from trainer.networks.perceptual import Lpips, Perceptual
-from trainer.training.likeness import evaluate
-from trainer.training.losses import Critic, content_loss, matching_loss, picture, where_seen
-from trainer.training.pairs import Pairs
+from trainer.networks.discriminator import Discriminator
+from trainer.training.image_metrics import prediction_metrics
+from trainer.training.losses import (
+    adversarial_loss,
+    content_loss,
+    display_encoded,
+    matching_loss,
+    where_measured,
+)
+from trainer.training.pretrained_networks import PretrainedNetworks
 from trainer.training.recipe import Recipe
+from trainer.training.training_pairs import Pairs
 
 CHECKPOINT, NETWORK = "checkpoint.pt", "network.safetensors"
-EVERY = 500  # steps between checkpoints and looks at the held-out pictures
+EVERY = 500  # steps between checkpoints and between metrics of the held-out pictures
 
 Progress = Callable[[int, float], None]
-
-
-@dataclass(frozen=True)
-class Judges:
-    """Networks of others, from the user's weight files: the perceptual loss and the LPIPS of the curves."""
-
-    perceptual: Perceptual | None = None
-    lpips: Lpips | None = None
 
 
 def train(
@@ -47,7 +46,7 @@ def train(
     steps: int,
     folder: Path | None = None,
     held_out: Pairs | None = None,
-    judges: Judges | None = None,
+    pretrained: PretrainedNetworks | None = None,
     start: Approximator | None = None,
     teacher: Approximator | None = None,
     seed: int = 0,
@@ -55,27 +54,67 @@ def train(
     about: dict[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> Approximator:
-    """A network trained on pairs, on the CPU, in evaluation mode.
+    """A network trained on pairs.
 
-    folder : for checkpoints, TensorBoard's curves and the network; a run that is there with the same settings goes on
-    held_out : pairs that the curves are measured on. start : weights to begin from; none: the identity
-    teacher : a network whose results stand in for the measurements (distillation). about : goes into the file
-    progress : called with the step and its content loss
-    Raises InputError where the folder holds a run with other settings, or nothing is left to learn from.
+    Parameters
+    ----------
+    pairs : Pairs
+        What is learned from.
+    recipe : Recipe
+        Architecture, losses and optimiser.
+    steps : int
+        Total steps of the run.
+    folder : path or None
+        For checkpoints, TensorBoard's curves and the network; a run in it with the same settings is continued.
+    held_out : Pairs or None
+        Pairs for the curves of metrics.
+    pretrained : PretrainedNetworks or None
+        The perceptual loss and LPIPS.
+    start : Approximator or None
+        Weights to begin from; None is the identity.
+    teacher : Approximator or None
+        A network whose results are learned instead of the measurements (distillation).
+    seed : int
+        Of weights, order and dropout.
+    every : int
+        Steps between checkpoints.
+    about : dict or None
+        Written into the network's file.
+    progress : callable or None
+        Called with the step and its content loss.
+
+    Returns
+    -------
+    Approximator
+        On the CPU, in evaluation mode.
+
+    Raises
+    ------
+    InputError
+        Where the folder holds a run with other settings, or no loss is left.
     """
-    return _Run(
-        pairs, recipe, steps, folder, judges or Judges(), start, teacher, seed, every, about or {}
-    ).go(held_out, progress)
+    return _TrainingRun(
+        pairs,
+        recipe,
+        steps,
+        folder,
+        pretrained or PretrainedNetworks(),
+        start,
+        teacher,
+        seed,
+        every,
+        about or {},
+    ).run(held_out, progress)
 
 
 def processes() -> tuple[int, int]:
-    """(processes on this machine, machines), as torchrun says; one and one without it."""
+    """(processes on this machine, machines), from the environment of torchrun; one and one without it."""
     local = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     return local, max(1, int(os.environ.get("WORLD_SIZE", "1")) // local)
 
 
-class _Run:
-    """One training: networks, optimisers, and the step that it has come to."""
+class _TrainingRun:
+    """Networks, optimisers, and the current step."""
 
     def __init__(
         self,
@@ -83,7 +122,7 @@ class _Run:
         recipe: Recipe,
         steps: int,
         folder: Path | None,
-        judges: Judges,
+        pretrained: PretrainedNetworks,
         start: Approximator | None,
         teacher: Approximator | None,
         seed: int,
@@ -93,7 +132,7 @@ class _Run:
         from lightning_fabric import Fabric
         from lightning_fabric.loggers import TensorBoardLogger
 
-        if recipe.l1 == recipe.adversarial == recipe.matching == 0 and judges.perceptual is None:
+        if recipe.l1 == recipe.adversarial == recipe.matching == 0 and pretrained.perceptual is None:
             raise InputError(
                 "every loss has weight zero or lacks its weights file: give --l1 or another a weight"
             )
@@ -111,19 +150,25 @@ class _Run:
             self.fabric.launch()
         self.pairs, self.recipe, self.steps = pairs, recipe, steps
         self.folder, self.every, self.seed, self.about = folder, every, seed, about
-        self.judges = judges
-        if judges.perceptual is not None:  # LPIPS stays where pictures are compared, on the CPU
-            judges.perceptual.to(self.fabric.device)
+        self.pretrained = pretrained
+        if pretrained.perceptual is not None:  # LPIPS stays where pictures are compared, on the CPU
+            pretrained.perceptual.to(self.fabric.device)
         self.teacher = None if teacher is None else teacher.to(self.fabric.device)
         torch.manual_seed(seed)
         network = Approximator(Architecture(recipe.network, recipe.filters, pairs.shape, pairs.colours))
         if start is not None:
             network.load_state_dict(start.state_dict())
-        self.network, self.network_steps = self._set_up(network)
-        self.critic: Any = None
+        self.network, self.network_adam = self._set_up(network)
+        self.discriminator: Any = None
         if recipe.adversarial or recipe.matching:
-            self.critic, self.critic_steps = self._set_up(
-                Critic(recipe, recipe.filters, pairs.colours)  # as wide as the generator, as published
+            self.discriminator, self.discriminator_adam = self._set_up(
+                Discriminator(
+                    recipe.filters,  # as wide as the generator (Chakravarthula et al. 2020)
+                    pairs.colours,
+                    recipe.receptive,
+                    recipe.critics,
+                    recipe.conditional,
+                )
             )
         self.step = 0
 
@@ -131,7 +176,7 @@ class _Run:
         adam = torch.optim.Adam(module.parameters(), lr=self.recipe.rate, betas=self.recipe.betas)
         return self.fabric.setup(module, adam)
 
-    def go(self, held_out: Pairs | None, progress: Progress | None) -> Approximator:
+    def run(self, held_out: Pairs | None, progress: Progress | None) -> Approximator:
         self._resume()
         while self.step < self.steps:
             losses = self._step()
@@ -139,7 +184,7 @@ class _Run:
             if progress:
                 progress(self.step, losses["content"])
             if self.folder and (self.step % self.every == 0 or self.step == self.steps):
-                self._look(losses, held_out)
+                self._log(losses, held_out)
                 self._save()
         network: Approximator = self._bare(self.network).cpu().eval()
         if self.folder and self.fabric.is_global_zero:
@@ -147,42 +192,42 @@ class _Run:
         return network
 
     def _step(self) -> dict[str, float]:
-        """One update of the critic, if there is one, and one of the network, on one picture a process."""
+        """One update of the discriminator, if there is one, and one of the network, on one picture for each process."""
         torch.manual_seed(_draw(self.seed, 1, self.step))  # dropout
         given, target, weight = self._picture()
         self.network.train()
         white, recipe = self.pairs.white, self.recipe
-        ours = where_seen(picture(self.network(given), white), target, weight)
-        condition = picture(given, white)
+        ours = where_measured(display_encoded(self.network(given), white), target, weight)
+        condition = display_encoded(given, white)
         losses: dict[str, Tensor] = {}
-        if self.critic is not None:
-            self._bare(self.critic).requires_grad_(True)
-            both = self.critic(torch.cat((target, ours.detach())), torch.cat((condition, condition)))
+        if self.discriminator is not None:
+            self._bare(self.discriminator).requires_grad_(True)
+            both = self.discriminator(torch.cat((target, ours.detach())), torch.cat((condition, condition)))
             real, fake = ([[f[half] for f in scale] for scale in both] for half in (slice(0, 1), slice(1, 2)))
-            loss = (self._judge(real, True) + self._judge(fake, False)) / 2
-            self.critic_steps.zero_grad()
+            loss = (self._adversarial(real, True) + self._adversarial(fake, False)) / 2
+            self.discriminator_adam.zero_grad()
             self.fabric.backward(loss)
-            self.critic_steps.step()
+            self.discriminator_adam.step()
             losses["critic"] = loss
-        content = content_loss(recipe, ours, target, self.judges.perceptual)
+        content = content_loss(recipe, ours, target, self.pretrained.perceptual)
         losses["content"], total = content, content
-        if self.critic is not None:
-            # The bare module: what distributes it would wait for gradients of its weights.
-            critic = self._bare(self.critic).requires_grad_(False)
+        if self.discriminator is not None:
+            # The bare module: the distributed wrapper would wait for gradients of its weights.
+            discriminator = self._bare(self.discriminator).requires_grad_(False)
             with self.fabric.autocast():
-                judged = critic(ours, condition)
-                losses["adversarial"] = self._judge(judged, True)
+                judged = discriminator(ours, condition)
+                losses["adversarial"] = self._adversarial(judged, True)
                 total = total + recipe.adversarial * losses["adversarial"]
                 if recipe.matching:
-                    losses["matching"] = matching_loss(judged, critic(target, condition))
+                    losses["matching"] = matching_loss(judged, discriminator(target, condition))
                     total = total + recipe.matching * losses["matching"]
-        self.network_steps.zero_grad()
+        self.network_adam.zero_grad()
         self.fabric.backward(total)
-        self.network_steps.step()
+        self.network_adam.step()
         return {name: float(value.detach()) for name, value in losses.items()}
 
-    def _judge(self, judged: Any, real: bool) -> Tensor:
-        return self._bare(self.critic).loss(judged, real)
+    def _adversarial(self, judged: Any, real: bool) -> Tensor:
+        return adversarial_loss(judged, real, self.recipe.cross_entropy)
 
     def _picture(self) -> tuple[Tensor, Tensor, Tensor]:
         """Input irradiance, target picture and weight of this step's picture, [1, C, H, W]."""
@@ -195,28 +240,30 @@ class _Run:
         if self.teacher is not None:
             with torch.no_grad():
                 measured = self.teacher(given)
-        return given, picture(measured, self.pairs.white), weight
+        return given, display_encoded(measured, self.pairs.white), weight
 
-    def _look(self, losses: dict[str, float], held_out: Pairs | None) -> None:
-        """Curves for TensorBoard."""
+    def _log(self, losses: dict[str, float], held_out: Pairs | None) -> None:
+        """Log losses and held-out metrics for TensorBoard."""
         if not self.fabric.is_global_zero:
             return
         values = {f"loss/{name}": value for name, value in losses.items()}
         if held_out is not None:
             network = self._bare(self.network).eval()
-            found = evaluate(held_out, lambda x: network(x.to(self.fabric.device)), self.judges.lpips)
+            metrics = prediction_metrics(
+                held_out, lambda x: network(x.to(self.fabric.device)), self.pretrained.lpips
+            )
             values |= {
-                f"heldout/{name}": value for name, value in found.as_json().items() if value is not None
+                f"heldout/{name}": value for name, value in metrics.as_json().items() if value is not None
             }
         self.fabric.log_dict(values, step=self.step)
 
     def _settings(self) -> dict[str, Any]:
-        """What a run that is gone on with must have in common with this one."""
+        """Settings that a continued run must share with this one."""
         return {
             "recipe": asdict(self.recipe),
             "seed": self.seed,
             "shape": list(self.pairs.shape),
-            "perceptual": self.judges.perceptual is not None,
+            "perceptual": self.pretrained.perceptual is not None,
             "teacher": self.teacher is not None,
             **self.about,
         }
@@ -225,7 +272,7 @@ class _Run:
         if self.folder is None or not self.fabric.is_global_zero:
             return
         state = {"settings": self._settings(), "step": self.step}
-        for name, module, adam in self._parts():
+        for name, module, adam in self._modules():
             state[name] = {"weights": self._bare(module).state_dict(), "adam": adam.state_dict()}
         with whole_file(self.folder / CHECKPOINT) as file:
             torch.save(state, file)
@@ -246,18 +293,22 @@ class _Run:
             raise InputError(
                 f"{self.folder} holds a training with another {wrong}: give another --out, or remove the folder"
             )
-        for name, module, adam in self._parts():
+        for name, module, adam in self._modules():
             self._bare(module).load_state_dict(state[name]["weights"])
             adam.load_state_dict(state[name]["adam"])
         self.step = int(state["step"])
 
-    def _parts(self) -> list[tuple[str, Any, Any]]:
-        parts = [("network", self.network, self.network_steps)]
-        return parts if self.critic is None else [*parts, ("critic", self.critic, self.critic_steps)]
+    def _modules(self) -> list[tuple[str, Any, Any]]:
+        parts = [("network", self.network, self.network_adam)]
+        return (
+            parts
+            if self.discriminator is None
+            else [*parts, ("critic", self.discriminator, self.discriminator_adam)]
+        )
 
     @staticmethod
     def _bare(module: Any) -> Any:
-        """The module without what distributes it."""
+        """The module without its distributed wrapper."""
         return module.module if hasattr(module, "module") else module
 
 
@@ -266,7 +317,7 @@ def _draw(*entropy: int) -> int:
 
 
 def _plain(value: Any) -> Any:
-    """With tuples as lists, as they are read back."""
+    """With tuples as lists, as a checkpoint gives them back."""
     if isinstance(value, dict):
         return {k: _plain(v) for k, v in value.items()}
     return [_plain(v) for v in value] if isinstance(value, (list, tuple)) else value
