@@ -19,9 +19,10 @@ from runtime.solver import Solver, quality
 from tests.trainer.fringed_bench import SHAPE, captured, fringed, known
 from tests.trainer.test_networks import disturbed
 from trainer.cli import main
+from trainer.cycle.cycle_settings import CycleSettings
 from trainer.cycle.evaluation import DISPLAY, PREDICTION, run_evaluation
 from trainer.cycle.evaluation_bench import EvaluationSizes
-from trainer.cycle.hardware_in_the_loop import CycleSettings, CycleState, run_cycle
+from trainer.cycle.hardware_in_the_loop import CycleState, run_cycle
 from trainer.cycle.phase_retrieval import (
     METHODS,
     beside_zero_order,
@@ -29,7 +30,7 @@ from trainer.cycle.phase_retrieval import (
     retrieve,
     torch_path,
 )
-from trainer.cycle.show_on_bench import BenchDisplay, with_iris_beside
+from trainer.cycle.show_on_bench import BenchDisplay, headset_beside_zero_order
 from trainer.cycle.target_pictures import TargetVolume, in_depth, photographs
 from trainer.model.export import export_bundle
 from trainer.model.model import Model
@@ -180,7 +181,7 @@ def test_every_named_method_shows_the_picture() -> None:
     picture = photographs(("astronaut",), bench)[0]
     found = {}
     for method in METHODS:
-        shown = with_iris_beside(headset) if method == "wirtinger_no_zero_order" else headset
+        shown = headset_beside_zero_order(headset) if method == "wirtinger_no_zero_order" else headset
         gray = retrieve(Model(bench), picture, method, None, 40)[0]
         assert gray.dtype == np.uint8 and gray.shape == SHAPE
         found[method] = quality(shown.true_irradiance(gray, "green"), picture.irradiance[0, 0]).psnr_db
@@ -196,7 +197,7 @@ def test_the_ramp_and_the_iris_keep_the_zero_order_out() -> None:
     headset = VirtualHeadset(description.resized(*SHAPE, 6.0))
     chequer = (128 * (np.indices(SHAPE).sum(0) % 2)).astype(np.uint8)  # diffracts to the band's corners
     straight, beside = (
-        h.true_irradiance(chequer, "green").mean() for h in (headset, with_iris_beside(headset))
+        h.true_irradiance(chequer, "green").mean() for h in (headset, headset_beside_zero_order(headset))
     )
     assert beside < 0.02 * straight
     model = beside_zero_order(Model(known(headset)))

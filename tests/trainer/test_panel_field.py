@@ -22,7 +22,8 @@ from trainer.captures.acquire import capture_set
 from trainer.captures.bench_file import Bench
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.open_bench import nominal_bench
-from trainer.cycle.hardware_in_the_loop import CycleSettings, run_cycle
+from trainer.cycle.cycle_settings import CycleSettings
+from trainer.cycle.hardware_in_the_loop import run_cycle
 from trainer.cycle.phase_retrieval import retrieve
 from trainer.cycle.show_on_bench import BenchDisplay
 from trainer.cycle.target_pictures import photographs

@@ -31,6 +31,7 @@ from trainer.networks.discriminator import Discriminator
 from trainer.networks.pretrained_features import ALEXNET, VGG19
 from trainer.prediction.scene import scene_for, stages_for
 from trainer.training.camera_to_panel import onto_camera, onto_panel
+from trainer.training.checkpoint import CHECKPOINT
 from trainer.training.image_metrics import image_metrics, noise_floor, prediction_metrics
 from trainer.training.losses import (
     adversarial_loss,
@@ -41,7 +42,7 @@ from trainer.training.losses import (
 )
 from trainer.training.recipe import RECIPES, Recipe, recipe_named
 from trainer.training.training_pairs import measured_on_panel, pairs_of, stacked
-from trainer.training.training_run import CHECKPOINT, NETWORK, train
+from trainer.training.training_run import NETWORK, train
 from trainer.training.training_sets import TrainingSets, training_sets
 
 SMALL = replace(RECIPES["compact"], filters=2)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from trainer.captures.bench_file import Bench
-    from trainer.cycle.hardware_in_the_loop import CycleSettings
+    from trainer.cycle.cycle_settings import CycleSettings
 
 
 def run_loop(args: Namespace, screen: Screen) -> Result:
@@ -38,7 +38,7 @@ def run_loop(args: Namespace, screen: Screen) -> Result:
     from trainer.captures.open_bench import open_bench
     from trainer.cycle.hardware_in_the_loop import run_cycle
     from trainer.cycle.phase_retrieval import beside_zero_order
-    from trainer.cycle.show_on_bench import BenchDisplay, with_iris_beside
+    from trainer.cycle.show_on_bench import BenchDisplay, headset_beside_zero_order
     from trainer.cycle.target_pictures import LEARNED, in_depth, photographs, volumes_of
     from trainer.effects.catalogue import catalogue
     from trainer.model.model import Model
@@ -63,7 +63,7 @@ def run_loop(args: Namespace, screen: Screen) -> Result:
         model = model or Model(bench)
         if args.method == "wirtinger_no_zero_order":
             model = beside_zero_order(model)
-            headset = None if headset is None else with_iris_beside(headset)
+            headset = None if headset is None else headset_beside_zero_order(headset)
         wanted = volumes_of(args.pictures, bench) if args.pictures else photographs(LEARNED, bench)
         if args.planes:
             depths = _depths(args, bench, len(wanted))
@@ -99,7 +99,7 @@ def _depths(args: Namespace, bench: Bench, count: int) -> list[np.ndarray | None
 def _settings(args: Namespace) -> CycleSettings:
     from dataclasses import replace
 
-    from trainer.cycle.hardware_in_the_loop import CycleSettings
+    from trainer.cycle.cycle_settings import CycleSettings
     from trainer.training.pretrained_networks import read_pretrained
     from trainer.training.recipe import recipe_named
 

@@ -17,7 +17,12 @@ from firmware_iface.errors import InputError, nearest
 from trainer.cycle.evaluation_bench import EvaluationBench, EvaluationSizes
 from trainer.cycle.hardware_in_the_loop import run_cycle
 from trainer.cycle.phase_retrieval import retrieve
-from trainer.cycle.show_on_bench import BenchDisplay, display_metrics, pairs_by_pattern, with_iris_beside
+from trainer.cycle.show_on_bench import (
+    BenchDisplay,
+    display_metrics,
+    headset_beside_zero_order,
+    pairs_by_pattern,
+)
 from trainer.cycle.target_pictures import TargetVolume, in_depth
 from trainer.diagnosis.compare import with_gains
 from trainer.model.model import Model
@@ -134,7 +139,9 @@ class _MethodComparison:
             return self._online(method)
         patterns = {one.name: self.solved(method, one) for one in self.on.held_out}
         headset = (
-            with_iris_beside(self.on.headset) if method == "wirtinger_no_zero_order" else self.on.headset
+            headset_beside_zero_order(self.on.headset)
+            if method == "wirtinger_no_zero_order"
+            else self.on.headset
         )
         if headset is self.on.headset:
             self.patterns[method] = patterns

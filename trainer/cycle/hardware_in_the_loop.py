@@ -25,7 +25,8 @@ import torch
 from firmware_iface.errors import InputError
 from runtime.solving import write_gray
 from trainer.captures.capture_set import CaptureSet
-from trainer.cycle.phase_retrieval import ITERATIONS, retrieve
+from trainer.cycle.cycle_settings import CycleSettings
+from trainer.cycle.phase_retrieval import retrieve
 from trainer.cycle.show_on_bench import BenchDisplay, display_metrics, pairs_by_pattern, rows_of
 from trainer.cycle.target_pictures import TargetVolume
 from trainer.diagnosis.compare import with_gains
@@ -34,57 +35,10 @@ from trainer.model.model import Model
 from trainer.model.model_file import write_model
 from trainer.networks.approximator import Approximator, write_approximator
 from trainer.training.image_metrics import ImageMetrics
-from trainer.training.pretrained_networks import PretrainedNetworks
-from trainer.training.recipe import Recipe
 from trainer.training.training_pairs import Pairs, pairs_of
 from trainer.training.training_run import train
 
-GOOD_LPIPS, GOOD_SSIM = 0.5, 0.95  # 1 - LPIPS is from the paper; SSIM is used where LPIPS has no weights
-
 Progress = Callable[[float, str], None]
-
-
-@dataclass(frozen=True)
-class CycleSettings:
-    """How a cycle is run.
-
-    Attributes
-    ----------
-    rounds : int
-        K.
-    recipe : Recipe
-        Of each training.
-    steps : int
-        Of each training; with 0 there is no network.
-    iterations : int
-        Of each phase retrieval.
-    method : str
-        Phase retrieval through the model alone, before there is a D.
-    good : float or None
-        1 - LPIPS (SSIM without weights) above which a picture is left alone; None: GOOD_LPIPS, GOOD_SSIM.
-    online : bool
-        Whether each picture has its own D and its own field.
-    seed : int
-        Of each training.
-    pretrained : PretrainedNetworks
-        The perceptual loss and LPIPS.
-    """
-
-    rounds: int
-    recipe: Recipe
-    steps: int
-    iterations: int = ITERATIONS
-    method: str = "hardware_in_the_loop"
-    good: float | None = None
-    online: bool = False
-    seed: int = 0
-    pretrained: PretrainedNetworks = field(default_factory=PretrainedNetworks)
-
-    def good_enough(self, metrics: ImageMetrics) -> bool:
-        """Whether a picture is left alone."""
-        if metrics.one_minus_lpips is not None:
-            return metrics.one_minus_lpips > (GOOD_LPIPS if self.good is None else self.good)
-        return metrics.ssim > (GOOD_SSIM if self.good is None else self.good)
 
 
 @dataclass

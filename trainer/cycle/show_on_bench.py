@@ -70,7 +70,7 @@ class BenchDisplay:
         return read_captures(folder)
 
 
-def with_iris_beside(headset: Any) -> Any:
+def headset_beside_zero_order(headset: Any) -> Any:
     """A virtual headset whose iris is next to the zero order, as in `beside_zero_order`.
 
     Raises

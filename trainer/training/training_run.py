@@ -8,7 +8,6 @@ gradients are averaged.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -19,9 +18,9 @@ import torch
 from torch import Tensor
 
 from firmware_iface.errors import InputError
-from runtime.bundle.whole_files import whole_file
 from trainer.networks.approximator import Approximator, Architecture, write_approximator
 from trainer.networks.discriminator import Discriminator
+from trainer.training.checkpoint import read_checkpoint, write_checkpoint
 from trainer.training.image_metrics import prediction_metrics
 from trainer.training.losses import (
     adversarial_loss,
@@ -31,10 +30,11 @@ from trainer.training.losses import (
     where_measured,
 )
 from trainer.training.pretrained_networks import PretrainedNetworks
+from trainer.training.processes import launched_fabric
 from trainer.training.recipe import Recipe
 from trainer.training.training_pairs import Pairs
 
-CHECKPOINT, NETWORK = "checkpoint.pt", "network.safetensors"
+NETWORK = "network.safetensors"
 EVERY = 500  # steps between checkpoints and between metrics of the held-out pictures
 
 Progress = Callable[[int, float], None]
@@ -107,12 +107,6 @@ def train(
     ).run(held_out, progress)
 
 
-def processes() -> tuple[int, int]:
-    """(processes on this machine, machines), from the environment of torchrun; one and one without it."""
-    local = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
-    return local, max(1, int(os.environ.get("WORLD_SIZE", "1")) // local)
-
-
 class _TrainingRun:
     """Networks, optimisers, and the current step."""
 
@@ -129,25 +123,11 @@ class _TrainingRun:
         every: int,
         about: dict[str, Any],
     ) -> None:
-        from lightning_fabric import Fabric
-        from lightning_fabric.loggers import TensorBoardLogger
-
         if recipe.l1 == recipe.adversarial == recipe.matching == 0 and pretrained.perceptual is None:
             raise InputError(
                 "every loss has weight zero or lacks its weights file: give --l1 or another a weight"
             )
-        local, machines = processes()
-        gpu = torch.cuda.is_available()
-        logger = TensorBoardLogger(folder, name="", version="curves") if folder else None
-        self.fabric = Fabric(
-            accelerator="cuda" if gpu else "cpu",
-            devices=local,
-            num_nodes=machines,
-            precision="bf16-mixed" if gpu else "32-true",
-            loggers=logger,
-        )
-        if local * machines > 1:
-            self.fabric.launch()
+        self.fabric = launched_fabric(folder)
         self.pairs, self.recipe, self.steps = pairs, recipe, steps
         self.folder, self.every, self.seed, self.about = folder, every, seed, about
         self.pretrained = pretrained
@@ -271,28 +251,17 @@ class _TrainingRun:
     def _save(self) -> None:
         if self.folder is None or not self.fabric.is_global_zero:
             return
-        state = {"settings": self._settings(), "step": self.step}
+        state: dict[str, Any] = {"step": self.step}
         for name, module, adam in self._modules():
             state[name] = {"weights": self._bare(module).state_dict(), "adam": adam.state_dict()}
-        with whole_file(self.folder / CHECKPOINT) as file:
-            torch.save(state, file)
+        write_checkpoint(self.folder, self._settings(), state)
 
     def _resume(self) -> None:
-        if self.folder is None or not (self.folder / CHECKPOINT).is_file():
+        if self.folder is None:
             return
-        path = self.folder / CHECKPOINT
-        try:
-            state = torch.load(path, map_location=self.fabric.device, weights_only=True)
-            before = state["settings"]
-        except Exception as error:
-            reason = str(error).splitlines()[0][:80] if str(error) else type(error).__name__
-            raise InputError(f"{path} cannot be read ({reason}): remove it or give another --out") from None
-        ours = self._settings()
-        if _plain(before) != _plain(ours):
-            wrong = next(k for k in {**before, **ours} if _plain(before.get(k)) != _plain(ours.get(k)))
-            raise InputError(
-                f"{self.folder} holds a training with another {wrong}: give another --out, or remove the folder"
-            )
+        state = read_checkpoint(self.folder, self._settings(), self.fabric.device)
+        if state is None:
+            return
         for name, module, adam in self._modules():
             self._bare(module).load_state_dict(state[name]["weights"])
             adam.load_state_dict(state[name]["adam"])
@@ -314,10 +283,3 @@ class _TrainingRun:
 
 def _draw(*entropy: int) -> int:
     return int(np.random.SeedSequence(entropy).generate_state(1)[0])
-
-
-def _plain(value: Any) -> Any:
-    """With tuples as lists, as a checkpoint gives them back."""
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    return [_plain(v) for v in value] if isinstance(value, (list, tuple)) else value
