@@ -81,7 +81,7 @@ def test_a_picture_that_is_good_enough_is_left_alone(tmp_path: Path) -> None:
     assert len(cycle.history) == 1 and cycle.network is None
 
 
-def test_recorded_captures_stand_in_for_the_camera(tmp_path: Path) -> None:
+def test_recorded_captures_take_the_place_of_the_camera(tmp_path: Path) -> None:
     """What was recorded is learned from, and the patterns that are left behind show the picture better."""
     captures = captured(tmp_path / "captures", patterns=12)
     model, wanted = Model(captures.bench), photographs(("astronaut",), captures.bench)
@@ -107,8 +107,8 @@ def run_shown(
     from trainer.diagnosis.compare import with_gains
 
     captures = stage.show(patterns, wanted.planes_mm, folder)
-    seen = pairs_by_pattern(captures, with_gains(captures, stage.model, captures.captures))
-    return display_metrics(seen[wanted.name], wanted).psnr_db
+    pairs = pairs_by_pattern(captures, with_gains(captures, stage.model, captures.captures))
+    return display_metrics(pairs[wanted.name], wanted).psnr_db
 
 
 def test_the_headset_shows_better_through_the_exported_network(tmp_path: Path) -> None:
@@ -163,16 +163,16 @@ def light(phase: torch.Tensor, paths: list, network: torch.nn.Module) -> torch.T
 
 
 def scaled(phase, paths, target, weight, network) -> torch.Tensor:  # type: ignore[no-untyped-def]
-    seen = light(phase, paths, network)
-    over = (target.sqrt() * seen.clamp(min=0).sqrt() * weight).sum((0, 2, 3)) / (target * weight).sum(
+    irradiance = light(phase, paths, network)
+    over = (target.sqrt() * irradiance.clamp(min=0).sqrt() * weight).sum((0, 2, 3)) / (target * weight).sum(
         (0, 2, 3)
     )
     return target * over[None, :, None, None] ** 2
 
 
 def penalty_at(phase, paths, target, weight, network) -> torch.Tensor:  # type: ignore[no-untyped-def]
-    seen = light(phase, paths, network)
-    return (weight * ((seen.clamp(min=0) + 1e-3).sqrt() - (target + 1e-3).sqrt()) ** 2).sum()
+    irradiance = light(phase, paths, network)
+    return (weight * ((irradiance.clamp(min=0) + 1e-3).sqrt() - (target + 1e-3).sqrt()) ** 2).sum()
 
 
 def test_every_named_method_shows_the_picture() -> None:
@@ -214,8 +214,8 @@ def test_a_stack_of_planes_shows_each_part_in_its_plane() -> None:
     single = retrieve(Model(bench), replace(flat, planes_mm=(4.0,)), "wirtinger", None, 60)[0]
     far = wanted.weight[1] > 0
     target = flat.irradiance[0, 0]
-    seen = [headset.true_irradiance(gray, "green", 8.0) for gray in (deep, single)]
-    assert quality(seen[0], target, far).psnr_db > quality(seen[1], target, far).psnr_db + 6
+    shown = [headset.true_irradiance(gray, "green", 8.0) for gray in (deep, single)]
+    assert quality(shown[0], target, far).psnr_db > quality(shown[1], target, far).psnr_db + 6
     with pytest.raises(InputError, match="one plane"):
         retrieve(Model(bench), wanted, "gerchberg_saxton")
 

@@ -79,8 +79,8 @@ def test_a_patch_of_the_discriminator_sees_94_pixels(plain: int, side: int) -> N
     picture = torch.rand(1, 1, 256, 256, dtype=torch.float64, requires_grad=True)
     judged = layers(picture)
     judged[0, 0, judged.shape[2] // 2, judged.shape[3] // 2].backward()
-    seen = picture.grad[0, 0].abs() > 0
-    assert (int(seen.any(1).sum()), int(seen.any(0).sum())) == (side, side)
+    support = picture.grad[0, 0].abs() > 0
+    assert (int(support.any(1).sum()), int(support.any(0).sum())) == (side, side)
 
 
 def test_u_net_has_half_the_filters_of_the_original() -> None:

@@ -118,8 +118,8 @@ def test_lpips_is_a_distance(tmp_path: Path, layout: tuple[Layer, ...], widths: 
     only = read_lpips([backbone, heads])
     for head in list(only.heads)[1:]:
         head.zero_()
-    seen = [only.features((2 * x - 1 - only.mean) / only.scale)[0] for x in (first, second)]
-    unit = [torch.nn.functional.normalize(f, dim=1) for f in seen]
+    features = [only.features((2 * x - 1 - only.mean) / only.scale)[0] for x in (first, second)]
+    unit = [torch.nn.functional.normalize(f, dim=1) for f in features]
     expected = ((unit[0] - unit[1]) ** 2 * only.heads[0]).sum(1).mean((1, 2))
     assert torch.allclose(only(first, second), expected, rtol=1e-4)
     with pytest.raises(InputError, match="heads"):

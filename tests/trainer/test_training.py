@@ -116,9 +116,9 @@ def test_a_turned_camera_sees_the_same_pairs(tmp_path: Path) -> None:
     # camera row i, column j looks at panel row 47 - j, column i
     turned["camera"]["homography"] = [[0.0, 1.0, 0.0], [-1.0, 0.0, 47.0], [0.0, 0.0, 1.0]]
     found = []
-    for name, table, seen in (("straight", tables, light), ("turned", turned, np.rot90(light, -1))):
+    for name, table, view in (("straight", tables, light), ("turned", turned, np.rot90(light, -1))):
         quiet = {**table, "camera": {**table["camera"], "read_noise_e": 0, "full_well_e": 1e8}}
-        counts = counted(np.ascontiguousarray(seen), quiet, np.random.default_rng(0))
+        counts = counted(np.ascontiguousarray(view), quiet, np.random.default_rng(0))
         write_captures(tmp_path / name, quiet, [{"gray": gray, "counts": counts, "channel": "green"}])
         captures = read_captures(tmp_path / name)
         model = with_gains(captures, Model(captures.bench), captures.captures)
@@ -283,21 +283,14 @@ def test_a_run_with_other_settings_is_not_continued(sets: TrainingSets, tmp_path
         train(sets.fitted, SMALL, 4, tmp_path)
 
 
+def train_words(captures: CaptureSet, out: Path, *options: str) -> list[str]:
+    """The command line of a small training."""
+    return ["train", str(captures.folder), "--out", str(out), "--filters", "2", *options]
+
+
 def test_the_command(captures: CaptureSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
-    words = [
-        "train",
-        str(captures.folder),
-        "--out",
-        str(out),
-        "--steps",
-        "4",
-        "--every",
-        "2",
-        "--filters",
-        "2",
-        "--json",
-    ]
+    words = train_words(captures, out, "--steps", "4", "--every", "2", "--json")
     assert main(words) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["steps"] == 4
@@ -323,16 +316,7 @@ def test_weights_that_are_named_are_used(
     save_file(random_weights(VGG19), vgg)
     heads = {f"lin{k}.model.1.weight": torch.rand(1, w, 1, 1) for k, w in enumerate((64, 192, 384, 256, 256))}
     save_file(random_weights(ALEXNET) | heads, lpips)
-    words = [
-        "train",
-        str(captures.folder),
-        "--out",
-        str(tmp_path / "run"),
-        "--network",
-        "published",
-        "--filters",
-        "2",
-    ]
+    words = train_words(captures, tmp_path / "run", "--network", "published")
     assert main([*words, "--steps", "1", "--vgg", str(vgg), "--lpips", str(lpips), "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["left_out"] == []
@@ -343,18 +327,7 @@ def test_weights_that_are_named_are_used(
 def test_two_processes_train_one_network(captures: CaptureSet, tmp_path: Path) -> None:
     """The same command under torchrun."""
     out = tmp_path / "run"
-    words = [
-        "train",
-        str(captures.folder),
-        "--out",
-        str(out),
-        "--steps",
-        "4",
-        "--network",
-        "published",
-        "--filters",
-        "2",
-    ]
+    words = train_words(captures, out, "--steps", "4", "--network", "published")
     launcher = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "-m", "trainer.cli"]
     subprocess.run([*launcher, *words], cwd=ROOT, check=True, capture_output=True, timeout=300)
     assert read_approximator(out / NETWORK)[1]["steps"] == 4
