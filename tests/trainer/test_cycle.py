@@ -48,8 +48,8 @@ def cycle_of(headset: VirtualHeadset, folder: Path, count: int = 3, **changed: o
     bench = known(headset)
     settings = CycleSettings(2, COMPACT, 150, iterations=30, good=NEVER)
     names = ("astronaut", "coffee", "rocket", "chelsea")[:count]
-    stage = BenchDisplay(headset, bench, Model(bench))
-    return run_cycle(Model(bench), photographs(names, bench), replace(settings, **changed), folder, stage)
+    display = BenchDisplay(headset, bench, Model(bench))
+    return run_cycle(Model(bench), photographs(names, bench), replace(settings, **changed), folder, display)
 
 
 def psnr(cycle: CycleState, number: int) -> float:
@@ -90,9 +90,9 @@ def test_recorded_captures_take_the_place_of_the_camera(tmp_path: Path) -> None:
     assert cycle.history == [] and cycle.network is not None
     headset = fringed()
     plain = {"astronaut": retrieve(model, wanted[0], "wirtinger", None, 30)}
-    stage = BenchDisplay(headset, captures.bench, model)
+    display = BenchDisplay(headset, captures.bench, model)
     better = [
-        run_shown(stage, patterns, wanted[0], tmp_path / f"{k}")
+        run_shown(display, patterns, wanted[0], tmp_path / f"{k}")
         for k, patterns in enumerate((plain, cycle.patterns))
     ]
     assert better[1] > better[0] + 3
@@ -101,13 +101,13 @@ def test_recorded_captures_take_the_place_of_the_camera(tmp_path: Path) -> None:
 
 
 def run_shown(
-    stage: BenchDisplay, patterns: dict[str, np.ndarray], wanted: TargetVolume, folder: Path
+    display: BenchDisplay, patterns: dict[str, np.ndarray], wanted: TargetVolume, folder: Path
 ) -> float:
     from trainer.cycle.show_on_bench import display_metrics, pairs_by_pattern
     from trainer.diagnosis.compare import with_gains
 
-    captures = stage.show(patterns, wanted.planes_mm, folder)
-    pairs = pairs_by_pattern(captures, with_gains(captures, stage.model, captures.captures))
+    captures = display.show(patterns, wanted.planes_mm, folder)
+    pairs = pairs_by_pattern(captures, with_gains(captures, display.model, captures.captures))
     return display_metrics(pairs[wanted.name], wanted).psnr_db
 
 
@@ -121,10 +121,10 @@ def test_the_headset_shows_better_through_the_exported_network(tmp_path: Path) -
     export_bundle(model, captures, tmp_path / "bundle", network=tmp_path / "run" / NETWORK)
     bundle = read_bundle(tmp_path / "bundle")
     path, wanted = load_light_path(bundle), photographs(("astronaut",), captures.bench)[0]
-    stage, shown = BenchDisplay(fringed(), captures.bench, model), {}
+    display, shown = BenchDisplay(fringed(), captures.bench, model), {}
     for name, d in (("without", None), ("through", approximator_of(bundle, (1, *SHAPE)))):
         gray = Solver(path, approximator=d).solve(wanted.irradiance[0, 0], 40).gray.copy()
-        shown[name] = run_shown(stage, {wanted.name: gray.reshape(1, *SHAPE)}, wanted, tmp_path / name)
+        shown[name] = run_shown(display, {wanted.name: gray.reshape(1, *SHAPE)}, wanted, tmp_path / name)
     assert shown["through"] > shown["without"] + 3
 
 

@@ -168,10 +168,10 @@ def test_online_each_picture_has_its_own_field(striped: CaptureSet, tmp_path: Pa
     """Without a network, round after round from the pattern before; each model can be exported."""
     there = headset("stripes")
     model = learn_field(striped, Model(striped.bench)).model
-    stage = BenchDisplay(there, striped.bench, Model(striped.bench))
+    display = BenchDisplay(there, striped.bench, Model(striped.bench))
     settings = CycleSettings(2, RECIPES["compact"], 0, iterations=60, good=2.0, online=True)
     wanted = photographs(("astronaut",), striped.bench)
-    cycle = run_cycle(model, wanted, settings, tmp_path / "loop", stage)
+    cycle = run_cycle(model, wanted, settings, tmp_path / "loop", display)
     psnr = [one["astronaut"].psnr_db for one in cycle.history]
     assert psnr[2] > psnr[0] + 0.5
     assert cycle.network is None and not cycle.own

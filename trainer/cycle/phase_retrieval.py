@@ -26,7 +26,7 @@ from trainer.cycle.target_pictures import TargetVolume
 from trainer.effects.catalogue import BUILT_IN
 from trainer.model.export import baked_path, told_to_display
 from trainer.model.model import Model, absent
-from trainer.networks.approximator import Approximator, amplitude
+from trainer.networks.approximator import Approximator, penalty
 from trainer.prediction.predict import light_path
 from trainer.prediction.scene import scene_for, stages_of
 
@@ -205,8 +205,7 @@ def loss_of(
         scale = (
             (root * wanted * weight).sum((0, 2, 3)) / (target * weight).sum((0, 2, 3)).clamp(min=1e-12)
         ) ** 2
-        scaled = amplitude(target * scale[None, :, None, None])
-    return (weight * (amplitude(corrected) - scaled) ** 2).sum()
+    return penalty(corrected, target * scale[None, :, None, None], weight)
 
 
 def torch_path(model: Model, channel: str, plane_mm: float, dtype: torch.dtype = torch.float32) -> LightPath:

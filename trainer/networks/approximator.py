@@ -91,10 +91,18 @@ def amplitude(irradiance: Tensor) -> Tensor:
     return torch.sqrt(torch.clamp(irradiance, min=0) + DYNAMIC_RANGE)
 
 
-def penalty(corrected: Tensor, target: Tensor) -> Tensor:
-    """Sum of squared differences of amplitude, which phase retrieval minimises; the target is already scaled."""
+def penalty(corrected: Tensor, target: Tensor, weight: Tensor | float = 1.0) -> Tensor:
+    """Sum of squared differences of amplitude, which phase retrieval minimises.
+
+    Parameters
+    ----------
+    corrected, target : Tensor [..., C, H, W]
+        Irradiance; the target is already scaled to the corrected one.
+    weight : Tensor or float
+        How much a pixel counts.
+    """
     difference = amplitude(corrected) - amplitude(target)
-    return (difference * difference).sum()
+    return (weight * (difference * difference)).sum()
 
 
 def write_approximator(path: Path | str, network: Approximator, about: dict[str, Any]) -> None:
