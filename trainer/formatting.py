@@ -1,4 +1,4 @@
-"""Numbers and parameters as a person reads them."""
+"""Numbers, names and parameters as text for people."""
 
 from __future__ import annotations
 
@@ -9,17 +9,25 @@ from typing import Any
 
 import numpy as np
 
-TERMS = 4  # parameters with more numbers than this are summed up, and listed on demand
+TERMS = 4  # parameters with more numbers than this are summarised, and listed on demand
 UNITLESS = ("1", "")
-# Units at the end of a name in files; others stand there as they are.
+# Units at the end of a name in files; other units stand there unchanged.
 UNIT_SUFFIX = {"1": "", "%": "percent", "pixels": "px", "share of band": "share", "waves": "waves"}
 
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 @dataclass(frozen=True)
-class Shown:
-    """A parameter as it is printed: its name, one line, and every number where the line only sums them up."""
+class ParameterText:
+    """A parameter as it is printed.
+
+    Attributes
+    ----------
+    name, text : str
+        Its name as words, and its value in one line.
+    terms : tuple of str
+        Every number, where the line only summarises them.
+    """
 
     name: str
     text: str
@@ -27,7 +35,7 @@ class Shown:
 
 
 def number(value: Any, digits: int = 3) -> str:
-    """A number with some significant digits; a dash for None or what is not finite."""
+    """A number with some significant digits; a dash for None and for a number that is not finite."""
     if value is None or not math.isfinite(value):
         return "–"
     if value == 0:
@@ -59,13 +67,15 @@ def measured(value: Any, error: Any = None, unit: str = "") -> str:
     return f"{_minus(f'{value:.{places}f}')} ± {error:.{places}f}{tail}"
 
 
-def parameters(given: Any) -> list[Shown]:
+def parameters(given: Any) -> list[ParameterText]:
     """The parameters of an effect, one line each.
 
-    given : {name: {"value", "error", "unit"}}, values being numbers, lists, or {colour: number or list}; or
-        {name: number or list}
+    Parameters
+    ----------
+    given : mapping or None
+        {name: {"value", "error", "unit"}} or {name: value}. A value is a number, a list, or {colour: number or list}.
     """
-    shown = []
+    lines = []
     for name, one in (given or {}).items():
         entry = one if isinstance(one, Mapping) and "value" in one else {"value": one}
         value, error, unit = entry["value"], entry.get("error"), str(entry.get("unit") or "")
@@ -73,12 +83,12 @@ def parameters(given: Any) -> list[Shown]:
         if isinstance(value, Mapping):
             for colour, own in value.items():
                 own_error = error.get(colour) if isinstance(error, Mapping) else None
-                shown.append(_parameter(f"{label}, {colour}", own, own_error, unit))
+                lines.append(_parameter(f"{label}, {colour}", own, own_error, unit))
         elif isinstance(value, int | float | list | tuple | np.ndarray):
-            shown.append(_parameter(label, value, error, unit))
+            lines.append(_parameter(label, value, error, unit))
         elif value is not None:
-            shown.append(Shown(label, str(value)))
-    return shown
+            lines.append(ParameterText(label, str(value)))
+    return lines
 
 
 def _label(name: str, unit: str) -> str:
@@ -87,7 +97,7 @@ def _label(name: str, unit: str) -> str:
     return plain(name.removesuffix(f"_{suffix}") if suffix else name)
 
 
-def _parameter(label: str, value: Any, error: Any, unit: str) -> Shown:
+def _parameter(label: str, value: Any, error: Any, unit: str) -> ParameterText:
     values = np.atleast_1d(np.asarray(value, dtype=float)).ravel()
     errors = np.full(values.shape, np.nan)
     if error is not None:
@@ -96,17 +106,17 @@ def _parameter(label: str, value: Any, error: Any, unit: str) -> Shown:
     terms = [measured(float(v), float(e)) for v, e in zip(values, errors, strict=True)]
     tail = "" if unit in UNITLESS else f" {unit}"
     if len(terms) == 0:
-        return Shown(label, "–")
+        return ParameterText(label, "–")
     if len(terms) <= TERMS:
-        return Shown(label, ", ".join(terms) + tail)
+        return ParameterText(label, ", ".join(terms) + tail)
     largest = int(np.argmax(np.abs(values)))
     size = math.sqrt(float(np.sum(values**2)))
     text = f"{len(terms)} terms, together {number(size)}{tail}; largest, no. {largest + 1}: {terms[largest]}"
-    return Shown(label, text + tail, tuple(terms))
+    return ParameterText(label, text + tail, tuple(terms))
 
 
 def listed(names: Any) -> str:
-    """Names as a sentence has them: a, b and c."""
+    """Names as in a sentence: a, b and c."""
     names = [str(n) for n in names]
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1] if names else ""
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from firmware_iface.errors import InputError
-from tests.trainer.taught import captured
+from tests.trainer.fringed_bench import captured
 from tests.trainer.test_networks import disturbed
 from trainer.captures.capture_set import CaptureSet
 from trainer.cli import main
@@ -18,8 +18,8 @@ from trainer.diagnosis.error_budget import error_budget
 from trainer.model.model import Model
 from trainer.networks.approximator import write_approximator
 from trainer.training.recipe import RECIPES
-from trainer.training.sets import training_sets
-from trainer.training.train import train
+from trainer.training.training_run import train
+from trainer.training.training_sets import training_sets
 
 
 @pytest.fixture(scope="module")

@@ -16,40 +16,48 @@ from runtime.bundle.bundle_folder import read_bundle
 from runtime.bundle.light_path_arrays import load_light_path
 from runtime.networks.onnx_approximator import approximator_of
 from runtime.solver import Solver, quality
-from tests.trainer.taught import SHAPE, captured, fringed, known
+from tests.trainer.fringed_bench import SHAPE, captured, fringed, known
 from tests.trainer.test_networks import disturbed
 from trainer.cli import main
-from trainer.cycle.evaluate import DISPLAY, PREDICTION, Sizes, run_evaluation
-from trainer.cycle.loop import Cycle, Settings, run_cycle
-from trainer.cycle.retrieval import METHODS, Volume, beside_zero_order, loss_of, retrieve, torch_path
-from trainer.cycle.show_on_bench import Stage, with_iris_beside
-from trainer.cycle.test_pictures import in_depth, photographs
+from trainer.cycle.cycle_settings import CycleSettings
+from trainer.cycle.evaluation import DISPLAY, PREDICTION, run_evaluation
+from trainer.cycle.evaluation_bench import EvaluationSizes
+from trainer.cycle.hardware_in_the_loop import CycleState, run_cycle
+from trainer.cycle.phase_retrieval import (
+    METHODS,
+    beside_zero_order,
+    loss_of,
+    retrieve,
+    torch_path,
+)
+from trainer.cycle.show_on_bench import BenchDisplay, headset_beside_zero_order
+from trainer.cycle.target_pictures import TargetVolume, in_depth, photographs
 from trainer.model.export import export_bundle
 from trainer.model.model import Model
 from trainer.networks.approximator import Approximator, Architecture
 from trainer.training.recipe import RECIPES
-from trainer.training.sets import training_sets
-from trainer.training.train import NETWORK, train
+from trainer.training.training_run import NETWORK, train
+from trainer.training.training_sets import training_sets
 
 COMPACT = replace(RECIPES["compact"], filters=2)
-NEVER = 2.0  # no likeness is that good
+NEVER = 2.0  # no picture is that good
 
 
-def cycle_of(headset: VirtualHeadset, folder: Path, count: int = 3, **changed: object) -> Cycle:
+def cycle_of(headset: VirtualHeadset, folder: Path, count: int = 3, **changed: object) -> CycleState:
     """Two rounds on a headset, under the ideal model."""
     bench = known(headset)
-    settings = Settings(2, COMPACT, 150, iterations=30, good=NEVER)
+    settings = CycleSettings(2, COMPACT, 150, iterations=30, good=NEVER)
     names = ("astronaut", "coffee", "rocket", "chelsea")[:count]
-    stage = Stage(headset, bench, Model(bench))
-    return run_cycle(Model(bench), photographs(names, bench), replace(settings, **changed), folder, stage)
+    display = BenchDisplay(headset, bench, Model(bench))
+    return run_cycle(Model(bench), photographs(names, bench), replace(settings, **changed), folder, display)
 
 
-def psnr(cycle: Cycle, number: int) -> float:
+def psnr(cycle: CycleState, number: int) -> float:
     return float(np.mean([one.psnr_db for one in cycle.history[number].values()]))
 
 
-def test_each_round_is_seen_to_be_better_than_none(tmp_path: Path) -> None:
-    """The fringes of the bench go: with nothing learned they cost more than 4 dB."""
+def test_each_round_is_better_than_none(tmp_path: Path) -> None:
+    """The fringes of the bench are corrected: with nothing learned they cost more than 4 dB."""
     cycle = cycle_of(fringed(), tmp_path)
     assert len(cycle.history) == 3
     assert psnr(cycle, 1) > psnr(cycle, 0) + 4
@@ -73,18 +81,18 @@ def test_a_picture_that_is_good_enough_is_left_alone(tmp_path: Path) -> None:
     assert len(cycle.history) == 1 and cycle.network is None
 
 
-def test_recorded_captures_stand_in_for_the_camera(tmp_path: Path) -> None:
+def test_recorded_captures_take_the_place_of_the_camera(tmp_path: Path) -> None:
     """What was recorded is learned from, and the patterns that are left behind show the picture better."""
     captures = captured(tmp_path / "captures", patterns=12)
     model, wanted = Model(captures.bench), photographs(("astronaut",), captures.bench)
-    settings = Settings(1, COMPACT, 150, iterations=30)
+    settings = CycleSettings(1, COMPACT, 150, iterations=30)
     cycle = run_cycle(model, wanted, settings, tmp_path / "loop", None, [captures])
     assert cycle.history == [] and cycle.network is not None
     headset = fringed()
     plain = {"astronaut": retrieve(model, wanted[0], "wirtinger", None, 30)}
-    stage = Stage(headset, captures.bench, model)
+    display = BenchDisplay(headset, captures.bench, model)
     better = [
-        run_shown(stage, patterns, wanted[0], tmp_path / f"{k}")
+        run_shown(display, patterns, wanted[0], tmp_path / f"{k}")
         for k, patterns in enumerate((plain, cycle.patterns))
     ]
     assert better[1] > better[0] + 3
@@ -92,17 +100,19 @@ def test_recorded_captures_stand_in_for_the_camera(tmp_path: Path) -> None:
         run_cycle(model, wanted, replace(settings, rounds=2), tmp_path / "more", None, [captures])
 
 
-def run_shown(stage: Stage, patterns: dict[str, np.ndarray], wanted: Volume, folder: Path) -> float:
-    from trainer.cycle.show_on_bench import display_likeness, seen_pairs
-    from trainer.fitting.gains import with_gains
+def run_shown(
+    display: BenchDisplay, patterns: dict[str, np.ndarray], wanted: TargetVolume, folder: Path
+) -> float:
+    from trainer.cycle.show_on_bench import display_metrics, pairs_by_pattern
+    from trainer.diagnosis.compare import with_gains
 
-    captures = stage.show(patterns, wanted.planes_mm, folder)
-    seen = seen_pairs(captures, with_gains(captures, stage.model, captures.captures))
-    return display_likeness(seen[wanted.name], wanted).psnr_db
+    captures = display.show(patterns, wanted.planes_mm, folder)
+    pairs = pairs_by_pattern(captures, with_gains(captures, display.model, captures.captures))
+    return display_metrics(pairs[wanted.name], wanted).psnr_db
 
 
 def test_the_headset_shows_better_through_the_exported_network(tmp_path: Path) -> None:
-    """Trained, exported as ONNX, and looked through by the headset's own solver, without torch: seen by the camera."""
+    """A network is trained, exported as ONNX and used by the headset's own solver without torch; the camera judges."""
     captures = captured(tmp_path / "captures", patterns=12)
     model = Model(captures.bench)
     train(
@@ -111,10 +121,10 @@ def test_the_headset_shows_better_through_the_exported_network(tmp_path: Path) -
     export_bundle(model, captures, tmp_path / "bundle", network=tmp_path / "run" / NETWORK)
     bundle = read_bundle(tmp_path / "bundle")
     path, wanted = load_light_path(bundle), photographs(("astronaut",), captures.bench)[0]
-    stage, shown = Stage(fringed(), captures.bench, model), {}
+    display, shown = BenchDisplay(fringed(), captures.bench, model), {}
     for name, d in (("without", None), ("through", approximator_of(bundle, (1, *SHAPE)))):
         gray = Solver(path, approximator=d).solve(wanted.irradiance[0, 0], 40).gray.copy()
-        shown[name] = run_shown(stage, {wanted.name: gray.reshape(1, *SHAPE)}, wanted, tmp_path / name)
+        shown[name] = run_shown(display, {wanted.name: gray.reshape(1, *SHAPE)}, wanted, tmp_path / name)
     assert shown["through"] > shown["without"] + 3
 
 
@@ -123,7 +133,7 @@ def test_the_headset_shows_better_through_the_exported_network(tmp_path: Path) -
 
 @pytest.mark.parametrize("colours", [False, True])
 def test_the_phase_gradient_through_the_network_is_the_slope(colours: bool) -> None:
-    """Seed eq. 23 through light path and network, along a random direction, in double precision."""
+    """Chakravarthula et al. 2020, eq. 23, along a random direction, in double precision."""
     bench = known(fringed(colours))
     names, planes = [c.name for c in bench.channels], (5.5, 6.0)
     paths = [[torch_path(Model(bench), n, z, torch.float64) for n in names] for z in planes]
@@ -153,16 +163,16 @@ def light(phase: torch.Tensor, paths: list, network: torch.nn.Module) -> torch.T
 
 
 def scaled(phase, paths, target, weight, network) -> torch.Tensor:  # type: ignore[no-untyped-def]
-    seen = light(phase, paths, network)
-    over = (target.sqrt() * seen.clamp(min=0).sqrt() * weight).sum((0, 2, 3)) / (target * weight).sum(
+    irradiance = light(phase, paths, network)
+    over = (target.sqrt() * irradiance.clamp(min=0).sqrt() * weight).sum((0, 2, 3)) / (target * weight).sum(
         (0, 2, 3)
     )
     return target * over[None, :, None, None] ** 2
 
 
 def penalty_at(phase, paths, target, weight, network) -> torch.Tensor:  # type: ignore[no-untyped-def]
-    seen = light(phase, paths, network)
-    return (weight * ((seen.clamp(min=0) + 1e-3).sqrt() - (target + 1e-3).sqrt()) ** 2).sum()
+    irradiance = light(phase, paths, network)
+    return (weight * ((irradiance.clamp(min=0) + 1e-3).sqrt() - (target + 1e-3).sqrt()) ** 2).sum()
 
 
 def test_every_named_method_shows_the_picture() -> None:
@@ -171,7 +181,7 @@ def test_every_named_method_shows_the_picture() -> None:
     picture = photographs(("astronaut",), bench)[0]
     found = {}
     for method in METHODS:
-        shown = with_iris_beside(headset) if method == "wirtinger_no_zero_order" else headset
+        shown = headset_beside_zero_order(headset) if method == "wirtinger_no_zero_order" else headset
         gray = retrieve(Model(bench), picture, method, None, 40)[0]
         assert gray.dtype == np.uint8 and gray.shape == SHAPE
         found[method] = quality(shown.true_irradiance(gray, "green"), picture.irradiance[0, 0]).psnr_db
@@ -187,7 +197,7 @@ def test_the_ramp_and_the_iris_keep_the_zero_order_out() -> None:
     headset = VirtualHeadset(description.resized(*SHAPE, 6.0))
     chequer = (128 * (np.indices(SHAPE).sum(0) % 2)).astype(np.uint8)  # diffracts to the band's corners
     straight, beside = (
-        h.true_irradiance(chequer, "green").mean() for h in (headset, with_iris_beside(headset))
+        h.true_irradiance(chequer, "green").mean() for h in (headset, headset_beside_zero_order(headset))
     )
     assert beside < 0.02 * straight
     model = beside_zero_order(Model(known(headset)))
@@ -204,8 +214,8 @@ def test_a_stack_of_planes_shows_each_part_in_its_plane() -> None:
     single = retrieve(Model(bench), replace(flat, planes_mm=(4.0,)), "wirtinger", None, 60)[0]
     far = wanted.weight[1] > 0
     target = flat.irradiance[0, 0]
-    seen = [headset.true_irradiance(gray, "green", 8.0) for gray in (deep, single)]
-    assert quality(seen[0], target, far).psnr_db > quality(seen[1], target, far).psnr_db + 6
+    shown = [headset.true_irradiance(gray, "green", 8.0) for gray in (deep, single)]
+    assert quality(shown[0], target, far).psnr_db > quality(shown[1], target, far).psnr_db + 6
     with pytest.raises(InputError, match="one plane"):
         retrieve(Model(bench), wanted, "gerchberg_saxton")
 
@@ -223,8 +233,8 @@ def test_a_cycle_in_depth_gets_better(tmp_path: Path) -> None:
     headset = fringed()
     bench = known(headset)
     wanted = [in_depth(one, (5.0, 7.0)) for one in photographs(("astronaut", "coffee"), bench)]
-    settings = Settings(1, COMPACT, 150, iterations=30, method="wirtinger", good=NEVER)
-    cycle = run_cycle(Model(bench), wanted, settings, tmp_path, Stage(headset, bench, Model(bench)))
+    settings = CycleSettings(1, COMPACT, 150, iterations=30, method="wirtinger", good=NEVER)
+    cycle = run_cycle(Model(bench), wanted, settings, tmp_path, BenchDisplay(headset, bench, Model(bench)))
     assert psnr(cycle, 1) > psnr(cycle, 0) + 1
 
 
@@ -271,7 +281,7 @@ def test_the_loop_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert "--bench" in capsys.readouterr().err
 
 
-def test_evaluate_prints_its_contract(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_evaluate_prints_its_keys(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = [
         "evaluate",
         "--bench",
@@ -299,7 +309,9 @@ def test_evaluate_prints_its_contract(tmp_path: Path, capsys: pytest.CaptureFixt
 
 @pytest.mark.slow
 def test_every_method_of_evaluate_runs(tmp_path: Path) -> None:
-    found = run_evaluation(str(bench_file(tmp_path, "zero_order")), sizes=Sizes(2, 20, 20), workers=1)
+    found = run_evaluation(
+        str(bench_file(tmp_path, "zero_order")), sizes=EvaluationSizes(2, 20, 20), workers=1
+    )
     assert [row["method"] for row in found["prediction"]] == list(PREDICTION)
     assert [row["method"] for row in found["display"]] == list(DISPLAY)
     by_name = {row["method"]: row["psnr_db"] for row in found["display"]}

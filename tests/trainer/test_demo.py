@@ -12,8 +12,8 @@ from firmware_iface.errors import InputError
 from runtime.solver import quality
 from trainer.captures.capture_set import read_captures
 from trainer.commands.making import first_free
-from trainer.cycle.demo import run_demo
-from trainer.report.displayed import Shown, display_section, with_display
+from trainer.cycle.demo_run import run_demo
+from trainer.report.display_section import DisplayedPicture, display_section, with_display
 
 
 def test_a_folder_that_holds_something_is_refused(tmp_path: Path) -> None:
@@ -25,10 +25,10 @@ def test_a_folder_that_holds_something_is_refused(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
 
 
-def test_the_display_goes_to_the_end_of_the_reports_main_part() -> None:
+def test_the_display_is_at_the_end_of_the_reports_main_part() -> None:
     target = np.random.default_rng(0).random((12, 16))
     light = 3 * target**1.1
-    shown = [Shown("a <picture>", target, {"before": light}, {"before": quality(light, target)})]
+    shown = [DisplayedPicture("a <picture>", target, {"before": light}, {"before": quality(light, target)})]
     html = with_display("<main><p>x</p></main></body>", shown, "better & better")
     assert html.index("<p>x</p>") < html.index("<section>") < html.index("</main>")
     assert "better &amp; better" in html
@@ -39,14 +39,14 @@ def test_the_display_goes_to_the_end_of_the_reports_main_part() -> None:
 
 @pytest.mark.slow
 def test_the_quick_demo(tmp_path: Path) -> None:
-    told: list[float] = []
-    result = run_demo(tmp_path / "demo", quick=True, progress=lambda done, what: told.append(done))
+    shares: list[float] = []
+    result = run_demo(tmp_path / "demo", quick=True, progress=lambda done, what: shares.append(done))
     assert set(result["found"]) == {"zero_order", "illumination", "phase_response"}
     assert result["verdict"] == "complete"
     display = {name: numbers["psnr_db"] for name, numbers in result["display"].items()}
     assert display["after"] > display["before"] + 8
     assert display["oracle"] > display["after"] - 0.5
-    assert told == sorted(told) and told[-1] == 1
+    assert shares == sorted(shares) and shares[-1] == 1
     assert len(read_captures(Path(result["captures"]))) > 5
     page = Path(result["report"]).read_text(encoding="utf-8")
     assert "What the display shows" in page

@@ -11,8 +11,8 @@ import tomlkit
 from firmware_iface.errors import InputError
 from firmware_iface.virtual import open_headset
 from tests.campaigns.headset import hardware, write_configuration
+from tests.trainer.fringed_bench import SHAPE, fringed, known
 from tests.trainer.hidden import ran
-from tests.trainer.taught import SHAPE, fringed, known
 from trainer.captures.acquire import capture_set
 from trainer.captures.bench_file import bench_tables
 from trainer.captures.open_bench import RealHeadset, nominal_bench, open_bench

@@ -14,7 +14,8 @@ from runtime.bundle.light_path_arrays import load_light_path, pack_light_paths
 from runtime.solver import Solver
 from tests.runtime.benches import ideal_path, scene
 from trainer.cli import main
-from trainer.training.train_initialiser import InitialiserNetwork, _fit, onnx_file
+from trainer.networks.initialiser_network import InitialiserNetwork, initialiser_onnx
+from trainer.training.train_initialiser import _fit
 
 SHAPE = (48, 64)
 
@@ -47,7 +48,7 @@ def test_onnx_says_what_torch_says() -> None:
     for weight in network.parameters():
         torch.nn.init.normal_(weight, 0, 0.05)
     amplitude = torch.rand(1, 1, *SHAPE) * 2
-    session = onnxruntime.InferenceSession(onnx_file(network, SHAPE))
+    session = onnxruntime.InferenceSession(initialiser_onnx(network, SHAPE))
     (phase,) = session.run(["phase"], {"target": amplitude.numpy()})
     with torch.no_grad():
         np.testing.assert_allclose(phase, network(amplitude).numpy(), atol=1e-4)

@@ -1,4 +1,4 @@
-"""Networks: the identity at the start, the published layers, and what each part sees."""
+"""Networks: the identity at the start, the layers of the paper, and the field of view of each part."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ from trainer.networks.approximator import (
     read_approximator,
     write_approximator,
 )
-from trainer.networks.baselines import UNet
+from trainer.networks.discriminator import PatchDiscriminator
 from trainer.networks.layers import InstanceNorm, LeakyReLU, cropped
-from trainer.networks.published import Generator, PatchDiscriminator
+from trainer.networks.published_generator import Generator
+from trainer.networks.unet import UNet
 
-# Seed Fig. 14, read off the table: (kernel, channels in, channels out)
+# Chakravarthula et al. 2020, Fig. 14, from the table: (kernel, channels in, channels out)
 GENERATOR = [
     (5, 3, 64), (5, 64, 128), (5, 128, 256), (5, 256, 512), *[(5, 512, 512)] * 4,
     (4, 512, 512), *[(4, 1024, 512)] * 3, (4, 1024, 256), (4, 512, 128), (4, 256, 64), (4, 128, 32), (4, 32, 3),
@@ -70,14 +71,16 @@ def test_instance_norm_is_on_the_inner_layers_only() -> None:
 
 @pytest.mark.parametrize(("plain", "side"), [(2, 94), (1, 70)])
 def test_a_patch_of_the_discriminator_sees_94_pixels(plain: int, side: int) -> None:
-    """The support of the gradient of one judgement, norms (which see everything) left out."""
-    judge = PatchDiscriminator(1, 4, plain=plain)
-    layers = torch.nn.Sequential(*[m for m in judge.layers if isinstance(m, torch.nn.Conv2d)]).double()
+    """The support of the gradient of one judgement, without the norms, which cover everything."""
+    discriminator = PatchDiscriminator(1, 4, plain=plain)
+    layers = torch.nn.Sequential(
+        *[m for m in discriminator.layers if isinstance(m, torch.nn.Conv2d)]
+    ).double()
     picture = torch.rand(1, 1, 256, 256, dtype=torch.float64, requires_grad=True)
     judged = layers(picture)
     judged[0, 0, judged.shape[2] // 2, judged.shape[3] // 2].backward()
-    seen = picture.grad[0, 0].abs() > 0
-    assert (int(seen.any(1).sum()), int(seen.any(0).sum())) == (side, side)
+    support = picture.grad[0, 0].abs() > 0
+    assert (int(support.any(1).sum()), int(support.any(0).sum())) == (side, side)
 
 
 def test_u_net_has_half_the_filters_of_the_original() -> None:

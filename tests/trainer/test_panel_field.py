@@ -16,16 +16,17 @@ from firmware_iface.virtual.simulated_panel import Surface
 from runtime.bundle.bundle_folder import read_bundle
 from runtime.bundle.light_path_arrays import load_light_path
 from runtime.lightpath.light_path import irradiance, panel_phase
+from tests.trainer.fringed_bench import SHAPE
 from tests.trainer.hidden import ran
-from tests.trainer.taught import SHAPE
 from trainer.captures.acquire import capture_set
 from trainer.captures.bench_file import Bench
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.open_bench import nominal_bench
-from trainer.cycle.loop import Settings, run_cycle
-from trainer.cycle.retrieval import retrieve
-from trainer.cycle.show_on_bench import Stage
-from trainer.cycle.test_pictures import photographs
+from trainer.cycle.cycle_settings import CycleSettings
+from trainer.cycle.hardware_in_the_loop import run_cycle
+from trainer.cycle.phase_retrieval import retrieve
+from trainer.cycle.show_on_bench import BenchDisplay
+from trainer.cycle.target_pictures import photographs
 from trainer.diagnosis.error_budget import error_budget
 from trainer.effects.effect_catalogue import catalogue
 from trainer.fitting.learn_field import learn_field
@@ -167,10 +168,10 @@ def test_online_each_picture_has_its_own_field(striped: CaptureSet, tmp_path: Pa
     """Without a network, round after round from the pattern before; each model can be exported."""
     there = headset("stripes")
     model = learn_field(striped, Model(striped.bench)).model
-    stage = Stage(there, striped.bench, Model(striped.bench))
-    settings = Settings(2, RECIPES["compact"], 0, iterations=60, good=2.0, online=True)
+    display = BenchDisplay(there, striped.bench, Model(striped.bench))
+    settings = CycleSettings(2, RECIPES["compact"], 0, iterations=60, good=2.0, online=True)
     wanted = photographs(("astronaut",), striped.bench)
-    cycle = run_cycle(model, wanted, settings, tmp_path / "loop", stage)
+    cycle = run_cycle(model, wanted, settings, tmp_path / "loop", display)
     psnr = [one["astronaut"].psnr_db for one in cycle.history]
     assert psnr[2] > psnr[0] + 0.5
     assert cycle.network is None and not cycle.own

@@ -12,8 +12,17 @@ import scipy.io
 import torch
 
 from firmware_iface.errors import InputError
-from trainer.networks.perceptual import read_lpips, read_perceptual
-from trainer.networks.weights import ALEXNET, VGG16, VGG19, Features, Layer, load_features, read_weights
+from trainer.networks.lpips import read_lpips
+from trainer.networks.perceptual_loss import read_perceptual_loss
+from trainer.networks.pretrained_features import (
+    ALEXNET,
+    VGG16,
+    VGG19,
+    Layer,
+    PretrainedFeatures,
+    load_features,
+)
+from trainer.networks.weight_files import read_weights
 
 
 def random_weights(layout: tuple[Layer, ...], seed: int = 0) -> dict[str, torch.Tensor]:
@@ -81,7 +90,7 @@ def test_features_are_the_networks_own() -> None:
 def test_the_perceptual_loss_vanishes_for_equal_pictures(tmp_path: Path) -> None:
     path = tmp_path / "vgg.safetensors"
     safetensors.torch.save_file(random_weights(VGG19), path)
-    loss = read_perceptual(path)
+    loss = read_perceptual_loss(path)
     target = torch.rand(1, 3, 40, 48)
     assert loss(target, target) == 0
     near, far = (loss(target + size * torch.randn_like(target), target) for size in (0.02, 0.2))
@@ -109,8 +118,8 @@ def test_lpips_is_a_distance(tmp_path: Path, layout: tuple[Layer, ...], widths: 
     only = read_lpips([backbone, heads])
     for head in list(only.heads)[1:]:
         head.zero_()
-    seen = [only.features((2 * x - 1 - only.mean) / only.scale)[0] for x in (first, second)]
-    unit = [torch.nn.functional.normalize(f, dim=1) for f in seen]
+    features = [only.features((2 * x - 1 - only.mean) / only.scale)[0] for x in (first, second)]
+    unit = [torch.nn.functional.normalize(f, dim=1) for f in features]
     expected = ((unit[0] - unit[1]) ** 2 * only.heads[0]).sum(1).mean((1, 2))
     assert torch.allclose(only(first, second), expected, rtol=1e-4)
     with pytest.raises(InputError, match="heads"):
@@ -142,5 +151,5 @@ def test_weights_of_another_network_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "alex.safetensors"
     safetensors.torch.save_file(random_weights(ALEXNET), path)
     with pytest.raises(InputError, match="another weights file"):
-        read_perceptual(path)
-    assert len(Features(VGG16, (0,)).convolutions()) == 13
+        read_perceptual_loss(path)
+    assert len(PretrainedFeatures(VGG16, (0,)).convolutions()) == 13

@@ -1,4 +1,4 @@
-"""Training: what it learns from, what it minimises, and that it goes on as if it had not been killed."""
+"""Training: its pairs, its losses, and that a killed run continues to the same result."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from safetensors.torch import save_file
 
 from firmware_iface.errors import InputError
 from tests.conftest import ROOT
+from tests.trainer.fringed_bench import SHAPE, captured
 from tests.trainer.made_sets import bench_tables, counted, irradiance
-from tests.trainer.taught import SHAPE, captured
 from tests.trainer.test_perceptual import random_weights
 from trainer.captures.batches import load_batch
 from trainer.captures.bench_file import read_bench
@@ -28,20 +28,29 @@ from trainer.fitting.gains import with_gains
 from trainer.model.model import Model, absent
 from trainer.model.model_stages import scene_for, stages_for
 from trainer.networks.approximator import read_approximator
-from trainer.networks.weights import ALEXNET, VGG19
-from trainer.training.likeness import evaluate, likeness, noise_floor
-from trainer.training.losses import Critic, content_loss, matching_loss, picture, where_seen
-from trainer.training.pairs import measured_on_panel, onto_camera, onto_panel, pairs_of, stacked
+from trainer.networks.discriminator import Discriminator
+from trainer.networks.pretrained_features import ALEXNET, VGG19
+from trainer.training.camera_to_panel import onto_camera, onto_panel
+from trainer.training.checkpoint import CHECKPOINT
+from trainer.training.image_metrics import image_metrics, noise_floor, prediction_metrics
+from trainer.training.losses import (
+    adversarial_loss,
+    content_loss,
+    display_encoded,
+    matching_loss,
+    where_measured,
+)
 from trainer.training.recipe import RECIPES, Recipe, recipe_named
-from trainer.training.sets import TrainingSets, training_sets
-from trainer.training.train import CHECKPOINT, NETWORK, train
+from trainer.training.training_pairs import measured_on_panel, pairs_of, stacked
+from trainer.training.training_run import NETWORK, train
+from trainer.training.training_sets import TrainingSets, training_sets
 
 SMALL = replace(RECIPES["compact"], filters=2)
 
 
 @pytest.fixture(scope="module")
 def captures(tmp_path_factory: pytest.TempPathFactory) -> CaptureSet:
-    return captured(tmp_path_factory.mktemp("taught") / "captures")
+    return captured(tmp_path_factory.mktemp("fringed") / "captures")
 
 
 @pytest.fixture(scope="module")
@@ -51,26 +60,26 @@ def sets(captures: CaptureSet) -> TrainingSets:
 
 def test_a_defect_without_a_name_is_learned(sets: TrainingSets) -> None:
     """Held-out pictures come to within 1.5 dB of the camera's noise, from 13 dB above it."""
-    before, floor = evaluate(sets.held_out, None), noise_floor(sets.held_out)
+    before, floor = prediction_metrics(sets.held_out, None), noise_floor(sets.held_out)
     network = train(sets.fitted, SMALL, 250)
-    after = evaluate(sets.held_out, network)
+    after = prediction_metrics(sets.held_out, network)
     assert before.psnr_db < floor.psnr_db - 8
     assert after.psnr_db > floor.psnr_db - 1.5
     assert after.ssim > before.ssim
 
 
-def test_a_student_learns_what_its_teacher_says(sets: TrainingSets) -> None:
+def test_a_student_learns_its_teachers_results(sets: TrainingSets) -> None:
     teacher = train(sets.fitted, SMALL, 100)
     student = train(sets.fitted, SMALL, 100, teacher=teacher, seed=1)
-    taught = replace(sets.held_out, measured=teacher(sets.held_out.predicted).detach())
-    assert evaluate(taught, student).psnr_db > evaluate(taught, None).psnr_db + 6
+    held_out = replace(sets.held_out, measured=teacher(sets.held_out.predicted).detach())
+    assert prediction_metrics(held_out, student).psnr_db > prediction_metrics(held_out, None).psnr_db + 6
 
 
 def test_no_steps_leave_the_identity(sets: TrainingSets) -> None:
     assert torch.equal(train(sets.fitted, SMALL, 0)(sets.held_out.predicted), sets.held_out.predicted)
 
 
-# What it learns from
+# Pairs
 
 
 def test_pairs_are_the_counts_over_the_gain_where_the_camera_adds_nothing(captures: CaptureSet) -> None:
@@ -85,7 +94,7 @@ def test_pairs_are_the_counts_over_the_gain_where_the_camera_adds_nothing(captur
     assert float(pairs.predicted[:, 0].mean()) == pytest.approx(float(pairs.measured[:, 0].mean()), rel=0.1)
 
 
-def test_what_the_camera_adds_is_taken_out(captures: CaptureSet) -> None:
+def test_effects_of_the_camera_are_taken_out(captures: CaptureSet) -> None:
     """A model that says that the camera is brighter at a side leaves predicted irradiance as it is."""
     row = captures.captures[0]
     vignetting = absent(catalogue()["vignetting"], captures.bench)
@@ -107,9 +116,9 @@ def test_a_turned_camera_sees_the_same_pairs(tmp_path: Path) -> None:
     # camera row i, column j looks at panel row 47 - j, column i
     turned["camera"]["homography"] = [[0.0, 1.0, 0.0], [-1.0, 0.0, 47.0], [0.0, 0.0, 1.0]]
     found = []
-    for name, table, seen in (("straight", tables, light), ("turned", turned, np.rot90(light, -1))):
+    for name, table, view in (("straight", tables, light), ("turned", turned, np.rot90(light, -1))):
         quiet = {**table, "camera": {**table["camera"], "read_noise_e": 0, "full_well_e": 1e8}}
-        counts = counted(np.ascontiguousarray(seen), quiet, np.random.default_rng(0))
+        counts = counted(np.ascontiguousarray(view), quiet, np.random.default_rng(0))
         write_captures(tmp_path / name, quiet, [{"gray": gray, "counts": counts, "channel": "green"}])
         captures = read_captures(tmp_path / name)
         model = with_gains(captures, Model(captures.bench), captures.captures)
@@ -142,7 +151,7 @@ def test_colours_are_stacked_in_the_order_of_their_patterns(tmp_path: Path) -> N
     ]  # fmt: skip
 
 
-# What it minimises
+# Losses and metrics
 
 
 def test_losses_vanish_for_equal_pictures_and_are_what_they_say() -> None:
@@ -152,23 +161,22 @@ def test_losses_vanish_for_equal_pictures_and_are_what_they_say() -> None:
     assert float(content_loss(recipe, ours, target, None)) == pytest.approx(
         100 * float((ours - target).abs().mean())
     )
-    critic = Critic(recipe, 4)
-    judged = critic(ours, target)
+    discriminator = Discriminator(4)
+    judged = discriminator(ours, target)
     assert matching_loss(judged, judged) == 0
-    assert matching_loss(judged, critic(target, target)) > 0
+    assert matching_loss(judged, discriminator(target, target)) > 0
     certain = [[torch.ones(1, 1, 3, 3)]]
-    assert critic.loss(certain, True) == 0
-    assert critic.loss(certain, False) == 1
-    logistic = Critic(replace(recipe, cross_entropy=True), 4)
-    assert float(logistic.loss([[torch.full((1, 1, 2, 2), 30.0)]], True)) < 1e-6
+    assert adversarial_loss(certain, True) == 0
+    assert adversarial_loss(certain, False) == 1
+    assert float(adversarial_loss([[torch.full((1, 1, 2, 2), 30.0)]], True, cross_entropy=True)) < 1e-6
 
 
-def test_only_a_conditional_critic_sees_the_condition() -> None:
+def test_only_a_conditional_discriminator_depends_on_the_condition() -> None:
     ours, one, other = torch.rand(3, 1, 3, 48, 64)
     for conditional in (True, False):
         torch.manual_seed(0)
-        critic = Critic(Recipe(conditional=conditional), 4)
-        same = torch.equal(critic(ours, one)[0][-1], critic(ours, other)[0][-1])
+        discriminator = Discriminator(4, conditional=conditional)
+        same = torch.equal(discriminator(ours, one)[0][-1], discriminator(ours, other)[0][-1])
         assert same is not conditional
 
 
@@ -176,7 +184,9 @@ def test_pixels_without_a_measurement_have_no_gradient() -> None:
     ours = torch.rand(1, 3, 8, 8, requires_grad=True)
     weight = (torch.rand(1, 3, 8, 8) > 0.5).float()
     target = torch.rand(1, 3, 8, 8)
-    content_loss(Recipe(), where_seen(picture(ours, 1.0), target, weight), target, None).backward()
+    content_loss(
+        Recipe(), where_measured(display_encoded(ours, 1.0), target, weight), target, None
+    ).backward()
     assert torch.equal(ours.grad != 0, weight > 0)
 
 
@@ -206,20 +216,22 @@ def test_every_recipe_takes_steps(name: str, sets: TrainingSets) -> None:
     assert torch.isfinite(network(given)).all()
 
 
-def test_likeness_of_equal_pictures_is_perfect_and_counts_what_counts() -> None:
+def test_metrics_of_equal_pictures_is_perfect_and_counts_what_counts() -> None:
     one, every = torch.rand(3, 40, 40), torch.ones(3, 40, 40)
-    same, other = likeness(one, one, every), likeness(0.9 * one, 0.9 * one + 0.1, every)
+    same, other = image_metrics(one, one, every), image_metrics(0.9 * one, 0.9 * one + 0.1, every)
     assert (same.psnr_db, same.ssim) == (120, 1)
     assert other.psnr_db == pytest.approx(20) and other.ssim < 1
     half = every.clone()
     half[:, :20] = 0
     wrong = torch.cat((torch.zeros(3, 20, 40), one[:, 20:]), 1)
-    assert likeness(wrong, one, half).psnr_db == 120
-    assert likeness(0.9 * one, 0.9 * one + 0.1, half).psnr_db == pytest.approx(20)
-    assert likeness(torch.cat((one[:1], 0 * one[1:])), one, torch.cat((every[:1], 0 * one[1:]))).ssim == 1
+    assert image_metrics(wrong, one, half).psnr_db == 120
+    assert image_metrics(0.9 * one, 0.9 * one + 0.1, half).psnr_db == pytest.approx(20)
+    assert (
+        image_metrics(torch.cat((one[:1], 0 * one[1:])), one, torch.cat((every[:1], 0 * one[1:]))).ssim == 1
+    )
 
 
-# That it goes on
+# That a killed run continues
 
 RESUMED = """
 import os, signal, sys
@@ -231,23 +243,23 @@ torch.set_num_threads(1)
 from trainer.captures.capture_set import read_captures
 from trainer.model.model import Model
 from trainer.training.recipe import RECIPES
-from trainer.training.sets import training_sets
-from trainer.training.train import train
+from trainer.training.training_sets import training_sets
+from trainer.training.training_run import train
 
 captures = read_captures(sys.argv[1])
 sets = training_sets(captures, Model(captures.bench))
 die = int(sys.argv[3])
 
-def told(step, loss):
+def die_at(step, loss):
     if step == die:
         os.kill(os.getpid(), signal.SIGKILL)
 
-# Pix2Pix has all that could differ: a critic, two optimisers and dropout.
-train(sets.fitted, replace(RECIPES["pix2pix"], filters=2), 8, Path(sys.argv[2]), every=3, progress=told)
+# Pix2Pix has all that could differ: a discriminator, two optimisers and dropout.
+train(sets.fitted, replace(RECIPES["pix2pix"], filters=2), 8, Path(sys.argv[2]), every=3, progress=die_at)
 """
 
 
-def test_a_killed_training_goes_on_to_the_same_bits(captures: CaptureSet, tmp_path: Path) -> None:
+def test_a_killed_training_continues_to_the_same_bits(captures: CaptureSet, tmp_path: Path) -> None:
     def run(folder: str, die: int) -> int:
         command = [sys.executable, "-c", RESUMED, str(captures.folder), str(tmp_path / folder), str(die)]
         (tmp_path / folder).mkdir(exist_ok=True)
@@ -261,7 +273,7 @@ def test_a_killed_training_goes_on_to_the_same_bits(captures: CaptureSet, tmp_pa
     assert (tmp_path / "killed" / NETWORK).read_bytes() == (tmp_path / "whole" / NETWORK).read_bytes()
 
 
-def test_a_run_with_other_settings_is_not_gone_on_with(sets: TrainingSets, tmp_path: Path) -> None:
+def test_a_run_with_other_settings_is_not_continued(sets: TrainingSets, tmp_path: Path) -> None:
     train(sets.fitted, SMALL, 2, tmp_path)
     with pytest.raises(InputError, match="another recipe"):
         train(sets.fitted, replace(SMALL, l1=3.0), 4, tmp_path)
@@ -271,21 +283,14 @@ def test_a_run_with_other_settings_is_not_gone_on_with(sets: TrainingSets, tmp_p
         train(sets.fitted, SMALL, 4, tmp_path)
 
 
+def train_words(captures: CaptureSet, out: Path, *options: str) -> list[str]:
+    """The command line of a small training."""
+    return ["train", str(captures.folder), "--out", str(out), "--filters", "2", *options]
+
+
 def test_the_command(captures: CaptureSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
-    words = [
-        "train",
-        str(captures.folder),
-        "--out",
-        str(out),
-        "--steps",
-        "4",
-        "--every",
-        "2",
-        "--filters",
-        "2",
-        "--json",
-    ]
+    words = train_words(captures, out, "--steps", "4", "--every", "2", "--json")
     assert main(words) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["steps"] == 4
@@ -311,16 +316,7 @@ def test_weights_that_are_named_are_used(
     save_file(random_weights(VGG19), vgg)
     heads = {f"lin{k}.model.1.weight": torch.rand(1, w, 1, 1) for k, w in enumerate((64, 192, 384, 256, 256))}
     save_file(random_weights(ALEXNET) | heads, lpips)
-    words = [
-        "train",
-        str(captures.folder),
-        "--out",
-        str(tmp_path / "run"),
-        "--network",
-        "published",
-        "--filters",
-        "2",
-    ]
+    words = train_words(captures, tmp_path / "run", "--network", "published")
     assert main([*words, "--steps", "1", "--vgg", str(vgg), "--lpips", str(lpips), "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["left_out"] == []
@@ -331,18 +327,7 @@ def test_weights_that_are_named_are_used(
 def test_two_processes_train_one_network(captures: CaptureSet, tmp_path: Path) -> None:
     """The same command under torchrun."""
     out = tmp_path / "run"
-    words = [
-        "train",
-        str(captures.folder),
-        "--out",
-        str(out),
-        "--steps",
-        "4",
-        "--network",
-        "published",
-        "--filters",
-        "2",
-    ]
+    words = train_words(captures, out, "--steps", "4", "--network", "published")
     launcher = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "-m", "trainer.cli"]
     subprocess.run([*launcher, *words], cwd=ROOT, check=True, capture_output=True, timeout=300)
     assert read_approximator(out / NETWORK)[1]["steps"] == 4

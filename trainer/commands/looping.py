@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from trainer.captures.bench_file import Bench
-    from trainer.cycle.loop import Settings
+    from trainer.cycle.cycle_settings import CycleSettings
 
 
 def run_loop(args: Namespace, screen: Screen) -> Result:
@@ -36,14 +36,14 @@ def run_loop(args: Namespace, screen: Screen) -> Result:
 
     from trainer.captures.capture_set import read_captures
     from trainer.captures.open_bench import open_bench
-    from trainer.cycle.loop import run_cycle
-    from trainer.cycle.retrieval import beside_zero_order
-    from trainer.cycle.show_on_bench import Stage, with_iris_beside
-    from trainer.cycle.test_pictures import LEARNED, in_depth, photographs, volumes_of
+    from trainer.cycle.hardware_in_the_loop import run_cycle
+    from trainer.cycle.phase_retrieval import beside_zero_order
+    from trainer.cycle.show_on_bench import BenchDisplay, headset_beside_zero_order
+    from trainer.cycle.target_pictures import LEARNED, in_depth, photographs, volumes_of
     from trainer.effects.effect_catalogue import catalogue
     from trainer.model.model import Model
     from trainer.model.model_file import read_model
-    from trainer.training.weight_files import left_out
+    from trainer.training.pretrained_networks import left_out
 
     recorded = [read_captures(folder) for folder in args.recorded]
     if args.bench is None and not recorded:
@@ -63,12 +63,12 @@ def run_loop(args: Namespace, screen: Screen) -> Result:
         model = model or Model(bench)
         if args.method == "wirtinger_no_zero_order":
             model = beside_zero_order(model)
-            headset = None if headset is None else with_iris_beside(headset)
+            headset = None if headset is None else headset_beside_zero_order(headset)
         wanted = volumes_of(args.pictures, bench) if args.pictures else photographs(LEARNED, bench)
         if args.planes:
             depths = _depths(args, bench, len(wanted))
             wanted = [in_depth(one, args.planes, depth) for one, depth in zip(wanted, depths, strict=True)]
-        stage = None if headset is None else Stage(headset, bench, Model(bench))
+        stage = None if headset is None else BenchDisplay(headset, bench, Model(bench))
         told = stack.enter_context(screen.progress("the cycle"))
         cycle = run_cycle(model, wanted, settings, args.out, stage, recorded, progress=told)
     rounds = [{name: found.as_json() for name, found in one.items()} for one in cycle.history]
@@ -77,7 +77,7 @@ def run_loop(args: Namespace, screen: Screen) -> Result:
         "pictures": [one.name for one in wanted],
         "rounds": [{"round": k, "pictures": one, "mean": _mean(one)} for k, one in enumerate(rounds)],
         "good_enough": sorted(cycle.done),
-        "left_out": left_out(settings.recipe, settings.judges),
+        "left_out": left_out(settings.recipe, settings.pretrained),
     }
 
 
@@ -96,18 +96,18 @@ def _depths(args: Namespace, bench: Bench, count: int) -> list[np.ndarray | None
     ]  # as gray as they look
 
 
-def _settings(args: Namespace) -> Settings:
+def _settings(args: Namespace) -> CycleSettings:
     from dataclasses import replace
 
-    from trainer.cycle.loop import Settings
+    from trainer.cycle.cycle_settings import CycleSettings
+    from trainer.training.pretrained_networks import read_pretrained
     from trainer.training.recipe import recipe_named
-    from trainer.training.weight_files import read_judges
 
     recipe = recipe_named(args.network)
     if args.filters is not None:
         recipe = replace(recipe, filters=args.filters)
-    judges = read_judges(args.vgg, args.lpips)
-    return Settings(
+    judges = read_pretrained(args.vgg, args.lpips)
+    return CycleSettings(
         args.rounds,
         recipe,
         args.steps,
@@ -153,18 +153,19 @@ def run_evaluate(args: Namespace, screen: Screen) -> Result:
     """Every method on one bench."""
     from dataclasses import replace
 
-    from trainer.cycle.evaluate import METHODS, Sizes, run_evaluation
+    from trainer.cycle.evaluation import METHODS, run_evaluation
+    from trainer.cycle.evaluation_bench import EvaluationSizes
     from trainer.effects.effect_catalogue import catalogue
     from trainer.model.model_file import read_model
-    from trainer.training.weight_files import read_judges
+    from trainer.training.pretrained_networks import read_pretrained
 
-    sizes = Sizes.full() if args.full else Sizes()
+    sizes = EvaluationSizes.full() if args.full else EvaluationSizes()
     given = {"filters": args.filters, "steps": args.steps, "iterations": args.iterations}
     sizes = replace(sizes, **{name: value for name, value in given.items() if value is not None})
     model = None
     if args.model:
         model = read_model(args.model, catalogue(args.effects))
-    judges = read_judges(args.vgg, args.lpips)
+    judges = read_pretrained(args.vgg, args.lpips)
     with screen.progress("comparing methods") as told:
         found = run_evaluation(
             args.bench, args.methods or METHODS, sizes, judges, model, args.seed, workers_of(args), told

@@ -155,7 +155,7 @@ def show_export(result: Result, args: Namespace, screen: Screen) -> None:
 
 def run_demo(args: Namespace, screen: Screen) -> Result:
     """The whole way on a virtual bench."""
-    from trainer.cycle.demo import run_demo as demo
+    from trainer.cycle.demo_run import run_demo as demo
 
     folder = args.out or first_free(Path("hololoop-demo"))
     with screen.progress("demo") as told:

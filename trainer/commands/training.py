@@ -64,13 +64,13 @@ def run_train(args: Namespace, screen: Screen) -> Result:
     from dataclasses import asdict
 
     from trainer.networks.approximator import read_approximator
-    from trainer.training.likeness import evaluate, noise_floor
-    from trainer.training.sets import training_sets
-    from trainer.training.train import NETWORK, train
-    from trainer.training.weight_files import left_out, read_judges
+    from trainer.training.image_metrics import noise_floor, prediction_metrics
+    from trainer.training.pretrained_networks import left_out, read_pretrained
+    from trainer.training.training_run import NETWORK, train
+    from trainer.training.training_sets import training_sets
 
     recipe = recipe_of(args)
-    judges = read_judges(args.vgg, args.lpips)
+    judges = read_pretrained(args.vgg, args.lpips)
     captures, _, model = inputs_of(args)
     use_every_core()
     args.out.mkdir(parents=True, exist_ok=True)
@@ -93,8 +93,8 @@ def run_train(args: Namespace, screen: Screen) -> Result:
         "steps": args.steps,
         "left_out": left_out(recipe, judges),
         "heldout": {
-            "before": evaluate(sets.held_out, None, judges.lpips).as_json(),
-            "after": evaluate(sets.held_out, network, judges.lpips).as_json(),
+            "before": prediction_metrics(sets.held_out, None, judges.lpips).as_json(),
+            "after": prediction_metrics(sets.held_out, network, judges.lpips).as_json(),
             "noise_floor": noise_floor(sets.held_out, judges.lpips).as_json(),
         },
     }

@@ -1,4 +1,4 @@
-"""Patterns on a bench, virtual or real: shown, captured, and how near to what was wanted the camera saw them."""
+"""Patterns on a bench, virtual or real: shown, captured, and how similar the camera's pictures are to the targets."""
 
 from __future__ import annotations
 
@@ -16,18 +16,26 @@ from trainer.captures.acquire import capture_set
 from trainer.captures.bench_file import Bench
 from trainer.captures.capture_set import Capture, CaptureSet, read_captures
 from trainer.captures.patterns import Pattern
-from trainer.cycle.retrieval import CARRIER, OPENING, Volume
+from trainer.cycle.phase_retrieval import CARRIER, OPENING
+from trainer.cycle.target_pictures import TargetVolume
 from trainer.model.model import Model
-from trainer.networks.perceptual import Lpips
-from trainer.training.likeness import Likeness, likeness, mean_likeness
-from trainer.training.pairs import Pairs, pairs_of
+from trainer.networks.lpips import Lpips
+from trainer.training.image_metrics import ImageMetrics, image_metrics, mean_metrics
+from trainer.training.training_pairs import Pairs, pairs_of
 
 
 @dataclass(frozen=True)
-class Stage:
-    """Where patterns are shown: a headset and what is known of its bench.
+class BenchDisplay:
+    """A bench on which patterns are shown and captured.
 
-    model : of the display, with its gains; what it tells to the camera is taken out of what is seen
+    Attributes
+    ----------
+    headset : Headset
+        Panel, lasers and camera.
+    bench : Bench
+        What is known of it.
+    model : Model
+        Under which the captures become irradiance; its effects on the camera are taken out of them.
     """
 
     headset: Any
@@ -37,9 +45,21 @@ class Stage:
     def show(
         self, patterns: Mapping[str, np.ndarray], planes_mm: tuple[float, ...], folder: Path
     ) -> CaptureSet:
-        """Capture each pattern [C, H, W] on each plane, as a capture set whose patterns bear the names.
+        """Capture each pattern on each plane; the exposure is set again, once for each colour.
 
-        The exposure is set anew, once a colour. Raises InputError as `capture_set` does.
+        Parameters
+        ----------
+        patterns : mapping of str to uint8 array [C, H, W]
+            Gray levels by name; the captured patterns have these names.
+        planes_mm : tuple of float, mm
+            Distances of the planes.
+        folder : path
+            Of the new capture set.
+
+        Raises
+        ------
+        InputError
+            As from `capture_set`.
         """
         names = [c.name for c in self.bench.channels]
 
@@ -50,10 +70,13 @@ class Stage:
         return read_captures(folder)
 
 
-def with_iris_beside(headset: Any) -> Any:
-    """A virtual headset whose iris stands beside the zero order, as `beside_zero_order` has it.
+def headset_beside_zero_order(headset: Any) -> Any:
+    """A virtual headset whose iris is next to the zero order, as in `beside_zero_order`.
 
-    Raises InputError for a real one: there a person moves the iris.
+    Raises
+    ------
+    InputError
+        For a real headset: a person moves its iris.
     """
     from firmware_iface.virtual import VirtualHeadset
     from firmware_iface.virtual.defects import Iris
@@ -68,34 +91,34 @@ def with_iris_beside(headset: Any) -> Any:
     return VirtualHeadset(replace(headset.description, defects=(*others, moved)), headset.seed)
 
 
-def seen_pairs(captures: CaptureSet, model: Model) -> dict[str, Pairs]:
-    """What the camera saw of each pattern of `Stage.show`, by its name."""
+def pairs_by_pattern(captures: CaptureSet, model: Model) -> dict[str, Pairs]:
+    """Pairs of each pattern of `BenchDisplay.show`, by its name."""
     names = dict.fromkeys(c.extra["kind"] for c in captures.captures)
     return {name: pairs_of(captures, rows_of(captures, name), model) for name in names}
 
 
 def rows_of(captures: CaptureSet, name: str) -> list[Capture]:
-    """Captures of one pattern of `Stage.show`; the repeat that shows the noise is left out."""
+    """Captures of one pattern of `BenchDisplay.show`, without the repeat that measures the noise."""
     unique = {(c.channel, c.plane_mm, c.pattern): c for c in captures.captures}
     return [c for c in unique.values() if c.extra["kind"] == name]
 
 
-def display_likeness(seen: Pairs, wanted: Volume, lpips: Lpips | None = None) -> Likeness:
-    """How near what the camera saw is to a volume, mean over its planes.
+def display_metrics(pairs: Pairs, wanted: TargetVolume, lpips: Lpips | None = None) -> ImageMetrics:
+    """Metrics of the camera's pictures against a target, mean over its planes.
 
-    Of display-encoded pictures, the target's brightest as white, after one free scale a colour and plane; pixels that
-    do not count, or that the camera did not see, are left out.
+    They are of display-encoded pictures, with the target's brightest pixel as white, after one free scale for each
+    colour and plane. Pixels that do not count, or that were not measured, are left out.
     """
     found = []
-    for k in range(len(seen)):
+    for k in range(len(pairs)):
         target = torch.as_tensor(wanted.irradiance[k], dtype=torch.float32)
-        weight = seen.weight[k] * (torch.as_tensor(wanted.weight[k]) > 0)
-        found.append(likeness(*_encoded(seen.measured[k], target, weight), weight, lpips))
-    return mean_likeness(found)
+        weight = pairs.weight[k] * (torch.as_tensor(wanted.weight[k]) > 0)
+        found.append(image_metrics(*_encoded(pairs.measured[k], target, weight), weight, lpips))
+    return mean_metrics(found)
 
 
 def _encoded(light: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Amplitudes [C, H, W] of what was seen, scaled to the target's, and of the target, whose brightest is 1."""
+    """Amplitudes [C, H, W] of the light, scaled to the target's, and of the target, whose brightest is 1."""
     root, wanted = torch.sqrt(light.clamp(min=0)), torch.sqrt(target)
     wanted = wanted / wanted.amax().clamp(min=1e-12)
     scale = (weight * root * wanted).sum((1, 2)) / (weight * root * root).sum((1, 2)).clamp(min=1e-12)

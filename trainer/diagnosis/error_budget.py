@@ -21,7 +21,8 @@ from trainer.captures.held_out import split
 from trainer.fitting.predictor import Predictor
 from trainer.model.model import Model
 from trainer.networks.approximator import Approximator
-from trainer.training.pairs import display_irradiance, expected_counts, onto_camera, stacked
+from trainer.training.camera_to_panel import onto_camera
+from trainer.training.training_pairs import display_irradiance, expected_counts, stacked
 
 Progress = Callable[[float], None]
 

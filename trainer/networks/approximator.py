@@ -1,4 +1,4 @@
-"""The approximator D: irradiance plus what a network says is missing from it.
+"""The approximator D: irradiance plus a network's correction of it.
 
 Every network starts with its last layer at zero, so D starts as the identity, exactly.
 """
@@ -18,16 +18,18 @@ from torch import Tensor, nn
 
 from firmware_iface.errors import InputError, nearest
 from runtime.bundle.whole_files import whole_file
-from trainer.networks.baselines import Pix2Pix, Pix2PixHD, UNet
-from trainer.networks.compact import Compact
-from trainer.networks.published import Generator
+from trainer.networks.compact_network import CompactNetwork
+from trainer.networks.pix2pix import Pix2Pix
+from trainer.networks.pix2pixhd import Pix2PixHD
+from trainer.networks.published_generator import Generator
+from trainer.networks.unet import UNet
 
 FORMAT = "hololoop-approximator"
 DYNAMIC_RANGE = 1e-3  # of irradiance: added before square roots, whose slope is unbounded in the dark
 
 _NETWORKS: dict[str, Callable[[tuple[int, int], int, int], nn.Module]] = {
     "published": lambda shape, filters, planes: Generator(filters, planes),
-    "compact": Compact,
+    "compact": CompactNetwork,
     "unet": lambda shape, filters, planes: UNet(filters, planes),
     "pix2pix": lambda shape, filters, planes: Pix2Pix(filters, planes),
     "pix2pixhd": lambda shape, filters, planes: Pix2PixHD(filters, planes),
@@ -38,7 +40,19 @@ FULL_FILTERS = {"published": 64, "compact": 8, "unet": 32, "pix2pix": 64, "pix2p
 
 @dataclass(frozen=True)
 class Architecture:
-    """Which network, how wide (channels of its first layer), for which panel (rows, columns), for how many colours."""
+    """Which network, and for which panel.
+
+    Attributes
+    ----------
+    network : str
+        One of `NETWORKS`.
+    filters : int
+        Channels of its first layer, even.
+    shape : (int, int)
+        Rows and columns of the panel.
+    planes : int
+        Colours.
+    """
 
     network: str
     filters: int
@@ -68,7 +82,7 @@ class Approximator(nn.Module):
         return irradiance + self.network(irradiance)
 
     def adapters(self) -> dict[str, Tensor]:
-        """The weights of the last layer, by name: few, and linear in the result, so quick to refine."""
+        """The weights of the last layer, by name: few and linear in the result, so quick to refine."""
         return {n: p for n, p in self.named_parameters() if n.startswith("network.last.")}
 
 
@@ -77,14 +91,32 @@ def amplitude(irradiance: Tensor) -> Tensor:
     return torch.sqrt(torch.clamp(irradiance, min=0) + DYNAMIC_RANGE)
 
 
-def penalty(corrected: Tensor, target: Tensor) -> Tensor:
-    """Sum of squared differences of amplitude: what phase retrieval minimises. Target already scaled."""
+def penalty(corrected: Tensor, target: Tensor, weight: Tensor | float = 1.0) -> Tensor:
+    """Sum of squared differences of amplitude, which phase retrieval minimises.
+
+    Parameters
+    ----------
+    corrected, target : Tensor [..., C, H, W]
+        Irradiance; the target is already scaled to the corrected one.
+    weight : Tensor or float
+        How much a pixel counts.
+    """
     difference = amplitude(corrected) - amplitude(target)
-    return (difference * difference).sum()
+    return (weight * (difference * difference)).sum()
 
 
 def write_approximator(path: Path | str, network: Approximator, about: dict[str, Any]) -> None:
-    """Write a trained approximator as safetensors, whole or not at all; `about` says where it comes from."""
+    """Write a trained approximator as safetensors, whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    network : Approximator
+        What is written.
+    about : dict
+        Where it comes from, as JSON in the file's header.
+    """
     tensors = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
     header = {"format": FORMAT, "architecture": asdict(network.architecture), "about": about}
     with whole_file(path) as file:
@@ -92,7 +124,20 @@ def write_approximator(path: Path | str, network: Approximator, about: dict[str,
 
 
 def read_approximator(path: Path | str) -> tuple[Approximator, dict[str, Any]]:
-    """An approximator from its file, and what was said about it. Raises InputError where it is not one."""
+    """An approximator from its file.
+
+    Returns
+    -------
+    Approximator
+        In evaluation mode.
+    dict
+        Its `about`, as `write_approximator` got it.
+
+    Raises
+    ------
+    InputError
+        Where the file cannot be read or is not an approximator.
+    """
     try:
         with safe_open(path, "pt") as file:
             header = json.loads((file.metadata() or {}).get("hololoop", "{}"))

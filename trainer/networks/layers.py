@@ -1,4 +1,4 @@
-"""Layers with short gradients of their own, which the ONNX export traces into few operations."""
+"""Layers that state their own short gradients, so that the ONNX export traces them into few operations."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ EPS = 1e-5  # added to an instance's variance
 
 
 class _LeakyReLU(torch.autograd.Function):
-    """The slope is read off the result, so that the forward half needs to keep nothing else."""
+    """Saves the result alone: its sign gives the slope for the backward pass."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, slope: float) -> Tensor:
@@ -82,3 +82,8 @@ def cropped(x: Tensor, like: Tensor) -> Tensor:
     """The first rows and columns of x [B, C, H, W], as many as `like` has."""
     height, width = like.shape[2:]
     return x if x.shape[2:] == like.shape[2:] else _Crop.apply(x, height, width)
+
+
+def padded(x: Tensor, multiple: int) -> Tensor:
+    """Zeros below and to the right of x [B, C, H, W], up to a multiple of that many pixels."""
+    return functional.pad(x, (0, -x.shape[3] % multiple, 0, -x.shape[2] % multiple))

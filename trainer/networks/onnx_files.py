@@ -1,13 +1,12 @@
-"""An approximator as ONNX, with two entry points, which onnxruntime alone evaluates on the headset.
+"""An approximator as two ONNX files, which onnxruntime alone evaluates on the headset.
 
     approximator.onnx           irradiance -> corrected
     approximator_gradient.onnx  irradiance, target, adapters -> loss, corrected, gradient, gradient.ADAPTER for each
 
-The second is the whole way forward and back as one graph of plain operations: the network and torch's own gradient
-of it are traced together into ATen operations, with decompositions for those that ONNX lacks, so network and
-gradient cannot come apart. Arrays are [1, C, H, W], C the
-bundle's colours and H, W the panel. Adapters are the last layer's weights, and inputs: the
-headset refines them without a new export.
+The second file is the forward and the backward pass as one graph of plain operations. The network and torch's own
+gradient of it are traced together into ATen operations, with decompositions for those that ONNX lacks, so network and
+gradient always agree. Arrays are [1, C, H, W], C the bundle's colours and H, W the panel. Adapters are the last layer's
+weights. They are inputs, so the headset refines them without a new export.
 """
 
 from __future__ import annotations
@@ -59,7 +58,13 @@ def _total(x: Tensor, axes: Sequence[int]) -> Tensor:
 
 
 def onnx_files(network: Approximator) -> dict[str, bytes]:
-    """The files of an approximator, by name. Raises InputError for a network that has no export."""
+    """The files of an approximator, by name.
+
+    Raises
+    ------
+    InputError
+        For a network that has no export.
+    """
     if network.architecture.network not in EXPORTED:
         raise InputError(
             f"the network '{network.architecture.network}' is a baseline and is not exported: train "
@@ -69,13 +74,13 @@ def onnx_files(network: Approximator) -> dict[str, bytes]:
     shape = (1, network.architecture.planes, *network.architecture.shape)
     irradiance, target = torch.ones(shape), torch.ones(shape)
     adapters = {name: value.detach().clone() for name, value in network.adapters().items()}
-    joint = joint_gradient(network, tuple(adapters))
+    joint = _joint_gradient(network, tuple(adapters))
     arguments = (irradiance, target, *adapters.values())
     with _quiet():
-        forward = saved(network, (irradiance,), ["irradiance"], ["corrected"])
+        forward = onnx_bytes(network, (irradiance,), ["irradiance"], ["corrected"])
         graph = _traced(joint, arguments)
         names = ["loss", "corrected", "gradient", *(f"gradient.{name}" for name in adapters)]
-        gradient = saved(graph, arguments, ["irradiance", "target", *adapters], names)
+        gradient = onnx_bytes(graph, arguments, ["irradiance", "target", *adapters], names)
     return {APPROXIMATOR: forward, GRADIENT: gradient, ADAPTERS: safetensors.torch.save(adapters)}
 
 
@@ -85,7 +90,7 @@ def _frozen(network: Approximator) -> Approximator:
     return copy.requires_grad_(False).eval()
 
 
-def joint_gradient(network: Approximator, names: Sequence[str]) -> Callable[..., tuple[Tensor, ...]]:
+def _joint_gradient(network: Approximator, names: Sequence[str]) -> Callable[..., tuple[Tensor, ...]]:
     """(irradiance, target, adapters) to (loss, corrected, gradient over irradiance, gradients over adapters)."""
 
     def joint(irradiance: Tensor, target: Tensor, *weights: Tensor) -> tuple[Tensor, ...]:
@@ -108,7 +113,7 @@ def _traced(function: Callable[..., Any], arguments: tuple[Tensor, ...]) -> torc
     return graph
 
 
-def saved(module: Any, arguments: tuple[Tensor, ...], inputs: list[str], outputs: list[str]) -> bytes:
+def onnx_bytes(module: Any, arguments: tuple[Tensor, ...], inputs: list[str], outputs: list[str]) -> bytes:
     """A module as ONNX for arguments of these sizes."""
     program = torch.onnx.export(
         module,
@@ -119,8 +124,8 @@ def saved(module: Any, arguments: tuple[Tensor, ...], inputs: list[str], outputs
         opset_version=OPSET,
         verbose=False,
     )
-    if program is None:  # what the exporter returns to callers that give it a file, which is not done here
-        raise RuntimeError("torch.onnx.export returned no program")
+    if program is None:  # only where the exporter writes a file itself, which is not asked for here
+        raise RuntimeError("torch.onnx.export rerotated no program")
     buffer = io.BytesIO()
     import onnx
 
@@ -130,7 +135,7 @@ def saved(module: Any, arguments: tuple[Tensor, ...], inputs: list[str], outputs
 
 @contextmanager
 def _quiet() -> Any:
-    """The exporter warns of its own internals."""
+    """Without the exporter's warnings about its own internals."""
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
@@ -142,7 +147,7 @@ def _quiet() -> Any:
 
 
 def _decompositions() -> dict[Any, Callable[..., Any]]:
-    """How operations without a translation to ONNX are made of others; those with one of their own are kept."""
+    """Decompositions of operations without a translation to ONNX; operations that have one are kept."""
     from torch._decomp import core_aten_decompositions
 
     table: dict[Any, Callable[..., Any]] = dict(core_aten_decompositions())
@@ -167,17 +172,18 @@ def _convolution_backward(
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
     """Adjoints of a convolution (dilation 1), as convolutions and matrix products.
 
-    Over the input it is a convolution of the other kind: at stride 1 a plain one with the turned kernel, which
-    onnxruntime runs fastest. Over the weights it is one matrix product for each tap of the kernel.
+    Over the input it is a transposed convolution (a plain one where the forward one is transposed); at stride 1 a plain
+    one with the rotated kernel, which onnxruntime runs fastest. Over the weights it is one matrix product for each tap
+    of the kernel.
     """
     over_x = over_weight = over_bias = None
     one, zero = [1, 1], [0, 0]
     if wanted[0] and transposed:
         over_x = _aten.convolution.default(gradient, weight, None, stride, padding, one, False, zero, groups)
     elif wanted[0] and all(s == 1 for s in stride):
-        turned = _swapped(weight, groups).flip(2, 3)
+        rotated = _swapped(weight, groups).flip(2, 3)
         edge = [weight.shape[2 + i] - 1 - padding[i] for i in (0, 1)]
-        over_x = _aten.convolution.default(gradient, turned, None, one, edge, one, False, zero, groups)
+        over_x = _aten.convolution.default(gradient, rotated, None, one, edge, one, False, zero, groups)
     elif wanted[0]:
         rest = [
             x.shape[2 + i] - ((gradient.shape[2 + i] - 1) * stride[i] - 2 * padding[i] + weight.shape[2 + i])
@@ -210,7 +216,7 @@ def _over_weight(
     taps = []
     for i in range(rows):
         for j in range(columns):
-            seen = padded[
+            window = padded[
                 :,
                 :,
                 i : i + (height - 1) * stride[0] + 1 : stride[0],
@@ -218,7 +224,7 @@ def _over_weight(
             ]
             blocks = [
                 torch.mm(_flat(a), _flat(b).t())
-                for a, b in zip(narrow.chunk(groups, 1), seen.chunk(groups, 1), strict=True)
+                for a, b in zip(narrow.chunk(groups, 1), window.chunk(groups, 1), strict=True)
             ]
             taps.append(torch.cat(blocks) if groups > 1 else blocks[0])
     return torch.stack(taps, -1).reshape(*taps[0].shape, rows, columns)

@@ -1,5 +1,5 @@
-"""Reports: one self-contained HTML file that says at a glance how far a model is off, where and why."""
+"""Reports: one self-contained HTML file with the error of a model, its place and its likely cause."""
 
-from trainer.report.write import write_report
+from trainer.report.html_report import write_report
 
 __all__ = ["write_report"]

@@ -1,69 +1,39 @@
-"""Charts as SVG that stands in the page itself: its text and lines take the page's colours, light or dark."""
+"""The charts of a report, as SVG with a text description."""
 
 from __future__ import annotations
 
-import hashlib
-import io
-import re
 from collections.abc import Sequence
 from typing import Any
 
 import matplotlib
 import numpy as np
-from markupsafe import Markup, escape
+from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from trainer.formatting import number, percent, superscript
+from trainer.report.chart_style import (
+    CHART,
+    INK,
+    MAIN,
+    OTHER,
+    PAPER,
+    QUIET,
+    STYLE,
+    THIRD,
+    new_chart,
+    svg,
+)
 
-# Colours that stand for the page's own; each is replaced by a CSS value after drawing.
-INK, QUIET, GRID, PAPER = "#010101", "#020202", "#030303", "#070707"
-MAIN, OTHER, THIRD = "#040404", "#050505", "#060606"
-CSS = {
-    INK: "var(--ink)",
-    QUIET: "var(--quiet)",
-    GRID: "var(--line)",
-    PAPER: "var(--paper)",
-    MAIN: "var(--main)",
-    OTHER: "var(--other)",
-    THIRD: "var(--third)",
-}
-STYLE: Any = {
-    "svg.fonttype": "none",
-    "svg.hashsalt": "hololoop",
-    "text.parse_math": False,
-    "font.family": ["DejaVu Sans"],
-    "font.size": 9.5,
-    "text.color": INK,
-    "axes.edgecolor": QUIET,
-    "axes.labelcolor": INK,
-    "axes.titlecolor": INK,
-    "axes.facecolor": "none",
-    "figure.facecolor": "none",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": GRID,
-    "grid.linewidth": 0.8,
-    "xtick.color": QUIET,
-    "ytick.color": QUIET,
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "lines.linewidth": 2.0,
-    "legend.frameon": False,
-    "legend.fontsize": 9,
-}
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
-CHART = (4.6, 3.0)  # inches
 
 
-def frequency(rows: Sequence[dict[str, Any]]) -> Markup:
+def frequency_chart(rows: Sequence[dict[str, Any]]) -> Markup:
     """Power spectra of the error, of the expected noise and of the signal, logarithmic."""
     f = [r["cycles_per_pixel"] for r in rows]
     with matplotlib.rc_context(STYLE):
-        figure, axes = _new()
+        figure, axes = new_chart()
         axes.fill_between(
             f, [r["noise"] for r in rows], [r["error"] for r in rows], color=MAIN, alpha=0.15, linewidth=0
         )
@@ -82,7 +52,7 @@ def frequency(rows: Sequence[dict[str, Any]]) -> Markup:
             f"Power of signal, error and expected noise over spatial frequency, from {number(low)} to "
             f"{number(top)} counts squared on a logarithmic scale; {frequency_words(rows)}"
         )
-        return _svg(figure, text)
+        return svg(figure, text)
 
 
 def frequency_words(rows: Sequence[dict[str, Any]]) -> str:
@@ -100,12 +70,12 @@ def frequency_words(rows: Sequence[dict[str, Any]]) -> str:
     )
 
 
-def brightness(rows: Sequence[dict[str, Any]]) -> Markup:
-    """Root of the mean squared error above the noise, the noise and the bias over the predicted counts."""
+def brightness_chart(rows: Sequence[dict[str, Any]]) -> Markup:
+    """Root mean squared error above the noise, the noise and the bias over the predicted counts."""
     x = [r["counts"] for r in rows]
     above = [max(r["error"], 0.0) ** 0.5 for r in rows]
     with matplotlib.rc_context(STYLE):
-        figure, axes = _new()
+        figure, axes = new_chart()
         axes.axhline(0, color=QUIET, linewidth=0.8)
         axes.plot(x, above, color=MAIN, marker="o", markersize=3.5, label="model error, rms above noise")
         axes.plot(
@@ -123,10 +93,10 @@ def brightness(rows: Sequence[dict[str, Any]]) -> Markup:
             f"{number(rows[0]['noise'] ** 0.5)} to {number(rows[-1]['noise'] ** 0.5)}, largest bias "
             f"{number(worst['bias'])} counts at {number(worst['counts'])} counts."
         )
-        return _svg(figure, text)
+        return svg(figure, text)
 
 
-def time(rows: Sequence[dict[str, Any]]) -> Markup:
+def time_chart(rows: Sequence[dict[str, Any]]) -> Markup:
     """Each capture's own gain and excess over the time it was taken."""
     channels = list(dict.fromkeys(r["channel"] for r in rows))
     with matplotlib.rc_context(STYLE):
@@ -152,7 +122,7 @@ def time(rows: Sequence[dict[str, Any]]) -> Markup:
             upper.set_ylim(min(low, 0.99), max(high, 1.01))
         if len(channels) > 1:
             _legend_above(figure, upper)
-        return _svg(figure, f"Gain and excess of each held-out capture over time: {time_words(rows)}")
+        return svg(figure, f"Gain and excess of each held-out capture over time: {time_words(rows)}")
 
 
 def time_words(rows: Sequence[dict[str, Any]]) -> str:
@@ -165,7 +135,7 @@ def time_words(rows: Sequence[dict[str, Any]]) -> str:
     return f"the captures' own gains run from {number(min(gains), 4)} to {number(max(gains), 4)}."
 
 
-def ladder(labels: Sequence[str], nrmse: Sequence[float], noise: float | None) -> Markup:
+def ladder_chart(labels: Sequence[str], nrmse: Sequence[float], noise: float | None) -> Markup:
     """Held-out error after each step, from top to bottom, with the noise floor drawn in."""
     y = np.arange(len(labels))
     with matplotlib.rc_context(STYLE):
@@ -182,7 +152,7 @@ def ladder(labels: Sequence[str], nrmse: Sequence[float], noise: float | None) -
         axes.plot(nrmse, y, color=MAIN, linewidth=1.2, alpha=0.6)
         axes.plot(nrmse, y, color=MAIN, marker="o", markersize=7, linestyle="none")
         for value, row in zip(nrmse, y, strict=True):
-            _beside(axes, percent(value), (value, float(row)))
+            _label_right(axes, percent(value), (value, float(row)))
         axes.set_xscale("log")
         axes.set_xlim(low, max(nrmse) * 1.35)
         axes.set_ylim(len(labels) - 0.5, -0.5)
@@ -193,7 +163,7 @@ def ladder(labels: Sequence[str], nrmse: Sequence[float], noise: float | None) -
         axes.set_xlabel("held-out error, rms, share of the signal's spread (logarithmic)")
         steps = ", ".join(f"{a} {percent(v)}" for a, v in zip(labels, nrmse, strict=True))
         floor = f"; the camera's noise alone is {percent(noise)}" if noise else ""
-        return _svg(figure, f"Held-out error after each step: {steps}{floor}.")
+        return svg(figure, f"Held-out error after each step: {steps}{floor}.")
 
 
 def stage_bars(rows: Sequence[dict[str, Any]], total: float | None, chosen: str | None) -> Markup:
@@ -208,7 +178,7 @@ def stage_bars(rows: Sequence[dict[str, Any]], total: float | None, chosen: str 
             bar.set_alpha(1.0 if name == chosen else 0.55)
         for k, value in enumerate(values):
             share = f" ({percent(value / total, 2)})" if total and total > 0 else ""
-            _beside(axes, number(value) + share, (max(value, 0.0), k))
+            _label_right(axes, number(value) + share, (max(value, 0.0), k))
         if total and total > 0:
             axes.axvline(total, color=INK, linewidth=1.2, linestyle="--")
             axes.annotate(
@@ -222,11 +192,11 @@ def stage_bars(rows: Sequence[dict[str, Any]], total: float | None, chosen: str 
         axes.tick_params(axis="y", length=0)
         axes.set_xlabel("excess removed on held-out captures by a free-form probe of that stage alone")
         said = ", ".join(f"{n} {number(v)}" for n, v in zip(names, values, strict=True))
-        return _svg(figure, f"Excess removed by each stage's probe: {said}.")
+        return svg(figure, f"Excess removed by each stage's probe: {said}.")
 
 
-def forest(rows: Sequence[dict[str, Any]], least: float | None) -> Markup:
-    """Excess that each effect removes with its interval; filled where it is worth adding."""
+def forest_plot(rows: Sequence[dict[str, Any]], least: float | None) -> Markup:
+    """Excess that each effect removes, with its interval; filled where it is worth adding."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(7.2, 1.1 + 0.3 * len(rows)), layout="constrained")
         axes = figure.subplots()
@@ -252,35 +222,30 @@ def forest(rows: Sequence[dict[str, Any]], least: float | None) -> Markup:
         axes.tick_params(axis="y", length=0)
         axes.set_xlabel("excess removed on held-out captures, with 95 % interval")
         said = ", ".join(f"{r['effect']} {number(r['excess_removed'])}" for r in rows)
-        return _svg(figure, f"Excess removed by each effect with its interval, best first: {said}.")
+        return svg(figure, f"Excess removed by each effect with its interval, best first: {said}.")
 
 
 def is_worth(row: dict[str, Any], least: float | None) -> bool:
-    """Is an effect of the ranking worth adding: what the diagnosis says, or else its interval."""
+    """Whether an effect of the ranking is worth adding: by the diagnosis, or else by its interval."""
     if "worth_adding" in row:
         return bool(row["worth_adding"])
     low, _ = row.get("ci95") or (0.0, 0.0)
     return bool(low > 0 and row["excess_removed"] > (least or 0.0))
 
 
-def curve(values: np.ndarray, title: str, unit: str) -> Markup:
+def curve_chart(values: np.ndarray, title: str, unit: str) -> Markup:
     """A fitted probe that is a curve."""
     with matplotlib.rc_context(STYLE):
-        figure, axes = _new((3.0, 2.3))
+        figure, axes = new_chart((3.0, 2.3))
         axes.axhline(0, color=QUIET, linewidth=0.8)
         axes.plot(values, color=MAIN)
         axes.set_ylabel("" if unit == "1" else unit)
         axes.margins(x=0.01)
         text = f"Curve of {title}: {len(values)} points from {number(float(np.nanmin(values)))} to "
-        return _svg(figure, f"{text}{number(float(np.nanmax(values)))} {'' if unit == '1' else unit}.")
+        return svg(figure, f"{text}{number(float(np.nanmax(values)))} {'' if unit == '1' else unit}.")
 
 
-def _new(size: tuple[float, float] = CHART) -> tuple[Figure, Axes]:
-    figure = Figure(figsize=size, layout="constrained")
-    return figure, figure.subplots()
-
-
-def _beside(axes: Axes, text: str, place: tuple[float, float]) -> None:
+def _label_right(axes: Axes, text: str, place: tuple[float, float]) -> None:
     box = {"facecolor": PAPER, "edgecolor": "none", "pad": 1.0, "alpha": 0.85}
     axes.annotate(text, place, xytext=(8, 0), textcoords="offset points", va="center", bbox=box)
 
@@ -298,22 +263,3 @@ def _log_ticks(axes: Axes) -> None:
     axes.xaxis.set_major_locator(LogLocator(10, subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: percent(value, 1)))
     axes.xaxis.set_minor_formatter(NullFormatter())
-
-
-def _svg(figure: Figure, alt: str) -> Markup:
-    """The figure as an <svg> element without links, and with ids of its own."""
-    stream = io.StringIO()
-    figure.savefig(stream, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
-    text = stream.getvalue()
-    text = text[text.index("<svg") :]
-    text = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", text, flags=re.DOTALL)
-    text = re.sub(r'\sxmlns(:\w+)?="[^"]*"', "", text)
-    text = re.sub(r'^<svg([^>]*?)\swidth="[^"]*"', r"<svg\1", text)
-    text = re.sub(r'^<svg([^>]*?)\sheight="[^"]*"', r"<svg\1", text)
-    for stand_in, css in CSS.items():
-        text = text.replace(stand_in, css)
-    used = set(re.findall(r'(?:url\(#|href="#)([\w-]+)', text))
-    prefix = "c" + hashlib.sha256(text.encode()).hexdigest()[:8]
-    text = re.sub(r'\sid="([\w.-]+)"', lambda m: f' id="{prefix}{m[1]}"' if m[1] in used else "", text)
-    text = re.sub(r'(url\(#|href="#)([\w-]+)', rf"\g<1>{prefix}\g<2>", text)
-    return Markup(text.replace("<svg", f'<svg role="img" aria-label="{escape(alt)}"', 1))

@@ -1,1 +1,1 @@
-"""Training of an approximator on what the camera saw."""
+"""Training of an approximator and of an initialiser: pairs to learn from, losses, metrics, and the training run."""

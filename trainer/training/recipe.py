@@ -1,6 +1,7 @@
 """How a network is trained: its architecture, its losses and its optimiser, under a name.
 
-The published loss is l1 + perceptual + adversarial; an ablation is the published recipe with one of them changed.
+The loss of Chakravarthula et al. 2020 is l1 + perceptual + adversarial ("published" below). An ablation is that recipe
+with one thing changed.
 """
 
 from __future__ import annotations
@@ -10,18 +11,31 @@ from dataclasses import dataclass, replace
 from firmware_iface.errors import InputError, nearest
 from trainer.networks.approximator import FULL_FILTERS
 
-STEPS = 40000  # as published
+STEPS = 40000  # Chakravarthula et al. 2020
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """network : a name of `trainer.networks.approximator`; filters : channels of its first layer
+    """Architecture, losses and optimiser of a training.
 
-    l1, perceptual, adversarial, matching : weights of the losses, of pictures 0 .. 1; matching is of the
-    discriminator's features. conditional : the discriminator sees the network's input too.
-    critics : discriminators, each at half the size of the one before; receptive : pixels that each one sees, 94 or 70.
-    cross_entropy : the adversarial loss is the logistic one, not least squares (Mao et al. 2017).
-    rate, betas : of Adam
+    Attributes
+    ----------
+    network : str
+        One of `trainer.networks.approximator.NETWORKS`.
+    filters : int
+        Channels of its first layer.
+    l1, perceptual, adversarial, matching : float
+        Weights of the losses, of pictures 0 .. 1; matching is of the discriminator's features.
+    conditional : bool
+        Whether the discriminator sees the network's input too.
+    critics : int
+        Discriminators, each at half the size of the one before.
+    receptive : int, pixels
+        Side of the patch that each of their judgements sees, 94 or 70.
+    cross_entropy : bool
+        Whether the adversarial loss is the logistic one (Isola et al. 2017), not least squares (Mao et al. 2017).
+    rate, betas : float, (float, float)
+        Of Adam.
     """
 
     network: str = "published"
@@ -61,7 +75,13 @@ RECIPES: dict[str, Recipe] = {
 
 
 def recipe_named(name: str) -> Recipe:
-    """The recipe of that name. Raises InputError that suggests the nearest."""
+    """The recipe of that name.
+
+    Raises
+    ------
+    InputError
+        For an unknown name, with the nearest known one.
+    """
     if name not in RECIPES:
         raise InputError(f"there is no network '{name}': {nearest(name, RECIPES)}")
     return RECIPES[name]

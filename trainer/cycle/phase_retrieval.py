@@ -1,18 +1,19 @@
-"""Phase retrieval for the cycle: named methods, from a wanted volume to gray levels of each colour.
+"""Phase retrieval for the cycle: named methods, from a target volume to gray levels of each colour.
 
     double_phase, gerchberg_saxton, wirtinger   through the model's light path (Hsueh and Sawchuk 1978; Gerchberg and
                                                 Saxton 1972; Chakravarthula et al. 2019)
-    wirtinger_no_zero_order                     the same, with the iris beside the zero order and a ramp on the pattern
-    hardware_in_the_loop                        Wirtinger descent through light path and network (seed eq. 14-23)
+    wirtinger_no_zero_order                     the same, with the iris next to the zero order and a ramp on the pattern
+    hardware_in_the_loop                        Wirtinger descent through light path and network
+                                                (Chakravarthula et al. 2020, eq. 14-23)
 
-All but the last are the headset's own solver. The last, and every stack of planes, is the trainer's light path and
-network differentiated together: a network that is still learning has no ONNX file, and the solver's stacks have no D.
+All but the last are the headset's own solver. The last, and every stack of planes, differentiates the trainer's light
+path and the network together: a network that is still learning has no ONNX file, and the solver's stacks have no
+approximator.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -21,11 +22,12 @@ from torch import Tensor
 from firmware_iface.errors import InputError, nearest
 from runtime.lightpath.light_path import LightPath, irradiance, panel_phase, pixel_irradiance
 from runtime.solver import DriveRange, solve
+from trainer.cycle.target_pictures import TargetVolume
 from trainer.effects.effect_catalogue import BUILT_IN
 from trainer.model.export import acting_on_display, baked_path
 from trainer.model.model import Model, absent
 from trainer.model.model_stages import scene_for, stages_of
-from trainer.networks.approximator import Approximator, amplitude
+from trainer.networks.approximator import Approximator, penalty
 from trainer.prediction.predict import light_path
 
 SOLVERS = {
@@ -38,34 +40,14 @@ SOLVERS = {
 METHODS = tuple(SOLVERS)
 ITERATIONS = 60
 RATE, BETAS = 0.05, (0.8, 0.95)  # of Adam, rad: quick and without overshoot from a start that is nearly right
-CARRIER, OPENING = (
-    0.3,
-    0.26,
-)  # of the panel's band: where the iris stands beside the zero order, and its half width
+# Of the panel's band: centre of the iris that keeps the zero order out, and its half width.
+CARRIER, OPENING = 0.3, 0.26
 
 Progress = Callable[[float], None]
 
 
-@dataclass(frozen=True)
-class Volume:
-    """What is to be seen: irradiance [K, C, H, W] of any scale on K planes (mm), each colour and pixel.
-
-    weight [K, H, W]: how much a pixel of a plane counts; a scene in depth counts each pixel where it is in focus.
-    """
-
-    name: str
-    planes_mm: tuple[float, ...]
-    irradiance: np.ndarray
-    weight: np.ndarray
-
-    @staticmethod
-    def flat(name: str, plane_mm: float, picture: np.ndarray) -> Volume:
-        """A picture [C, H, W] on one plane."""
-        return Volume(name, (plane_mm,), picture[None], np.ones((1, *picture.shape[1:]), np.float32))
-
-
 def beside_zero_order(model: Model) -> Model:
-    """The model with the iris beside the zero order, as the seed's prototype has it (its section 5).
+    """The model with the iris next to the zero order (Chakravarthula et al. 2020, section 5).
 
     Patterns then carry a phase ramp, which takes the picture's band into the iris; undiffracted light stays out.
     """
@@ -77,18 +59,41 @@ def beside_zero_order(model: Model) -> Model:
 
 def retrieve(
     model: Model,
-    wanted: Volume,
+    wanted: TargetVolume,
     method: str = "hardware_in_the_loop",
     network: Approximator | None = None,
     iterations: int = ITERATIONS,
     progress: Progress | None = None,
     start: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Gray levels of each colour, uint8 [C, H, W].
+    """Patterns that show a target.
 
-    start : gray levels to begin from, where the method descends. network : what `hardware_in_the_loop` looks through;
-    None is the identity, with which it is plain Wirtinger descent.
-    Raises InputError for a method that is not there, and a method of one plane for a volume of several.
+    Parameters
+    ----------
+    model : Model
+        Of the bench; effects that act on the camera alone are left out.
+    wanted : TargetVolume
+        What is to be shown.
+    method : str
+        One of `METHODS`.
+    network : Approximator or None
+        The approximator of `hardware_in_the_loop`; None is the identity, which makes it plain Wirtinger descent.
+    iterations : int
+        Of the descent.
+    progress : callable or None
+        Called with the share done.
+    start : uint8 array [C, H, W] or None
+        Gray levels to begin from, where the method descends.
+
+    Returns
+    -------
+    uint8 array [C, H, W]
+        Gray levels of each colour.
+
+    Raises
+    ------
+    InputError
+        For an unknown method, and for a method of one plane with a volume of several.
     """
     if method not in METHODS:
         raise InputError(f"there is no phase retrieval '{method}': {nearest(method, METHODS)}")
@@ -99,8 +104,8 @@ def retrieve(
         network = None
     if SOLVERS[method] != "bfgs":
         start = None
-    if network is not None or (len(wanted.planes_mm) > 1 and SOLVERS[method] == "bfgs"):
-        return _through(model, wanted, network, iterations, progress, start)
+    if network is not None or (len(wanted.planes_mm) > 1 and SOLVERS[method] == "default"):
+        return _through_network(model, wanted, network, iterations, progress, start)
     if len(wanted.planes_mm) > 1:
         raise InputError(
             f"'{method}' shows one plane and {wanted.name} has {len(wanted.planes_mm)}: use wirtinger or "
@@ -112,7 +117,7 @@ def retrieve(
 
 def _solved(
     path: LightPath,
-    wanted: Volume,
+    wanted: TargetVolume,
     colour: int,
     method: str,
     iterations: int,
@@ -124,22 +129,22 @@ def _solved(
     return solution.gray.copy(), solution.phase.copy()
 
 
-def _through(
+def _through_network(
     model: Model,
-    wanted: Volume,
+    wanted: TargetVolume,
     network: Approximator | None,
     iterations: int,
     progress: Progress | None,
     start: np.ndarray | None,
 ) -> np.ndarray:
-    """Adam on the penalty of what the network makes of the light, all colours and planes at once.
+    """Adam on the penalty of the network's corrected irradiance, all colours and planes at once.
 
-    Begins with `start`, or what the solver finds without the network for the plane that counts most; the best pattern
-    met is kept.
+    It begins with `start`, or with the solver's result without the network for the plane that counts most, and returns
+    the best pattern of all steps.
     """
     first = int(np.argmax(wanted.weight.sum((1, 2))))
     plane = wanted.planes_mm[first]
-    flat = Volume.flat(wanted.name, plane, np.sum(wanted.weight[:, None] * wanted.irradiance, 0))
+    flat = TargetVolume.flat(wanted.name, plane, np.sum(wanted.weight[:, None] * wanted.irradiance, 0))
     baked = [baked_path(model, c.name, plane) for c in model.bench.channels]
     if start is None:
         begin = [_solved(path, flat, c, "wirtinger", iterations)[1] for c, path in enumerate(baked)]
@@ -176,21 +181,31 @@ def loss_of(
     weight: Tensor,
     network: Callable[[Tensor], Tensor] | None,
 ) -> Tensor:
-    """The penalty of phases [C, H, W] (rad), sum over planes, colours and pixels that count.
+    """The penalty of phases, sum over planes, colours and pixels that count.
 
-    paths : light paths [K][C] on tensors. target [K, C, H, W] is scaled to what is seen, a colour each.
+    Parameters
+    ----------
+    phase : Tensor [C, H, W], rad
+        Of the panel, for each colour.
+    paths : list of list of LightPath
+        [K][C], on tensors.
+    target : Tensor [K, C, H, W]
+        Wanted irradiance; each colour is scaled to the corrected irradiance.
+    weight : Tensor [K, 1, H, W]
+        How much a pixel of a plane counts.
+    network : callable or None
+        The approximator; None is the identity.
     """
     light = torch.stack(
         [torch.stack([_light(path, phase[c]) for c, path in enumerate(row)]) for row in paths]
     )
-    seen = light if network is None else network(light)
+    corrected = light if network is None else network(light)
     with torch.no_grad():
-        root, wanted = torch.sqrt(seen.clamp(min=0)), torch.sqrt(target)
+        root, wanted = torch.sqrt(corrected.clamp(min=0)), torch.sqrt(target)
         scale = (
             (root * wanted * weight).sum((0, 2, 3)) / (target * weight).sum((0, 2, 3)).clamp(min=1e-12)
         ) ** 2
-        asked = amplitude(target * scale[None, :, None, None])
-    return (weight * (amplitude(seen) - asked) ** 2).sum()
+    return penalty(corrected, target * scale[None, :, None, None], weight)
 
 
 def torch_path(model: Model, channel: str, plane_mm: float, dtype: torch.dtype = torch.float32) -> LightPath:

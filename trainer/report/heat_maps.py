@@ -1,11 +1,7 @@
-"""Arrays as pictures in a page: a small palette PNG as a data URI, with ticks, a colour bar, and a text that
-says what is seen.
-"""
+"""Arrays as heat maps in a page: a small palette PNG as a data URI, with ticks, a colour bar and a text description."""
 
 from __future__ import annotations
 
-import base64
-import io
 from dataclasses import dataclass
 
 import matplotlib
@@ -14,6 +10,7 @@ from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
 from trainer.formatting import number
+from trainer.report.png_uri import png_uri
 
 IRRADIANCE = "viridis"
 ERROR = "cividis"
@@ -26,15 +23,39 @@ BAR = 9  # stops of a colour bar
 
 @dataclass(frozen=True)
 class Tick:
-    """A label at a share (per cent) of an axis."""
+    """A label on an axis.
+
+    Attributes
+    ----------
+    at : float, per cent
+        Of the axis' length.
+    text : str
+        The label.
+    """
 
     at: float
     text: str
 
 
 @dataclass(frozen=True)
-class Map:
-    """A picture with its axes. width, height : pixels of the array; bar : CSS gradient of the colour bar."""
+class HeatMap:
+    """A picture with its axes.
+
+    Attributes
+    ----------
+    title, alt, note : str
+        Heading, text description and caption.
+    uri : str
+        The PNG as a data URI.
+    width, height : float, pixels
+        Of the array.
+    x, y, scale : tuple of Tick
+        Of the axes and of the colour bar.
+    bar : str
+        CSS gradient of the colour bar.
+    unit : str
+        Of the values.
+    """
 
     title: str
     uri: str
@@ -49,7 +70,7 @@ class Map:
     note: str = ""
 
 
-def draw(
+def heat_map(
     title: str,
     array: np.ndarray,
     alt: str,
@@ -59,23 +80,35 @@ def draw(
     extent: tuple[float, float, float, float] | None = None,
     largest: int = LARGEST,
     note: str = "",
-) -> Map:
-    """A picture of an array [row, column]; NaN is gray.
+) -> HeatMap:
+    """A picture of an array; NaN is gray.
 
-    scale : what the two ends of the colour bar stand for; values beyond are drawn as the ends
-    extent : top, left, height, width that the axes show; the array's own pixels if not given
+    Parameters
+    ----------
+    title, alt, unit, note : str
+        As of `HeatMap`.
+    array : array [H, W]
+        Values.
+    scale : (float, float)
+        Values at the two ends of the colour bar; values beyond are drawn as the ends.
+    colours : str
+        Name of a matplotlib colour map.
+    extent : (float, float, float, float) or None, pixels
+        Top, left, height and width that the axes show; None: the array's own.
+    largest : int, pixels
+        Side above which the picture shows means of blocks.
     """
     top, left, height, width = extent or (0.0, 0.0, float(array.shape[0]), float(array.shape[1]))
     factor = -(-max(array.shape) // largest)
     small = blocks(array, factor)
     low, high = scale if scale[1] > scale[0] else (scale[0], scale[0] + 1)
     index = np.full(small.shape, LEVELS, dtype=np.uint8)
-    seen = np.isfinite(small)
-    index[seen] = np.clip(np.rint((small[seen] - low) / (high - low) * (LEVELS - 1)), 0, LEVELS - 1)
+    finite = np.isfinite(small)
+    index[finite] = np.clip(np.rint((small[finite] - low) / (high - low) * (LEVELS - 1)), 0, LEVELS - 1)
     words = [note] if note else []
     if factor > 1:
         words.append(f"each point is the mean of {factor} × {factor} pixels")
-    return Map(
+    return HeatMap(
         title,
         _png(index, colours),
         alt,
@@ -91,19 +124,19 @@ def draw(
 
 
 def blocks(array: np.ndarray, factor: int) -> np.ndarray:
-    """Means over blocks of factor x factor pixels, NaN left out; a rest at the border is cut off."""
+    """Means over blocks of factor x factor pixels, without NaN; what is left at the border is cut off."""
     if factor <= 1:
         return array
     height, width = (n // factor * factor for n in array.shape)
     parts = array[:height, :width].reshape(height // factor, factor, width // factor, factor)
-    seen = np.isfinite(parts)
-    count = seen.sum((1, 3))
-    total = np.where(seen, parts, 0).sum((1, 3), dtype=np.float64)
+    finite = np.isfinite(parts)
+    count = finite.sum((1, 3))
+    total = np.where(finite, parts, 0).sum((1, 3), dtype=np.float64)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 def place(y: float, x: float) -> str:
-    """Words for a place, given as shares of height and width."""
+    """A place in words, from its shares of height and width."""
     rows, columns = ("upper ", "", "lower "), ("left", "centre", "right")
     row, column = min(int(y * 3), 2), min(int(x * 3), 2)
     if row == column == 1:
@@ -114,7 +147,7 @@ def place(y: float, x: float) -> str:
 
 
 def symmetric(arrays: list[np.ndarray], share: float = 99.7) -> tuple[float, float]:
-    """A scale about zero that all but a few values fit in."""
+    """A scale about zero that holds all but a few values."""
     values = np.concatenate([np.abs(a[np.isfinite(a)]).ravel() for a in arrays])
     top = float(np.percentile(values, share)) if values.size else 1.0
     top = top or float(values.max(initial=0.0)) or 1.0
@@ -122,7 +155,7 @@ def symmetric(arrays: list[np.ndarray], share: float = 99.7) -> tuple[float, flo
 
 
 def from_zero(arrays: list[np.ndarray], share: float = 99.8) -> tuple[float, float]:
-    """A scale from zero that all but a few values fit in."""
+    """A scale from zero that holds all but a few values."""
     values = np.concatenate([a[np.isfinite(a)].ravel() for a in arrays])
     return 0.0, (float(np.percentile(values, share)) if values.size else 1.0) or 1.0
 
@@ -131,9 +164,7 @@ def _png(index: np.ndarray, colours: str) -> str:
     palette = np.rint(matplotlib.colormaps[colours](np.linspace(0, 1, LEVELS))[:, :3] * 255).astype(np.uint8)
     picture = Image.fromarray(index)
     picture.putpalette(bytes(palette.tobytes()) + bytes(MISSING))
-    stream = io.BytesIO()
-    picture.save(stream, "PNG", optimize=True)
-    return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
+    return png_uri(picture)
 
 
 def _ticks(start: float, length: float) -> tuple[Tick, ...]:

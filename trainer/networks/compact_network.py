@@ -1,8 +1,8 @@
-"""The compact approximator: small enough to stand in the headset's loop.
+"""The compact network: small enough for the headset's loop.
 
-Colours are shown one after another and their light does not mix, so each has its own weights (groups). What a
-bench does at fixed places, dust, fringes and seams, is a map of gain and offset over the panel's picture; what it
-does everywhere alike, blur and ghosts, is a convolution, here of whole patches at a time.
+Colours are shown one after another and their light does not mix, so each has its own weights (groups). Faults at fixed
+places (dust, fringes, seams) are a map of gain and offset over the panel's picture. Faults that are the same everywhere
+(blur, ghosts) are a convolution, here of whole patches at a time.
 """
 
 from __future__ import annotations
@@ -11,17 +11,26 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from trainer.networks.layers import LeakyReLU, cropped
+from trainer.networks.layers import LeakyReLU, cropped, padded
 
 SLOPE = 0.02
 
 
-class Compact(nn.Module):
+class CompactNetwork(nn.Module):
     """Gain and offset maps plus patch convolutions: irradiance [B, C, H, W] to its change, same shape.
 
-    shape : panel (rows, columns); irradiance of another size is refused by torch
-    filters : channels a colour between the patches; 0 leaves the convolutions out
-    cell : side of a cell of the maps, pixels; 0 leaves the maps out
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns of the panel; torch refuses irradiance of another size.
+    filters : int
+        Channels between the patches, for each colour; 0 leaves the convolutions out.
+    planes : int
+        Colours C.
+    cell : int, pixels
+        Side of a cell of the maps; 0 leaves the maps out.
+    patch : int, pixels
+        Side of a patch.
     """
 
     def __init__(
@@ -47,15 +56,14 @@ class Compact(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         change = torch.zeros_like(x)
         if hasattr(self, "first"):
-            padded = functional.pad(x, (0, -x.shape[3] % self.patch, 0, -x.shape[2] % self.patch))
-            change = cropped(self.last(self.inner(self.first(padded))), x)
+            change = cropped(self.last(self.inner(self.first(padded(x, self.patch)))), x)
         if self.cell:
-            gain, offset = self.fields()
+            gain, offset = self.maps_at_pixels()
             change = change + x * gain + offset
         return change
 
-    def fields(self) -> Tensor:
-        """Gain and offset at every pixel, [2, C, H, W], straight lines between the cells' centres."""
+    def maps_at_pixels(self) -> Tensor:
+        """Gain and offset at every pixel, [2, C, H, W], linear between the cells' centres."""
         if self.cell == 1:
             return self.maps
         size = [n * self.cell for n in self.maps.shape[2:]]

@@ -1,4 +1,4 @@
-"""The parts of a report that show what was seen: pictures, and where the error lies."""
+"""A report's sections on the error: numbers, measured and predicted pictures, and where the error lies."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 
 from trainer.formatting import number, percent
-from trainer.report import charts
-from trainer.report.array_pictures import (
+from trainer.report.charts import brightness_chart, frequency_chart, frequency_words, time_chart, time_words
+from trainer.report.heat_maps import (
     DIFFERENCE,
     ERROR,
     IRRADIANCE,
     LARGEST,
-    Map,
-    draw,
+    HeatMap,
     from_zero,
+    heat_map,
     place,
     symmetric,
 )
@@ -47,7 +47,7 @@ def facts(compared: Any, heldout: Any, found: Any) -> list[tuple[str, str, str]]
 
 
 def _budget(budget: Mapping[str, float]) -> list[tuple[str, str, str]]:
-    """The parts of the ideal model's error, the network's only where there is one."""
+    """The parts of the ideal model's error; the network's only where there is one."""
     words = {
         "named_physics": "named physics explains",
         "network": "what was learned explains",
@@ -62,10 +62,10 @@ def _budget(budget: Mapping[str, float]) -> list[tuple[str, str, str]]:
     ]
 
 
-def pictures(shown: Sequence[Any]) -> list[dict[str, Any]]:
+def pictures(compared: Sequence[Any]) -> list[dict[str, Any]]:
     """Measured, predicted and difference of each capture, the first two on one scale."""
     groups = []
-    for number_of, p in enumerate(shown):
+    for number_of, p in enumerate(compared):
         what = f"capture {p.capture}, {p.channel}, {p.plane_mm:g} mm"
         error = "" if p.excess is None else f"error {percent(p.nrmse)}, excess {number(p.excess)}"
         groups.append({"heading": what, "note": error, "maps": _triple(p, what, None)})
@@ -77,7 +77,7 @@ def pictures(shown: Sequence[Any]) -> list[dict[str, Any]]:
     return groups
 
 
-def _triple(p: Any, what: str, corner: tuple[int, int] | None) -> list[Map]:
+def _triple(p: Any, what: str, corner: tuple[int, int] | None) -> list[HeatMap]:
     extent, arrays = None, [p.measured, p.predicted, p.difference]
     if corner is not None:
         top, left = corner
@@ -96,14 +96,14 @@ def _triple(p: Any, what: str, corner: tuple[int, int] | None) -> list[Map]:
             f"{name.capitalize()} picture of {what}: mean {number(float(array.mean()))} counts, brightest in "
             f"the {_brightest(array)}; same colour scale as its neighbour, 0 to {number(light[1])} counts."
         )
-        maps.append(draw(name, array, alt, "counts above black", light, IRRADIANCE, extent))
+        maps.append(heat_map(name, array, alt, "counts above black", light, IRRADIANCE, extent))
     alt = (
         f"Measured less predicted for {what}: rms {number(rms)} counts, largest in the {where}; colours are "
         f"symmetric about zero, to ± {number(apart[1])} counts{lost}."
     )
     note = f"rms {number(rms)} counts, own scale, symmetric about 0{lost}"
     title = "difference (measured − predicted)"
-    maps.append(draw(title, arrays[2], alt, "counts", apart, DIFFERENCE, extent, note=note))
+    maps.append(heat_map(title, arrays[2], alt, "counts", apart, DIFFERENCE, extent, note=note))
     return maps
 
 
@@ -135,20 +135,20 @@ def where(compared: dict[str, Any], shape: tuple[int, int] | None) -> dict[str, 
     """The error over the field, over frequency, brightness and time, and by colour and plane."""
     if not compared.get("where"):
         return None
-    found = compared["where"]
+    parts = compared["where"]
     columns = {
         key: [{"name": name, **row} for name, row in compared.get(key, {}).items()]
         for key in ("by_channel", "by_plane")
     }
     everything = [r["excess"] for rows in columns.values() for r in rows if r["excess"] is not None]
-    rows, frequency = found.get("time") or [], found.get("frequency") or []
+    times, spectrum, levels = (parts.get(key) or [] for key in ("time", "frequency", "brightness"))
     return {
-        "field": _field(found, shape),
-        "frequency": charts.frequency(frequency) if frequency else None,
-        "frequency_words": charts.frequency_words(frequency) if frequency else "",
-        "brightness": charts.brightness(found["brightness"]) if found.get("brightness") else None,
-        "time": charts.time(rows) if rows else None,
-        "time_words": charts.time_words(rows) if rows else "",
+        "field": _field(parts, shape),
+        "frequency": frequency_chart(spectrum) if spectrum else None,
+        "frequency_words": frequency_words(spectrum) if spectrum else "",
+        "brightness": brightness_chart(levels) if levels else None,
+        "time": time_chart(times) if times else None,
+        "time_words": time_words(times) if times else "",
         "by_channel": columns["by_channel"],
         "by_plane": columns["by_plane"] if len(columns["by_plane"]) > 1 else [],
         "longest": max([*everything, 1e-9]),
@@ -156,14 +156,14 @@ def where(compared: dict[str, Any], shape: tuple[int, int] | None) -> dict[str, 
     }
 
 
-def _field(found: dict[str, Any], shape: tuple[int, int] | None) -> tuple[Map, str] | None:
+def _field(parts: dict[str, Any], shape: tuple[int, int] | None) -> tuple[HeatMap, str] | None:
     """The map of excess over the field, and a sentence on it."""
-    if not found.get("field"):
+    if not parts.get("field"):
         return None
-    grid = np.array([[np.nan if v is None else v for v in row] for row in found["field"]], dtype=float)
+    grid = np.array([[np.nan if v is None else v for v in row] for row in parts["field"]], dtype=float)
     if not np.isfinite(grid).any():
         return None
-    tile = found.get("tile_px") or 1
+    tile = parts.get("tile_px") or 1
     height, width = shape or (grid.shape[0] * tile, grid.shape[1] * tile)
     i, j = np.unravel_index(int(np.nanargmax(grid)), grid.shape)
     middle, worst = float(np.nanmedian(grid)), float(grid[i, j])
@@ -176,7 +176,7 @@ def _field(found: dict[str, Any], shape: tuple[int, int] | None) -> tuple[Map, s
         words = f"the error is largest in the {spot}: excess {number(worst)} there, median {number(middle)}."
     alt = f"Excess over the picture in tiles of {tile} pixels, dark is small: {words}"
     top = float(np.nanmax(grid))
-    shown = draw(
+    picture = heat_map(
         "excess by place",
         grid,
         alt,
@@ -186,4 +186,4 @@ def _field(found: dict[str, Any], shape: tuple[int, int] | None) -> tuple[Map, s
         (0.0, 0.0, float(height), float(width)),
         note=f"tiles of {tile} × {tile} pixels; their mean is the excess of the whole",
     )
-    return shown, words
+    return picture, words

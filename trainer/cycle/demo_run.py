@@ -1,9 +1,9 @@
-"""The whole way on a virtual bench: capture, explain, export, solve, show, and look with the camera.
+"""The demo: all steps on a virtual bench, from captures to a better picture.
 
-A headset with three hidden effects is captured and explained; pictures are then shown with patterns computed
-for the ideal model, for the explained one, and by an oracle that knows the true bench, which is as good as it
-gets. They are shown through the drivers of a real headset, on emulated hardware: the panel over USB (pyusb), the
-lasers over I2C (smbus2, safety controller and heartbeat included), the camera over its link (depthai).
+A headset with three hidden effects is captured and explained. Pictures are then shown with patterns for the ideal
+model, for the explained model, and by an oracle that knows the true bench, which gives the upper bound. They are shown
+through the drivers of a real headset, on emulated hardware: the panel over USB (pyusb), the lasers over I2C (smbus2,
+with safety controller and heartbeat), the camera over its link (depthai).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from runtime.bundle.light_path_arrays import load_light_path
 from runtime.bundle.whole_files import whole_file
 from runtime.headset.open_devices import Devices, emulated
 from runtime.solver import Quality, quality, solve
-from runtime.solver.targets import decode_srgb, encode_srgb, fit_area
+from runtime.solver.targets import encode_srgb, fit_area
 from runtime.solving import write_gray
 from trainer.captures.bench_file import Bench
 from trainer.captures.open_bench import nominal_bench
@@ -31,7 +31,8 @@ from trainer.effects.effect_catalogue import catalogue
 from trainer.formatting import listed
 from trainer.model.export import export_bundle
 from trainer.model.model import Model
-from trainer.report.displayed import Shown, with_display
+from trainer.report.display_section import DisplayedPicture, with_display
+from trainer.training.photographs import photograph
 
 Progress = Callable[[float, str], None]
 
@@ -43,8 +44,16 @@ SATURATED = 0.001  # share of pixels
 
 
 @dataclass(frozen=True)
-class Seen:
-    """A pattern as the camera saw it: counts above black a millisecond [h, w], and how good that is."""
+class CameraPicture:
+    """The camera's picture of a pattern.
+
+    Attributes
+    ----------
+    light : array [h, w], counts/ms
+        Above black.
+    quality : Quality
+        Against the target.
+    """
 
     light: np.ndarray
     quality: Quality
@@ -53,9 +62,29 @@ class Seen:
 def run_demo(
     folder: Path, quick: bool = False, workers: int | None = None, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """Go the whole way and leave every file of it in `folder`; returns the numbers and where the files are.
+    """Run all steps and leave every file in `folder`.
 
-    quick: a smaller panel and fewer captures. Raises InputError where the folder holds something already.
+    Parameters
+    ----------
+    folder : path
+        A new or empty one.
+    quick : bool
+        A smaller panel and fewer captures.
+    workers : int or None
+        Processes; None: one for each core.
+    progress : callable or None
+        Called with the share done and what is being done.
+
+    Returns
+    -------
+    dict
+        Keys `sentence`, `found`, `verdict`, `steps`, `noise_nrmse`, `display`, `pictures`, `captures`, `model`,
+        `bundle` and `report` of `demo --json`.
+
+    Raises
+    ------
+    InputError
+        Where the folder is not empty or cannot be made.
     """
     from trainer.captures.acquire import capture_set
     from trainer.captures.capture_set import read_captures
@@ -93,12 +122,12 @@ def run_demo(
     export_bundle(found.model, captures, bundles["after"])
     pictures = PICTURES[:1] if quick else PICTURES
     patterns = folder / "patterns"
-    found_patterns = _patterns(
+    solved = _patterns(
         headset, captures.bench, bundles, pictures, patterns, lambda d, w: say(0.62 + 0.25 * d, w)
     )
     say(0.88, "showing")
     with emulated(spec, seed=2) as devices:
-        shown = [_show(devices, captures.bench, *each, patterns) for each in found_patterns]
+        shown = [_show(devices, captures.bench, *each, patterns) for each in solved]
 
     say(0.94, "writing the report")
     display = {name: _mean([p.qualities[name] for p in shown]) for name in ("before", "after", "oracle")}
@@ -151,7 +180,7 @@ def _patterns(
     folder: Path,
     say: Progress,
 ) -> list[tuple[str, np.ndarray, dict[str, np.ndarray]]]:
-    """(name, target, gray levels by whom) of every picture: by each bundle, and by the oracle, who knows `headset`."""
+    """(name, target, gray levels by source) of every picture; sources are the bundles and the oracle on `headset`."""
     channel = bench.channels[0].name
     paths = {name: load_light_path(read_bundle(bundle), channel) for name, bundle in bundles.items()}
     folder.mkdir()
@@ -178,26 +207,23 @@ def _patterns(
 
 def _show(
     devices: Devices, bench: Bench, name: str, target: np.ndarray, gray: dict[str, np.ndarray], folder: Path
-) -> Shown:
-    """A picture with each of its patterns, as the camera sees it."""
+) -> DisplayedPicture:
+    """A picture with each of its patterns, as the camera measures it."""
     channel = bench.channels[0].name
-    seen = {which: _look(devices, bench, channel, levels, target) for which, levels in gray.items()}
-    for which, one in seen.items():
+    camera = {which: _capture(devices, bench, channel, levels, target) for which, levels in gray.items()}
+    for which, one in camera.items():
         _write_picture(folder / f"{name}-{which}-seen.png", one.light)
-    return Shown(
+    return DisplayedPicture(
         name,
         target,
-        {which: one.light for which, one in seen.items()},
-        {which: one.quality for which, one in seen.items()},
+        {which: one.light for which, one in camera.items()},
+        {which: one.quality for which, one in camera.items()},
     )
 
 
 def _target(name: str, shape: tuple[int, int]) -> np.ndarray:
     """A photograph's green part as linear irradiance [H, W]."""
-    import skimage.data
-
-    picture = np.asarray(getattr(skimage.data, name)())[..., 1] / 255
-    return fit_area(decode_srgb(picture), shape).astype(np.float32)
+    return fit_area(photograph(name)[1], shape).astype(np.float32)
 
 
 def _oracle(
@@ -205,24 +231,26 @@ def _oracle(
     target: np.ndarray,
     channel: str,
     start: np.ndarray,
-    told: Callable[[float], None],
+    progress: Callable[[float], None],
 ) -> np.ndarray:
-    """The best of a start and of what the oracle makes of it, both judged by the true bench."""
+    """The better of a start and of the oracle's pattern from it, by the quality on the true bench."""
     wanted = target.astype(np.float64)
     better = headset.oracle_pattern(
         wanted,
         channel,
         iterations=ORACLE_ITERATIONS,
         start=start,
-        progress=lambda i, loss: told(i / ORACLE_ITERATIONS),
+        progress=lambda i, loss: progress(i / ORACLE_ITERATIONS),
     )
     return max(
         (start, better), key=lambda gray: quality(headset.true_irradiance(gray, channel), target).psnr_db
     )
 
 
-def _look(devices: Devices, bench: Bench, channel: str, gray: np.ndarray, target: np.ndarray) -> Seen:
-    """What the camera sees of a pattern, at an exposure that does not saturate, mean of several shots."""
+def _capture(
+    devices: Devices, bench: Bench, channel: str, gray: np.ndarray, target: np.ndarray
+) -> CameraPicture:
+    """The camera's picture of a pattern at an exposure that does not saturate, mean of several shots."""
     camera = devices.camera
     black = bench.camera.black_level * 2.0 ** (camera.bit_depth - bench.camera.bit_depth)
     devices.panel.show(gray)
@@ -232,7 +260,7 @@ def _look(devices: Devices, bench: Bench, channel: str, gray: np.ndarray, target
     shots = [camera.capture().astype(np.float64) - black for _ in range(SHOTS)]
     devices.lasers.off()
     light = np.mean(shots, axis=0) / camera.exposure_ms
-    return Seen(light, quality(light, target))
+    return CameraPicture(light, quality(light, target))
 
 
 def _write_picture(path: Path, light: np.ndarray) -> None:

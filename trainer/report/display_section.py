@@ -1,9 +1,7 @@
-"""What a display shows before and after it was calibrated, as a section of a report."""
+"""A report's section on the display: camera pictures before and after calibration, next to the target."""
 
 from __future__ import annotations
 
-import base64
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -13,17 +11,30 @@ from PIL import Image
 
 from runtime.solver import Quality
 from runtime.solver.targets import encode_srgb
+from trainer.report.png_uri import png_uri
 
 TITLES = {
     "before": "Pattern for the ideal model",
     "after": "Pattern for the explained model",
-    "oracle": "Pattern by who knows the true bench",
+    "oracle": "Pattern with the true bench known",
 }
 
 
 @dataclass(frozen=True)
-class Shown:
-    """A picture as a camera saw it with several patterns: target and lights [H, W], and quality."""
+class DisplayedPicture:
+    """The camera's pictures of one target, shown with several patterns.
+
+    Attributes
+    ----------
+    name : str
+        Of the target.
+    target : array [H, W]
+        Irradiance.
+    lights : mapping of str to array [H, W]
+        The camera's picture of each pattern.
+    qualities : mapping of str to Quality
+        Of each pattern.
+    """
 
     name: str
     target: np.ndarray
@@ -31,18 +42,18 @@ class Shown:
     qualities: Mapping[str, Quality]
 
 
-def with_display(html: str, shown: Sequence[Shown], sentence: str) -> str:
-    """A report's page with the pictures of a display added at the end of its main part."""
-    section = display_section(shown, sentence)
+def with_display(html: str, pictures: Sequence[DisplayedPicture], sentence: str) -> str:
+    """A report's page with the display's section added at the end of its main part."""
+    section = display_section(pictures, sentence)
     head, found, tail = html.rpartition("</main>")
     if not found:
         return html + section
     return f"{head}{section}\n{found}{tail}"
 
 
-def display_section(shown: Sequence[Shown], sentence: str) -> str:
-    """The section: for each picture the target and what the camera saw, all at the scale that fits best."""
-    rows = [_row(one) for one in shown]
+def display_section(pictures: Sequence[DisplayedPicture], sentence: str) -> str:
+    """The section: for each picture the target and the camera's pictures, each at the scale that fits best."""
+    rows = [_row(one) for one in pictures]
     return (
         "<section>\n<h2>What the display shows</h2>\n"
         f"<p>{escape(sentence)}</p>\n"
@@ -53,7 +64,7 @@ def display_section(shown: Sequence[Shown], sentence: str) -> str:
     )
 
 
-def _row(one: Shown) -> str:
+def _row(one: DisplayedPicture) -> str:
     figures = [_figure("Target", one.target, one.target, "")]
     for which, light in one.lights.items():
         q = one.qualities[which]
@@ -65,11 +76,9 @@ def _row(one: Shown) -> str:
 
 def _figure(title: str, light: np.ndarray, target: np.ndarray, note: str) -> str:
     white = max(float(np.percentile(target, 99.8)), 1e-12)
-    buffer = io.BytesIO()
-    Image.fromarray(np.rint(255 * encode_srgb(light / white)).astype(np.uint8)).save(buffer, format="PNG")
-    data = base64.b64encode(buffer.getvalue()).decode()
+    picture = Image.fromarray(np.rint(255 * encode_srgb(light / white)).astype(np.uint8))
     words = escape(f"{title}: {note}" if note else title)
     return (
         f'<figure><b>{escape(title)}</b><img style="width:100%" alt="{words}" '
-        f'src="data:image/png;base64,{data}"><figcaption class="quiet">{escape(note)}</figcaption></figure>'
+        f'src="{png_uri(picture)}"><figcaption class="quiet">{escape(note)}</figcaption></figure>'
     )

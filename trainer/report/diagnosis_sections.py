@@ -1,4 +1,4 @@
-"""The parts of a report that say why: verdict, ladder, stages, ranking, what the data cannot tell apart."""
+"""A report's sections on the diagnosis: verdict, ladder of errors, stages, ranking, what the captures cannot decide."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from trainer.diagnosis.verdict import Thresholds
 from trainer.formatting import listed, number, parameters, percent, plain
 from trainer.model.model import Model
 from trainer.model.parameters import json_values
-from trainer.report import charts
-from trainer.report.array_pictures import DIFFERENCE, IRRADIANCE, Map, draw, from_zero, place, symmetric
+from trainer.report.charts import curve_chart, forest_plot, is_worth, ladder_chart, stage_bars
+from trainer.report.heat_maps import DIFFERENCE, IRRADIANCE, HeatMap, from_zero, heat_map, place, symmetric
 
 PROBE = 320  # largest side of a probe's picture, pixels
 
@@ -60,13 +60,13 @@ def _diagnosed(found: Mapping[str, Any]) -> str:
         best = ranking[0]
         others = best.get("indistinguishable_from") or []
         also = f"; the data cannot tell it from {listed(others)}" if others else ""
-        gone = f"removes {number(best['excess_removed'])} of the excess {number(excess)}"
-        return f"Adding {best['effect']} ({best['stage']}) {gone}{also}."
+        removal = f"removes {number(best['excess_removed'])} of the excess {number(excess)}"
+        return f"Adding {best['effect']} ({best['stage']}) {removal}{also}."
     where = f", most likely in the {stage} stage" if stage else ""
     return f"Excess {number(excess)} is left that no effect of the catalogue explains{where}."
 
 
-def ladder(steps: Sequence[Mapping[str, Any]], noise: float | None) -> dict[str, Any] | None:
+def ladder_section(steps: Sequence[Mapping[str, Any]], noise: float | None) -> dict[str, Any] | None:
     """The chart and the table of errors after each step; None where nothing was added."""
     if len(steps) < 2:
         return None
@@ -85,9 +85,9 @@ def ladder(steps: Sequence[Mapping[str, Any]], noise: float | None) -> dict[str,
     for row in rows:
         row["left"] = row["excess"] / first if first and first > 0 else None
     return {
-        "chart": charts.ladder([r["label"] for r in rows], [r["nrmse"] for r in rows], noise),
+        "chart": ladder_chart([r["label"] for r in rows], [r["nrmse"] for r in rows], noise),
         "rows": rows,
-        "twins": any(r["others"] for r in rows),
+        "undecided": any(r["others"] for r in rows),
         "noise": noise,
     }
 
@@ -98,18 +98,20 @@ def stages(found: Any, probes: Sequence[tuple[str, str, np.ndarray, str]]) -> di
     if not rows and not probes:
         return None
     total = found["heldout"]["excess"] if found and found.get("heldout") else None
-    gone = {str(r["stage"]): float(r["excess_removed"]) for r in rows}
-    order = sorted(dict.fromkeys(str(p[0]) for p in probes), key=lambda stage: -gone.get(stage, 0.0))
+    removed = {str(r["stage"]): float(r["excess_removed"]) for r in rows}
+    order = sorted(dict.fromkeys(str(p[0]) for p in probes), key=lambda stage: -removed.get(stage, 0.0))
     groups = []
     for stage in order:
         note = ""
-        if stage in gone:
-            share = f" ({percent(gone[stage] / total, 2)})" if total and total > 0 else ""
-            note = f"removes excess {number(gone[stage])}{share}" if gone[stage] > 0 else "removes nothing"
-        shown = [_probe(*p) for p in probes if p[0] == stage and np.asarray(p[2]).size]
-        groups.append({"stage": stage, "note": note, "probes": shown})
+        if stage in removed:
+            share = f" ({percent(removed[stage] / total, 2)})" if total and total > 0 else ""
+            note = (
+                f"removes excess {number(removed[stage])}{share}" if removed[stage] > 0 else "removes nothing"
+            )
+        fitted = [_probe(*p) for p in probes if p[0] == stage and np.asarray(p[2]).size]
+        groups.append({"stage": stage, "note": note, "probes": fitted})
     return {
-        "chart": charts.stage_bars(rows, total, found.get("stage")) if rows else None,
+        "chart": stage_bars(rows, total, found.get("stage")) if rows else None,
         "groups": groups,
     }
 
@@ -120,19 +122,20 @@ def _probe(stage: str, title: str, values: Any, unit: str) -> dict[str, Any]:
         array = np.abs(array)
     array = np.atleast_1d(array.astype(np.float64))
     if array.ndim == 1:
-        return {"title": title, "chart": charts.curve(array, title, unit), "map": None}
+        return {"title": title, "chart": curve_chart(array, title, unit), "picture": None}
     if array.ndim > 2:
         array = array.reshape(-1, *array.shape[-2:])[0]
-    return {"title": title, "chart": None, "map": _probe_map(stage, title, array, unit)}
+    return {"title": title, "chart": None, "picture": _probe_map(stage, title, array, unit)}
 
 
-def _probe_map(stage: str, title: str, array: np.ndarray, unit: str) -> Map:
+def _probe_map(stage: str, title: str, array: np.ndarray, unit: str) -> HeatMap:
     low, high = float(np.nanmin(array)), float(np.nanmax(array))
     if low < 0 < high:
         scale, colours = symmetric([array]), DIFFERENCE
-    elif low > 0.5 * high:  # a gain map: its own range, or nothing is seen
-        seen = array[np.isfinite(array)]
-        scale, colours = (float(np.percentile(seen, 0.2)), float(np.percentile(seen, 99.8))), IRRADIANCE
+    elif low > 0.5 * high:  # a gain map: its own range, else it shows nothing
+        finite = array[np.isfinite(array)]
+        low_end, high_end = (float(np.percentile(finite, share)) for share in (0.2, 99.8))
+        scale, colours = (low_end, high_end), IRRADIANCE
     else:
         scale, colours = from_zero([array]), IRRADIANCE
     i, j = np.unravel_index(int(np.nanargmax(np.abs(array - np.nanmedian(array)))), array.shape)
@@ -142,7 +145,7 @@ def _probe_map(stage: str, title: str, array: np.ndarray, unit: str) -> Map:
         f"FitResult probe of the {stage} stage, {title}: from {number(low)} to {number(high)}{tail}, furthest "
         f"from its median in the {spot}."
     )
-    return draw(title, array, alt, "" if unit == "1" else unit, scale, colours, largest=PROBE)
+    return heat_map(title, array, alt, "" if unit == "1" else unit, scale, colours, largest=PROBE)
 
 
 def ranking(found: Any) -> dict[str, Any] | None:
@@ -161,13 +164,13 @@ def ranking(found: Any) -> dict[str, Any] | None:
                 "removed": r["excess_removed"],
                 "interval": interval,
                 "after": r.get("excess_after"),
-                "worth": charts.is_worth(r, least),
+                "worth": is_worth(r, least),
                 "parameters": parameters(r.get("parameters")),
                 "others": r.get("indistinguishable_from") or [],
             }
         )
-    twins = any(r["others"] for r in table)
-    return {"chart": charts.forest(rows, least), "rows": table, "twins": twins}
+    undecided = any(r["others"] for r in table)
+    return {"chart": forest_plot(rows, least), "rows": table, "undecided": undecided}
 
 
 def _least(found: Mapping[str, Any]) -> float | None:
@@ -178,13 +181,13 @@ def _least(found: Mapping[str, Any]) -> float | None:
 def apart(found: Any, steps: Sequence[Mapping[str, Any]], more: Sequence[Any]) -> dict[str, Any] | None:
     """Groups of effects that the data cannot separate, and captures that would (`more`: further ones)."""
     groups: list[list[str]] = []
-    seen: set[frozenset[str]] = set()
+    known: set[frozenset[str]] = set()
     named = [(r["effect"], r) for r in (found or {}).get("ranking") or []]
     for name, row in [*named, *((s.get("added"), s) for s in steps)]:
         others = row.get("indistinguishable_from") or []
         group = frozenset([str(name), *map(str, others)])
-        if name and others and group not in seen:
-            seen.add(group)
+        if name and others and group not in known:
+            known.add(group)
             groups.append([str(name), *[str(o) for o in others if o != name]])
     wanted = [*((found or {}).get("suggested_captures") or []), *more]
     suggestions = list(dict.fromkeys(_suggestion(s) for s in wanted))
@@ -203,7 +206,7 @@ def _suggestion(one: Any) -> str:
 
 
 def thresholds(found: Any) -> list[tuple[str, str]]:
-    """What decided the verdict, with the numbers that follow for this set."""
+    """The rules of the verdict, with the numbers that follow from them for these captures."""
     limits = (found or {}).get("thresholds")
     if not limits:
         return []

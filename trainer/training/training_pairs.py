@@ -1,6 +1,6 @@
-"""What a network is trained on: irradiance as the model predicts it, and as the camera saw it, on the panel's pixels.
+"""What a network is trained on: predicted and measured irradiance, on the panel's pixels.
 
-What the model tells to the camera (blur, offset, response) is taken out of the measurement, not put into the
+Effects that act on the camera alone (blur, offset, response) are taken out of the measurement, not put into the
 prediction: the network must not learn faults that the eye never sees. To first order that is
 
     measured irradiance = predicted irradiance + (counts - predicted counts) / sensitivity
@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -28,20 +27,31 @@ from trainer.model.model import Model
 from trainer.model.model_stages import scene_for, stages_of
 from trainer.prediction.predict import counts, light_path
 from trainer.prediction.scene import Scene, Stages
+from trainer.training.camera_to_panel import onto_panel
 
 MOST_COLOURS = 3
 WHITE = 0.999  # quantile of measured irradiance that is called white
-DULL = 0.02  # of the greatest sensitivity: below it the camera says too little
+DULL = 0.02  # of the greatest sensitivity: below it the camera measures too little
 
 Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """Irradiance predicted and measured, and where the measurement counts, each [N, C, H, W].
+    """Predicted and measured irradiance of N pictures.
 
-    noise : variance of the camera's noise in `measured`. white : irradiance of white in pictures.
-    captures : of each picture, by plane; None where a colour is missing
+    Attributes
+    ----------
+    predicted, measured : Tensor [N, C, H, W]
+        Irradiance on the panel's pixels.
+    weight : Tensor [N, C, H, W]
+        1 where the measurement counts, else 0.
+    noise : Tensor [N, C, H, W]
+        Variance of the camera's noise in `measured`.
+    white : float
+        Irradiance of white in pictures.
+    captures : tuple of tuple of Capture or None
+        Of each picture, by colour; None where a colour is missing.
     """
 
     predicted: Tensor
@@ -61,13 +71,23 @@ class Pairs:
 
     @property
     def colours(self) -> int:
-        """Planes of a picture."""
+        """Colours of a picture."""
         return self.predicted.shape[1]
 
 
 @dataclass(frozen=True)
-class Measured:
-    """One capture on the panel's pixels, each [H, W]: predicted and measured irradiance, weight, noise variance."""
+class PanelMeasurement:
+    """One capture on the panel's pixels.
+
+    Attributes
+    ----------
+    predicted, measured : Tensor [H, W]
+        Irradiance.
+    weight : Tensor [H, W]
+        1 where the measurement counts, else 0.
+    noise : Tensor [H, W]
+        Variance of the camera's noise in `measured`.
+    """
 
     predicted: Tensor
     measured: Tensor
@@ -78,10 +98,23 @@ class Measured:
 def pairs_of(
     captures: CaptureSet, rows: Sequence[Capture], model: Model, progress: Progress | None = None
 ) -> Pairs:
-    """The pairs of some captures, under a model whose gains are fitted.
+    """The pairs of some captures.
 
-    Colours of one plane are stacked in the order of their patterns. Raises InputError where there is no capture, or
-    the bench has more than three colours.
+    Parameters
+    ----------
+    captures : CaptureSet
+        The set.
+    rows : sequence of Capture
+        Captures of it; colours of one plane are stacked in the order of their patterns.
+    model : Model
+        With fitted gains.
+    progress : callable or None
+        Called with the share done.
+
+    Raises
+    ------
+    InputError
+        Where there is no capture, every picture is saturated, or the bench has more than three colours.
     """
     stacks = stacked(captures, rows)
     if not stacks:
@@ -97,12 +130,12 @@ def pairs_of(
                 weight[k, plane], noise[k, plane] = one.weight, one.noise
         if progress:
             progress((k + 1) / len(stacks))
-    seen = measured[weight > 0]
-    if not len(seen):
+    counted = measured[weight > 0]
+    if not len(counted):
         raise InputError(
             f"every picture of {captures.folder} is saturated: lower the exposure and capture again"
         )
-    white = float(np.quantile(seen.numpy(), WHITE))
+    white = float(np.quantile(counted.numpy(), WHITE))
     return Pairs(predicted, measured, weight, noise, max(white, 1e-6), tuple(stacks))
 
 
@@ -121,7 +154,7 @@ def stacked(captures: CaptureSet, rows: Sequence[Capture]) -> list[tuple[Capture
     return stacks
 
 
-def measured_on_panel(model: Model, batch: Batch) -> Measured:
+def measured_on_panel(model: Model, batch: Batch) -> PanelMeasurement:
     """Prediction and measurement of one capture (a batch of one) as irradiance on the panel's pixels."""
     scene, stages, expected, sensitivity = expected_counts(model, batch)
     sharp = sensitivity > DULL * sensitivity.max()
@@ -132,11 +165,21 @@ def measured_on_panel(model: Model, batch: Batch) -> Measured:
     shown = display_irradiance(model, batch)
     change, weight, noise = (onto_panel(scene, stages, one[0]) for one in (change, weight, noise))
     weight = (weight > 0.999).to(change.dtype)
-    return Measured(shown, shown + change, weight, noise)
+    return PanelMeasurement(shown, shown + change, weight, noise)
 
 
 def expected_counts(model: Model, batch: Batch) -> tuple[Scene, Stages, Tensor, Tensor]:
-    """Counts that a model expects of a batch of one, and counts a unit of light more, each [1, h, w]; where and how."""
+    """Counts that a model expects of a capture (a batch of one), and their slope.
+
+    Returns
+    -------
+    Scene, Stages
+        Of the prediction.
+    Tensor [1, h, w]
+        Expected counts above black.
+    Tensor [1, h, w]
+        Sensitivity: counts per unit of irradiance.
+    """
     predictor = Predictor(model, batch)
     scene, stages = predictor.scene, predictor.stages(model)
     with torch.no_grad():
@@ -157,71 +200,15 @@ def _own_gain(scene: Scene, stages: Stages, light: Tensor, model: Model, batch: 
         return torch.ones(1, 1, 1)
     linear = replace(stages, sensor=replace(sensor, offset=None, response=None, free_capture_gain=False))
     one = counts(scene, linear, light, model.gain[batch.channel] * batch.exposure[:, None, None], None)
-    seen = batch.signal if sensor.offset is None else batch.signal - sensor.offset
-    total = (seen * one * batch.mask).sum((-2, -1)) / (one**2 * batch.mask).sum((-2, -1))
+    signal = batch.signal if sensor.offset is None else batch.signal - sensor.offset
+    total = (signal * one * batch.mask).sum((-2, -1)) / (one**2 * batch.mask).sum((-2, -1))
     return total[:, None, None]
 
 
 def display_irradiance(model: Model, batch: Batch) -> Tensor:
-    """What the display shows of the first pattern of a batch, as its model says, on the panel's pixels [H, W]."""
+    """Predicted irradiance of the display for the first pattern of a batch, on the panel's pixels [H, W]."""
     shown = acting_on_display(model)
     scene = scene_for(shown, batch.channel, batch.plane_mm)
     with torch.no_grad():
         path = light_path(scene, stages_of(scene, shown))
         return pixel_irradiance(path, irradiance(path, panel_phase(path, batch.gray[:1])))[0]
-
-
-def onto_panel(scene: Scene, stages: Stages, picture: Tensor) -> Tensor:
-    """A picture on the camera's pixels [h, w], seen at the panel's pixels [H, W]; zero where no pixel looks."""
-    if same_pixels(scene, stages):
-        return picture
-    y, x = first_y, first_x = panel_on_camera(scene)
-    if stages.sensor.displacement is not None:
-        moves = [d.to(picture.dtype).expand(picture.shape) for d in stages.sensor.displacement]
-        for _ in range(
-            2
-        ):  # a camera pixel looks where the one a displacement further on should; they vary slowly
-            dy, dx = (sampled(d, y, x) for d in moves)
-            y, x = first_y - dy, first_x - dx
-    return sampled(picture, y, x)
-
-
-def onto_camera(scene: Scene, stages: Stages, picture: Tensor) -> Tensor:
-    """A picture on the panel's pixels [H, W], seen by the camera's pixels [h, w]; zero outside the panel."""
-    if same_pixels(scene, stages):
-        return picture
-    camera = scene.bench.camera
-    y, x = (torch.as_tensor(a, dtype=picture.dtype) for a in np.indices(camera.shape, dtype=float))
-    if stages.sensor.displacement is not None:
-        y, x = y + stages.sensor.displacement[0], x + stages.sensor.displacement[1]
-    return sampled(picture, *camera.on_panel(y, x))
-
-
-def same_pixels(scene: Scene, stages: Stages) -> bool:
-    """Whether camera pixel (i, j) is panel pixel (i, j)."""
-    bench = scene.bench
-    aligned = bench.camera.registered and bench.camera.shape == bench.panel.shape
-    return aligned and stages.sensor.displacement is None
-
-
-@lru_cache(maxsize=8)
-def panel_on_camera(scene: Scene) -> tuple[Tensor, Tensor]:
-    """Where on the camera each panel pixel's centre falls, camera pixels (y, x), each [H, W]."""
-    y, x = np.indices(scene.bench.panel.shape, dtype=float)
-    given = scene.bench.camera.homography
-    if given is not None:
-        m = np.linalg.inv(np.asarray(given, dtype=float).reshape(3, 3))
-        w = m[2, 0] * x + m[2, 1] * y + m[2, 2]
-        y, x = (m[1, 0] * x + m[1, 1] * y + m[1, 2]) / w, (m[0, 0] * x + m[0, 1] * y + m[0, 2]) / w
-    return torch.as_tensor(y, dtype=scene.dtype), torch.as_tensor(x, dtype=scene.dtype)
-
-
-def sampled(picture: Tensor, y: Tensor, x: Tensor) -> Tensor:
-    """Cubic interpolation of a picture [h, w] at places in its pixels; zero outside."""
-    height, width = picture.shape
-    places = torch.stack((2 * x / max(width - 1, 1) - 1, 2 * y / max(height - 1, 1) - 1), -1).to(
-        picture.dtype
-    )
-    return torch.nn.functional.grid_sample(
-        picture[None, None], places[None], mode="bicubic", padding_mode="zeros", align_corners=True
-    )[0, 0]

@@ -1,4 +1,4 @@
-"""The report of a comparison, a diagnosis, a ladder of effects and a model, as one file."""
+"""The HTML report of a comparison, a diagnosis, a ladder of effects and a model, as one file."""
 
 from __future__ import annotations
 
@@ -12,11 +12,19 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from runtime.bundle.whole_files import whole_file
 from trainer.formatting import listed, number, percent, sentence
 from trainer.model.model import Model
-from trainer.report import where_sections as seen
-from trainer.report import why_sections as explained
+from trainer.report.diagnosis_sections import (
+    apart,
+    headline,
+    ladder_section,
+    model_table,
+    ranking,
+    stages,
+    thresholds,
+)
+from trainer.report.error_sections import facts, pictures, where
 
 METHOD = (
-    "Every number comes from captures that no fit has seen: excess is the mean squared error beyond the "
+    "Every number comes from captures that no fit has used: excess is the mean squared error beyond the "
     "camera's expected noise, divided by the variance of the measured signal, so that 0 is a perfect model "
     "and 1 one that predicts nothing but the mean.",
     "Error (nrmse) is the root of the whole mean squared error over the same variance, noise included; "
@@ -33,15 +41,29 @@ def write_report(
     ladder: Any = None,
     model: Model | None = None,
 ) -> None:
-    """Write a report; the file appears whole or not at all.
+    """Write a report; the file appears whole or not at all. Sections without data are left out.
 
-    comparison : trainer.diagnosis.compare.Comparison, or anything with its `as_json()`; `pictures` if it has them
-    diagnosis : an object with `as_json()` (what `diagnose --json` prints, with `thresholds`, `ideal_excess`
-        and `sentence` if known), and `probe_pictures`: (stage, title, array of one or two dimensions, unit)
-    ladder : steps {"added", "removed", "nrmse", "excess", "indistinguishable_from"}, or what
-        `explain --json` prints; the model's history if not given
-    model : for a table of the effects that are present; the comparison's own if not given
-    Sections without data are left out. Raises InputError where the file cannot be written.
+    Parameters
+    ----------
+    path : path
+        The HTML file.
+    title : str
+        Of the page.
+    comparison : trainer.diagnosis.compare.Comparison or None
+        Or another object with its `as_json()` and, if known, `pictures`.
+    diagnosis : object or None
+        With `as_json()` (the object of `diagnose --json`, with `thresholds`, `ideal_excess` and `sentence` if known)
+        and `probe_pictures`: (stage, title, array of one or two dimensions, unit).
+    ladder : sequence of mapping, mapping or None
+        Steps with the keys `added`, `removed`, `nrmse`, `excess` and `indistinguishable_from`, or the object of
+        `explain --json`; None: the model's history.
+    model : Model or None
+        For a table of its effects; None: the comparison's own.
+
+    Raises
+    ------
+    InputError
+        Where the file cannot be written.
     """
     compared = comparison.as_json() if comparison is not None else None
     found = diagnosis.as_json() if diagnosis is not None else None
@@ -52,20 +74,19 @@ def write_report(
     steps, floor = _steps(ladder)
     if floor is None:
         floor = next((d["heldout"]["noise_nrmse"] for d in (compared, found) if d and d.get("heldout")), None)
-    pictures = getattr(comparison, "pictures", None) or ()
     heldout = next((d["heldout"] for d in (compared, found) if d and d.get("heldout")), None)
     context = {
         "title": title,
-        "headline": explained.headline(compared, found, steps),
-        "facts": seen.facts(compared, heldout, found),
-        "pictures": seen.pictures(pictures),
-        "where": seen.where(compared, model.bench.camera.shape if model else None) if compared else None,
-        "ladder": explained.ladder(steps, floor),
-        "stages": explained.stages(found, getattr(diagnosis, "probe_pictures", None) or ()),
-        "ranking": explained.ranking(found),
-        "apart": explained.apart(found, steps, _more(ladder)),
-        "thresholds": explained.thresholds(found),
-        "model": explained.model_table(model) if model is not None else None,
+        "headline": headline(compared, found, steps),
+        "facts": facts(compared, heldout, found),
+        "pictures": pictures(getattr(comparison, "pictures", None) or ()),
+        "where": where(compared, model.bench.camera.shape if model else None) if compared else None,
+        "ladder": ladder_section(steps, floor),
+        "stages": stages(found, getattr(diagnosis, "probe_pictures", None) or ()),
+        "ranking": ranking(found),
+        "apart": apart(found, steps, _more(ladder)),
+        "thresholds": thresholds(found),
+        "model": model_table(model) if model is not None else None,
         "method": METHOD,
     }
     html = _template().render(context)

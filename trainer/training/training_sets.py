@@ -1,4 +1,4 @@
-"""A capture set as what a network learns from and what it is judged by."""
+"""The two parts of a capture set for a training: pairs that are learned from and pairs that are held out."""
 
 from __future__ import annotations
 
@@ -10,14 +10,24 @@ from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import split
 from trainer.fitting.gains import with_gains
 from trainer.model.model import Model
-from trainer.training.pairs import Pairs, pairs_of
+from trainer.training.training_pairs import Pairs, pairs_of
 
 Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
 class TrainingSets:
-    """Pairs that are learned from and pairs that are held out, the model they are under, and where they come from."""
+    """Pairs of a capture set under a model.
+
+    Attributes
+    ----------
+    fitted, held_out : Pairs
+        Those that are learned from and those that are not.
+    model : Model
+        The model of the predictions, with its gains.
+    about : dict
+        Where they come from: keys `captures`, `captures_sha256`, `effects` and `channels`.
+    """
 
     fitted: Pairs
     held_out: Pairs
@@ -30,7 +40,21 @@ def training_sets(
 ) -> TrainingSets:
     """The pairs of a capture set, split as every command splits it.
 
-    ideal : without the model's effects. Raises InputError as the capture set's reader does.
+    Parameters
+    ----------
+    captures : CaptureSet
+        Captures of the model's bench.
+    model : Model
+        Predicts them; its gains are fitted here.
+    ideal : bool
+        Leave the model's effects out.
+    progress : callable or None
+        Called with the share done.
+
+    Raises
+    ------
+    InputError
+        As from `pairs_of`.
     """
     parts = split(captures)
     if ideal:
@@ -38,11 +62,11 @@ def training_sets(
     model = with_gains(captures, replace(model, gain={}), parts.fitted)
     share = len(parts.fitted) / max(1, len(captures))
 
-    def told(begin: float, part: float) -> Progress | None:
+    def part_of(begin: float, part: float) -> Progress | None:
         return None if progress is None else lambda done: progress(begin + part * done)
 
-    fitted = pairs_of(captures, parts.fitted, model, told(0, share))
-    held_out = pairs_of(captures, parts.held_out, model, told(share, 1 - share))
+    fitted = pairs_of(captures, parts.fitted, model, part_of(0, share))
+    held_out = pairs_of(captures, parts.held_out, model, part_of(share, 1 - share))
     about = {
         "captures": captures.folder.name,
         "captures_sha256": captures.content_hash(),

@@ -1,0 +1,61 @@
+"""Checkpoints of a training run: written whole, and read by a run with the same settings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from firmware_iface.errors import InputError
+from runtime.bundle.whole_files import whole_file
+
+CHECKPOINT = "checkpoint.pt"
+
+
+def write_checkpoint(folder: Path, settings: dict[str, Any], state: dict[str, Any]) -> None:
+    """Write the state of a run.
+
+    Parameters
+    ----------
+    folder : path
+        Of the run.
+    settings : dict
+        Those that a continued run must share.
+    state : dict
+        Its step, and weights and optimiser of each network.
+    """
+    with whole_file(folder / CHECKPOINT) as file:
+        torch.save({"settings": settings, **state}, file)
+
+
+def read_checkpoint(folder: Path, settings: dict[str, Any], device: torch.device) -> dict[str, Any] | None:
+    """The state that `write_checkpoint` wrote, on a device; None where there is none.
+
+    Raises
+    ------
+    InputError
+        Where the checkpoint cannot be read, or is of a run with other settings.
+    """
+    path = folder / CHECKPOINT
+    if not path.is_file():
+        return None
+    try:
+        state: dict[str, Any] = torch.load(path, map_location=device, weights_only=True)
+        before = state["settings"]
+    except Exception as error:
+        reason = str(error).splitlines()[0][:80] if str(error) else type(error).__name__
+        raise InputError(f"{path} cannot be read ({reason}): remove it or give another --out") from None
+    if _plain(before) != _plain(settings):
+        wrong = next(k for k in {**before, **settings} if _plain(before.get(k)) != _plain(settings.get(k)))
+        raise InputError(
+            f"{folder} holds a training with another {wrong}: give another --out, or remove the folder"
+        )
+    return state
+
+
+def _plain(value: Any) -> Any:
+    """With tuples as lists, as a checkpoint gives them back."""
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    return [_plain(v) for v in value] if isinstance(value, (list, tuple)) else value

@@ -1,0 +1,34 @@
+"""The processes and the device of a training run, and where its curves are logged."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+
+
+def processes() -> tuple[int, int]:
+    """(processes on this machine, machines), from the environment of torchrun; one and one without it."""
+    local = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+    return local, max(1, int(os.environ.get("WORLD_SIZE", "1")) // local)
+
+
+def launched_fabric(folder: Path | None) -> Any:
+    """A lightning Fabric on the GPU if there is one, with TensorBoard's curves in a folder; started in each process."""
+    from lightning_fabric import Fabric
+    from lightning_fabric.loggers import TensorBoardLogger
+
+    local, machines = processes()
+    gpu = torch.cuda.is_available()
+    fabric = Fabric(
+        accelerator="cuda" if gpu else "cpu",
+        devices=local,
+        num_nodes=machines,
+        precision="bf16-mixed" if gpu else "32-true",
+        loggers=TensorBoardLogger(folder, name="", version="curves") if folder else None,
+    )
+    if local * machines > 1:
+        fabric.launch()
+    return fabric
