@@ -18,10 +18,10 @@ from PIL import Image
 
 from runtime.bundle.whole_files import whole_file
 from runtime.calibration.calibrate import Calibration
-from runtime.calibration.command import sentence_of
 from runtime.calibration.response import Sweep
 from runtime.calibration.shown_patterns import proof_picture
 from runtime.calibration.summary import numbers
+from runtime.calibration.verdict_sentence import sentence_of
 from runtime.solver.targets import encode_srgb
 
 WIDTH = 320  # of a picture, screen pixels

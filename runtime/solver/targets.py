@@ -91,6 +91,38 @@ def read_target(
     return np.ascontiguousarray(target, dtype=np.float32)
 
 
+def channel_targets(
+    path: Path, shape: tuple[int, int], channels: Sequence[str], *, fit: bool, colour: bool
+) -> dict[str, np.ndarray]:
+    """A picture's irradiance for each channel of a bundle.
+
+    Parameters
+    ----------
+    path : Path
+        The picture, as `read_target` reads it.
+    shape : tuple of int
+        Height and width of the panel, pixels.
+    channels : sequence of str
+        Those that are wanted.
+    fit : bool
+        Whether a picture of another size is cropped and resized.
+    colour : bool
+        Whether the bundle has several channels, so that each shows its own part; otherwise luminance is shown.
+
+    Returns
+    -------
+    dict of str to float32 array [H, W]
+
+    Raises
+    ------
+    InputError
+        As `read_target`.
+    """
+    if colour and all(name in CHANNELS for name in channels):
+        return dict(zip(channels, read_target(path, shape, channels, fit=fit), strict=True))
+    return dict.fromkeys(channels, read_target(path, shape, fit=fit))
+
+
 def fit_area(picture: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """Crop [..., H, W] about its centre to the aspect of `shape`, and resize it to `shape` by area.
 

@@ -6,7 +6,6 @@ import json
 
 import pytest
 
-from runtime.benchmark import command
 from runtime.benchmark.measure import LEVELS_DB, SOLVERS, measure
 from runtime.cli import main
 
@@ -48,5 +47,5 @@ def test_it_is_printed_as_one_object_or_a_table(
     monkeypatch.setattr("runtime.benchmark.measure.measure", lambda **options: measured)
     assert main(["benchmark", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == measured
-    command.show(measured)
+    assert main(["benchmark"]) == 0
     assert "ratio" in capsys.readouterr().out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import textwrap
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -228,4 +229,22 @@ def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
     code, said, _ = run(capsys)
     assert code == 0 and "hololoop-trainer export" in said
     code, said, _ = run(capsys, "--version")
-    assert code == 0 and said.strip()
+    assert code == 0 and said.startswith("hololoop-runtime ")
+
+
+def test_the_python_of_the_help_runs_as_it_stands(
+    green: Path,
+    picture: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    _, said, _ = run(capsys, "solve", "--help")
+    lines = said.split("in Python:\n")[1].split("next:")[0]
+    (tmp_path / "bundle").symlink_to(green)
+    (tmp_path / "picture.png").symlink_to(picture)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec(textwrap.dedent(lines), names)
+    assert names["gray"].dtype == np.uint8
+    assert names["gray"].shape == SHAPE

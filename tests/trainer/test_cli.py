@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 import shlex
 import subprocess
 import sys
 from argparse import Namespace
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,15 +16,15 @@ from typing import Any
 import pytest
 
 from firmware_iface.errors import InputError
+from runtime.program.screen import Screen
 from trainer import cli
-from trainer.commands.screen import Screen
 from trainer.effects import testing
 from trainer.effects.effect_catalogue import catalogue
 from trainer.model.model import Model
 from trainer.model.model_file import read_model, write_model
 
 ROOT = Path(__file__).resolve().parent.parent.parent
-NAMES = [c.name for c in cli.commands()]
+NAMES = [c.name for c in cli.PROGRAM.commands]
 
 
 @pytest.fixture(autouse=True)
@@ -64,11 +63,11 @@ def test_help_says_what_it_is_for_shows_an_example_and_what_comes_next(
 
 
 def test_the_examples_of_the_help_can_be_parsed() -> None:
-    commands = cli.commands()
-    for command in commands:
-        args = cli.parser_of(commands).parse_args(shlex.split(command.example))
-        assert args.chosen is not None
-        assert args.command == command.name
+    for command in cli.PROGRAM.commands:
+        for example in command.examples:
+            args = cli.PROGRAM.parser().parse(shlex.split(example))
+            assert args.chosen is command
+            assert args.command == command.name
 
 
 def test_help_does_not_wait_for_torch() -> None:
@@ -376,36 +375,19 @@ def test_explain_shows_the_ladder_and_writes_the_model(
 def test_other_interruptions_and_a_full_disk_are_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    (effects,) = (c for c in cli.PROGRAM.commands if c.name == "effects")
     for error, code, message in (
-        (KeyboardInterrupt(), 130, "interrupted; nothing was written"),
+        (KeyboardInterrupt(), 130, "interrupted; what was finished is kept, and nothing is half written"),
         (OSError(28, "No space left on device", "x.toml"), 2, "x.toml: No space left on device"),
         (InputError("two\nlines"), 2, "two lines"),
-        (MemoryError(), 2, "memory"),
+        (MemoryError(), 2, "not enough memory"),
     ):
 
         def fails(args: Namespace, screen: Screen, error: BaseException = error) -> dict[str, Any]:
             raise error
 
-        known = [c for c in cli.commands() if c.name == "effects"]
-        replaced = [type(c)(c.name, c.about, c.example, c.after, c.options, fails, c.show) for c in known]
-        monkeypatch.setattr(cli, "commands", lambda replaced=replaced: replaced)
+        program = replace(cli.PROGRAM, commands=(replace(effects, run=fails),))
+        monkeypatch.setattr(cli, "PROGRAM", program)
         assert cli.main(["effects"]) == code
         assert message in one_line_of_error(capsys)
         monkeypatch.undo()
-
-
-def test_a_reader_that_goes_away_is_no_error() -> None:
-    script = "import sys; from trainer.cli import main; sys.exit(main(['effects', '--json']))"
-    reading, writing = os.pipe()
-    os.close(reading)
-    done = subprocess.run(
-        [sys.executable, "-c", script],
-        cwd=ROOT,
-        stdout=writing,
-        stderr=subprocess.PIPE,
-        timeout=60,
-        check=False,
-    )
-    os.close(writing)
-    assert done.stderr == b""
-    assert done.returncode == 141

@@ -11,7 +11,7 @@ from PIL import Image
 from firmware_iface.errors import InputError
 from runtime.solver import quality
 from trainer.captures.capture_set import read_captures
-from trainer.commands.making import first_free
+from trainer.commands.demo import first_free
 from trainer.cycle.demo_run import run_demo
 from trainer.report.display_section import DisplayedPicture, display_section, with_display
 

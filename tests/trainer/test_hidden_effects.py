@@ -102,7 +102,7 @@ def test_what_the_catalogue_does_not_name_is_placed_and_then_explained_by_a_user
 
 
 def test_a_ghost_beside_a_blur_is_found_by_fitting_both_together(tmp_path, capsys):
-    # FitResult alone, each takes up a part of the other, and then stands in its way.
+    # Fitted alone, each takes up a part of the other, and then stands in its way.
     blur = 'kind = "sensor_blur"\nsigma_x_px = 0.5'
     ghost = 'kind = "ghost"\nshare = 0.1\nshift_x_px = 6.5\nshift_y_px = -3'
     found = explained(capsys, captured(capsys, tmp_path, ghost, blur), tmp_path)

@@ -23,8 +23,8 @@ from runtime.bundle.light_path_arrays import load_light_path
 from runtime.bundle.whole_files import whole_file
 from runtime.headset.open_devices import Devices, emulated
 from runtime.solver import Quality, quality, solve
+from runtime.solver.pattern_files import write_pattern
 from runtime.solver.targets import encode_srgb, fit_area
-from runtime.solving import write_gray
 from trainer.captures.bench_file import Bench
 from trainer.captures.open_bench import nominal_bench
 from trainer.effects.effect_catalogue import catalogue
@@ -200,7 +200,7 @@ def _patterns(
             ),
         )  # fmt: skip
         for which, levels in gray.items():
-            write_gray(folder / f"{name}-{which}.png", levels)
+            write_pattern(folder / f"{name}-{which}.png", levels)
         found.append((name, target, gray))
     return found
 

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 
 from firmware_iface.errors import InputError
-from runtime.solving import write_gray
+from runtime.solver.pattern_files import write_pattern
 from trainer.captures.capture_set import CaptureSet
 from trainer.cycle.cycle_settings import CycleSettings
 from trainer.cycle.phase_retrieval import retrieve
@@ -169,7 +169,7 @@ def _write_patterns(cycle: CycleState, model: Model, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name, gray in cycle.patterns.items():
         for channel, one in zip(model.bench.channels, gray, strict=True):
-            write_gray(folder / f"{name}-{channel.name}.png", one)
+            write_pattern(folder / f"{name}-{channel.name}.png", one)
 
 
 def _show(

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from runtime.bundle.bundle_folder import write_bundle
 from runtime.bundle.light_path_arrays import pack_light_paths
 from runtime.lightpath.grid import Grid
 from runtime.lightpath.light_path import LightPath
+from runtime.program.version import installed_version
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import scenes
 from trainer.effects.definition import Effect
@@ -81,7 +81,7 @@ def export_bundle(
     provenance: dict[str, Any] = {
         "bench": model.bench.name,
         "captures_sha256": captures.content_hash() if captures else None,
-        "code_version": code_version(),
+        "code_version": installed_version(),
         "heldout": _last_errors(model),
         "history": list(model.history),
         "effects": [
@@ -149,14 +149,6 @@ def baked_path(model: Model, channel: str, plane_mm: float) -> LightPath:
         scene = scene_for(model, channel, plane_mm, torch.float64)
         path = light_path(scene, stages_of(scene, model))
     return LightPath(**{f.name: _single(getattr(path, f.name)) for f in fields(path)})
-
-
-def code_version() -> str:
-    """Version of the installed distribution."""
-    try:
-        return version("hololoop")
-    except PackageNotFoundError:
-        return "unknown"
 
 
 def _single(value: Any) -> Any:

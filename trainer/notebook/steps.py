@@ -14,7 +14,7 @@ from typing import Any
 from firmware_iface.errors import InputError
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.check_set import MISREAD, check_captures
-from trainer.commands.command import origin
+from trainer.commands.inputs import origin
 from trainer.diagnosis.compare import compare as compare_model
 from trainer.diagnosis.diagnose import diagnose as diagnose_model
 from trainer.diagnosis.explain import explain as explain_captures

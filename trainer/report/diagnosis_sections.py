@@ -142,7 +142,7 @@ def _probe_map(stage: str, title: str, array: np.ndarray, unit: str) -> HeatMap:
     spot = place(i / array.shape[0], j / array.shape[1])
     tail = "" if unit == "1" else f" {unit}"
     alt = (
-        f"FitResult probe of the {stage} stage, {title}: from {number(low)} to {number(high)}{tail}, furthest "
+        f"Fitted probe of the {stage} stage, {title}: from {number(low)} to {number(high)}{tail}, furthest "
         f"from its median in the {spot}."
     )
     return heat_map(title, array, alt, "" if unit == "1" else unit, scale, colours, largest=PROBE)

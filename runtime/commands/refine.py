@@ -1,4 +1,4 @@
-"""`hololoop-runtime refine`."""
+"""`hololoop-runtime refine`: a picture made better while a camera looks at it."""
 
 from __future__ import annotations
 
@@ -6,30 +6,26 @@ from argparse import ArgumentParser, Namespace
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from firmware_iface.errors import InputError
+from runtime.commands.inputs import bundle_argument, headset_option
+from runtime.program.command import Command, Result
+from runtime.program.screen import Screen
 
-ABOUT = """Show a picture, look at it with the headset's camera, and make it better while it is displayed.
+DESCRIPTION = """Show a picture, look at it with the headset's camera, and make it better while it is displayed.
 
 Each capture moves the pattern, and draws the bundle's approximator towards what the camera saw. Every third one is held
 out; where those are predicted worse than before, the refinement stops and goes back to the best. The bundle is not
 changed. The laser is switched on before and off after, and is not touched in between; several take turns, one lit at a
 time and each at its own power throughout. For bundles that were exported with a network, and whose camera a
-calibration has seen.
-
-examples:
-  hololoop-runtime refine bundle/ picture.png --headset headset.toml --out pattern.png --log drift.jsonl"""
+calibration has seen."""
 
 
-def arguments(parser: ArgumentParser) -> None:
-    """Declare the command's arguments."""
-    parser.add_argument("bundle", metavar="BUNDLE", type=Path, help="folder that hololoop-trainer exported")
+def options(parser: ArgumentParser) -> None:
+    """The options of `refine`."""
+    bundle_argument(parser)
     parser.add_argument("target", metavar="TARGET", type=Path, help="picture to show, of any size")
-    parser.add_argument(
-        "--headset", metavar="SPEC", required=True,
-        help="a service's configuration, virtual:NAME, or a virtual bench's TOML file",
-    )  # fmt: skip
+    headset_option(parser, required=True)
     parser.add_argument("--captures", metavar="N", type=int, default=24, help="at most so many (default 24)")
     parser.add_argument(
         "--out",
@@ -40,8 +36,8 @@ def arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--log", metavar="FILE.jsonl", type=Path, help="add a line for each capture")
 
 
-def run(args: Namespace) -> dict[str, Any]:
-    """Show, capture and refine; returns what `--json` prints."""
+def run(args: Namespace, screen: Screen) -> Result:
+    """Show, capture and refine."""
     import numpy as np
 
     from runtime.bundle.bundle_folder import read_bundle
@@ -53,20 +49,21 @@ def run(args: Namespace) -> dict[str, Any]:
     from runtime.refinement.panel_and_camera import PanelAndCamera
     from runtime.refinement.picture_refinement import Refinement, refine
     from runtime.solver import solve
-    from runtime.solving import jobs, target_planes, write_gray
+    from runtime.solver.pattern_files import pattern_files, write_pattern
+    from runtime.solver.targets import channel_targets
 
     if args.captures < 1:
         raise InputError(f"--captures {args.captures}: give 1 or more, and better 6")
     bundle = read_bundle(args.bundle)
     channels = bundle_channels(bundle)
-    outs = [job.out for job in jobs([args.target], channels, args.out)] if args.out else []
+    outs = [file.out for file in pattern_files([args.target], channels, args.out)] if args.out else []
     paths = [load_light_path(bundle, c) for c in channels]
     shape = paths[0].grid.shape
     approximator = approximator_of(bundle, (len(paths), *shape))
     if approximator is None:
         raise InputError("the bundle has no approximator to refine: train one and export it with the bundle")
-    planes = target_planes(args.target, shape, channels, fit=True, colour=len(channels) > 1)
-    target = np.stack([planes[c] for c in channels])
+    targets = channel_targets(args.target, shape, channels, fit=True, colour=len(channels) > 1)
+    target = np.stack([targets[c] for c in channels])
     first = np.stack([solve(path, t).phase for path, t in zip(paths, target, strict=True)])
     opened = open(args.log, "a", encoding="utf-8") if args.log else nullcontext()  # noqa: SIM115 - closed below
     with opened as log, open_devices(args.headset) as devices:
@@ -97,7 +94,7 @@ def run(args: Namespace) -> dict[str, Any]:
         finally:
             devices.lasers.off()
     for out, gray in zip(outs, state.gray if outs else [], strict=True):
-        write_gray(out, gray)
+        write_pattern(out, gray)
     return {
         "captures": len(steps),
         "psnr_db": {"first": steps[0].psnr_db, "best": state.best_psnr_db},
@@ -109,12 +106,24 @@ def run(args: Namespace) -> dict[str, Any]:
     }
 
 
-def show(result: dict[str, Any]) -> None:
+def show(result: Result, args: Namespace, screen: Screen) -> None:
     """One line, and where the pattern is."""
     psnr = result["psnr_db"]
-    print(
+    screen.say(
         f"{psnr['first']:.1f} -> {psnr['best']:.1f} dB amplitude PSNR, seen by the camera, after {result['captures']} "
         f"captures ({result['stopped']})."
     )
     for out in result["patterns"].values():
-        print(f"The best pattern is {out}.")
+        screen.say(f"The best pattern is {out}.")
+
+
+COMMAND = Command(
+    name="refine",
+    about="Make a picture better while a camera looks at it.",
+    options=options,
+    run=run,
+    show=show,
+    examples=("refine bundle/ picture.png --headset headset.toml --out pattern.png --log drift.jsonl",),
+    after="Show the pattern: show pattern.png --headset headset.toml",
+    description=DESCRIPTION,
+)

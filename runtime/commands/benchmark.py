@@ -1,37 +1,32 @@
-"""`hololoop-runtime benchmark`."""
+"""`hololoop-runtime benchmark`: the solver measured on this machine."""
 
 from __future__ import annotations
 
-import sys
 from argparse import ArgumentParser, Namespace
-from typing import Any
 
-ABOUT = """Measure the solver on this machine, in one run of some minutes.
+from runtime.program.command import Command, Result
+from runtime.program.screen import Screen
+
+DESCRIPTION = """Measure the solver on this machine, in one run of some minutes.
 
 An iteration against its transforms alone, convergence by iteration and by time against Adam and Gerchberg-Saxton,
 deadlines, a warm-started video, memory and sizes; at 1080 x 1920 and two smaller sizes, on scikit-image's pictures,
 520 nm, 8 um, 200 mm. Times are medians; compare ratios of one run, not milliseconds of two."""
 
 
-def arguments(parser: ArgumentParser) -> None:
+def options(parser: ArgumentParser) -> None:
     """There are none but --json."""
 
 
-def run(args: Namespace) -> dict[str, Any]:
-    """Measure, with progress on a terminal."""
+def run(args: Namespace, screen: Screen) -> Result:
+    """Measure."""
     from runtime.benchmark.measure import measure
 
-    if not sys.stderr.isatty():
-        return measure()
-    from rich.console import Console
-    from rich.progress import Progress
-
-    with Progress(console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("benchmark", total=1.0)
-        return measure(progress=lambda done, what: bar.update(task, completed=done, description=what))
+    with screen.progress("benchmark") as progress:
+        return measure(progress=progress)
 
 
-def show(result: dict[str, Any]) -> None:
+def show(result: Result, args: Namespace, screen: Screen) -> None:
     """The figures as a table."""
     latency, video = result["latency_ms"], result["video"]
     rows = [
@@ -59,4 +54,15 @@ def show(result: dict[str, Any]) -> None:
     for size in result["scaling"]:
         rows.append((f"an iteration of {size['pixels']} pixels", f"{size['iteration_ms']:.1f} ms"))
     for what, figure in rows:
-        print(f"{what:<52} {figure}")
+        screen.say(f"{what:<52} {figure}")
+
+
+COMMAND = Command(
+    name="benchmark",
+    about="Measure the solver on this machine.",
+    options=options,
+    run=run,
+    show=show,
+    examples=("benchmark", "benchmark --json"),
+    description=DESCRIPTION,
+)

@@ -1,12 +1,14 @@
-"""`hololoop-runtime serve`."""
+"""`hololoop-runtime serve`: the service that owns the headset."""
 
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
-from typing import Any
 
-ABOUT = """Run the service that owns the headset's panel, lasers and camera, until it is stopped.
+from runtime.program.command import Command, Result
+from runtime.program.screen import Screen
+
+DESCRIPTION = """Run the service that owns the headset's panel, lasers and camera, until it is stopped.
 
 CONFIG is one TOML file:
 
@@ -19,7 +21,7 @@ CONFIG is one TOML file:
   solve_ms = 12.0                        # time for a pattern
   stale_limit_ms = 80.0                  # what is older than this is not lit
   metrics_port = 9464                    # http://127.0.0.1:9464/metrics; 0: none
-  users = [1000]                         # besides root and the service's own user, who may connect
+  users = [1000]                         # who may connect, as well as root and the service's own user
   channel = "green"                      # the colour to show, where the bundle has several
 
   [panel]
@@ -39,14 +41,14 @@ CONFIG is one TOML file:
 Without hardware: python -m firmware_iface.virtual.served SOCKET emulates it, and bus = "virtual:SOCKET" in [panel],
 [lasers] and (with kind = "virtual") [camera] leads there. firmware_iface/configured_devices.py lists all keys.
 
-Programs connect as runtime.service.client does in Python; hololoop_service.h, beside it, is for C. The lasers are
+Programs connect as runtime.service.client does in Python; hololoop_service.h, next to it, is for C. The lasers are
 dark until a program clears and arms them, and after every fault until it does so again.
 
 With --dark nothing is served: the lasers are switched off, for ExecStopPost= in the service's unit. Unit files are
 in the folder that `hololoop-runtime serve --units DIR` writes."""
 
 
-def arguments(parser: ArgumentParser) -> None:
+def options(parser: ArgumentParser) -> None:
     """The options of `serve`."""
     parser.add_argument("config", metavar="CONFIG", type=Path, help="the headset's TOML file")
     only = parser.add_mutually_exclusive_group()
@@ -56,8 +58,8 @@ def arguments(parser: ArgumentParser) -> None:
     )
 
 
-def run(args: Namespace) -> dict[str, Any]:
-    """Serve until stopped; returns what `--json` prints."""
+def run(args: Namespace, screen: Screen) -> Result:
+    """Serve until stopped."""
     from firmware_iface.configured_devices import open_lasers
     from runtime.service.configuration import read_configuration
     from runtime.service.supervisor import Supervisor
@@ -77,11 +79,23 @@ def run(args: Namespace) -> dict[str, Any]:
     return {"served": supervisor.counts}
 
 
-def show(result: dict[str, Any]) -> None:
+def show(result: Result, args: Namespace, screen: Screen) -> None:
     """What was done, in a line or two."""
     if "dark" in result:
-        print("the lasers are off")
+        screen.say("the lasers are off")
     for path in result.get("units", []):
-        print(path)
+        screen.say(str(path))
     if served := result.get("served"):
-        print(", ".join(f"{count} {name}" for name, count in served.items()))
+        screen.say(", ".join(f"{count} {name}" for name, count in served.items()))
+
+
+COMMAND = Command(
+    name="serve",
+    about="Run the headset's service.",
+    options=options,
+    run=run,
+    show=show,
+    examples=("serve headset.toml", "serve headset.toml --units units/"),
+    after="See that its devices answer: devices headset.toml",
+    description=DESCRIPTION,
+)

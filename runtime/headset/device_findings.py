@@ -1,30 +1,18 @@
-"""`hololoop-runtime devices`: what is attached, what answers, what is wrong, and what to do about it."""
+"""What is attached to a host or named in a headset's configuration, what answers, what is wrong, and what to do."""
 
 from __future__ import annotations
 
 import importlib.util
 import os
-import textwrap
-from argparse import ArgumentParser, Namespace
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from firmware_iface.configured_devices import open_camera, open_lasers, open_panel
 from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
-from runtime.service.configuration import Configuration, read_configuration
-
-ABOUT = """Say what is attached, what answers, what is wrong, and what to do.
-
-Without CONFIG: what this host has, USB devices that hololoop knows, I2C buses, cameras. With CONFIG, the headset's
-TOML file (see hololoop-runtime serve --help): each of its devices is opened and asked, with the lasers dark. Where
-its service runs, which holds the devices, the service is asked instead.
-
-examples:
-  hololoop-runtime devices
-  hololoop-runtime devices headset.toml"""
+from runtime.service.configuration import Configuration
 
 KNOWN_USB = {
     (0x1209, 0x0001): "panel board",
@@ -47,7 +35,18 @@ NEEDED = {  # what the safety controller needs to hold before anything can be ar
 class Finding:
     """One device, and how it is.
 
-    part : panel, lasers, camera, bundle, service, usb, i2c. problems : each a sentence with what to do
+    Attributes
+    ----------
+    part : str
+        panel, lasers, camera, bundle, service, usb or i2c.
+    what : str
+        Which one it is, in words.
+    attached, answers : bool
+        Whether it is there, and whether it answers.
+    status : dict
+        What it says of itself.
+    problems : list of str
+        Each a sentence with what to do.
     """
 
     part: str
@@ -58,51 +57,12 @@ class Finding:
     problems: list[str] = field(default_factory=list)
 
 
-def arguments(parser: ArgumentParser) -> None:
-    """The options of `devices`."""
-    parser.add_argument("config", metavar="CONFIG", type=Path, nargs="?", help="the headset's TOML file")
-
-
-def run(args: Namespace) -> dict[str, Any]:
-    """Look at everything; returns what `--json` prints."""
-    found = host() if args.config is None else headset(read_configuration(args.config))
-    return {
-        "devices": [asdict(finding) for finding in found],
-        "problems": sum(len(finding.problems) for finding in found),
-        "ready": all(finding.answers and not finding.problems for finding in found),
-    }
-
-
-def show(result: dict[str, Any]) -> None:
-    """A line a device, and under it what is wrong."""
-    for found in result["devices"]:
-        state = "answers" if found["answers"] else "does not answer" if found["attached"] else "not there"
-        mark = "ok" if found["answers"] and not found["problems"] else "!!"
-        print(f"{mark}  {found['part']:8} {found['what']}: {state}")
-        told = (f"{name} {_plain(value)}" for name, value in found["status"].items())
-        for line in textwrap.wrap("; ".join(told), 110):
-            print(f"      {line}")
-        for problem in found["problems"]:
-            print(f"    - {problem}")
-    print("everything is well" if result["ready"] else f"to be mended: {result['problems']}")
-
-
-def _plain(value: Any) -> str:
-    if isinstance(value, dict):
-        return ", ".join(f"{name} {_plain(one)}" for name, one in value.items())
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, list):
-        return ", ".join(map(str, value)) or "none"
-    return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def host() -> list[Finding]:
+def host_findings() -> list[Finding]:
     """What this host has, without opening any of it."""
     return [*_usb(), *_i2c(), _camera_library()]
 
 
-def headset(configuration: Configuration) -> list[Finding]:
+def headset_findings(configuration: Configuration) -> list[Finding]:
     """The devices of a configuration, or its service where that runs."""
     if (service := _service(configuration)) is not None:
         return [service]
@@ -197,7 +157,7 @@ def _bundle(configuration: Configuration) -> tuple[Finding, tuple[int, ...] | No
 
 
 def _opened(found: Finding, opening: Callable[[], Any], look: Callable[[Any], None]) -> Finding:
-    """Open a device and look at it; what it raises is what is wrong."""
+    """Open a device and look at it; what it raises is a problem."""
     try:
         with closing(opening()) as device:
             found.status |= device.status()
@@ -210,7 +170,7 @@ def _opened(found: Finding, opening: Callable[[], Any], look: Callable[[Any], No
 
 
 def _place(table: dict[str, Any], usual: str, where: str) -> str:
-    """What a device is and where; one of the lab's own (MODULE:FUNCTION) knows its place by itself."""
+    """What a device is and where; a lab's own device (MODULE:FUNCTION) knows its place itself."""
     kind = str(table.get("kind", usual))
     return kind if ":" in kind else f"{kind} at {where}"
 

@@ -5,14 +5,14 @@ Colour and moving bars are for terminals alone, and NO_COLOR turns colour off th
 
 from __future__ import annotations
 
-import json
-import math
+import io
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from typing import Any, TextIO
 
-Progress = Callable[..., None]
+from runtime.program.plain_values import json_line
+from runtime.program.progress import Progress, no_progress
 
 PLAIN_WIDTH = 110  # columns where there is no terminal to ask
 
@@ -20,17 +20,22 @@ PLAIN_WIDTH = 110  # columns where there is no terminal to ask
 class Screen:
     """Standard output and error of one command.
 
-    out, err : where to write; by default the process's own at that moment
+    Parameters
+    ----------
+    out, err : text stream
+        Where to write; by default the process's own at that moment.
     """
 
     def __init__(self, out: TextIO | None = None, err: TextIO | None = None) -> None:
-        self.out, self.err = out or sys.stdout, err or sys.stderr
+        # A process may have been started without stdout or stderr: then what it says goes nowhere.
+        self.out: TextIO = out or sys.stdout or io.StringIO()
+        self.err: TextIO = err or sys.stderr or io.StringIO()
 
     def say(self, text: str = "", style: str = "") -> None:
         """One paragraph, as wide as it is."""
         from rich.text import Text
 
-        self._console(self.out).print(Text(text, style=style), soft_wrap=True)
+        self._print(Text(text, style=style), soft_wrap=True)
 
     def next(self, line: str, why: str = "Next") -> None:
         """The command to type next, on a line of its own."""
@@ -59,25 +64,34 @@ class Screen:
             right = all(isinstance(row[k], (int, float)) or row[k] is None for row in rows)
             table.add_column(name, justify="right" if right else "left", overflow="fold")
         for row in rows:
-            table.add_row(*(Text(shown(cell)) for cell in row))
+            table.add_row(*(Text(cell_text(cell)) for cell in row))
         self.say()
-        self._console(self.out).print(table)
+        self._print(table)
+
+    def facts(self, values: Mapping[str, Any]) -> None:
+        """A table of the words and numbers among some values, each with its name."""
+        self.table(
+            ("", ""),
+            [(k.replace("_", " "), v) for k, v in values.items() if isinstance(v, str | int | float)],
+        )
 
     def note(self, text: str) -> None:
-        """A line on stderr."""
-        print(one_line(text), file=self.err)
+        """A line on stderr; where nobody reads stderr any more, the work goes on."""
+        with suppress(BrokenPipeError):
+            print(one_line(text), file=self.err)
 
     def json(self, value: Mapping[str, Any]) -> None:
         """One object on stdout, on one line."""
-        self.out.write(json.dumps(plain(value), allow_nan=False) + "\n")
+        self.out.write(json_line(value) + "\n")
 
     @contextmanager
-    def progress(self, what: str) -> Iterator[Progress]:
-        """Gives a callback `(share done, what is going on)`; a moving bar on stderr if that is a terminal."""
+    def progress(self, title: str) -> Iterator[Progress]:
+        """Give a callback that says how far the work is; a moving bar on stderr if that is a terminal."""
         if not self.err.isatty():
-            yield lambda done, text="": None
+            yield no_progress
             return
-        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+        from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+        from rich.progress import Progress as Bars
 
         columns = (
             BarColumn(30),
@@ -87,13 +101,20 @@ class Screen:
             TimeRemainingColumn(),
             TextColumn("{task.description}", markup=False),
         )
-        with Progress(*columns, console=self._console(self.err), transient=True) as bar:
-            task = bar.add_task(what, total=1.0)
+        with Bars(*columns, console=self._console(self.err), transient=True) as bars:
+            task = bars.add_task(title, total=1.0)
 
-            def told(done: float, text: str = "") -> None:
-                bar.update(task, completed=min(max(done, 0.0), 1.0), description=text or what)
+            def progress(done: float, what: str = "") -> None:
+                bars.update(task, completed=min(max(done, 0.0), 1.0), description=what or title)
 
-            yield told
+            yield progress
+
+    def _print(self, what: Any, soft_wrap: bool = False) -> None:
+        """Something of rich's on stdout; written here, since rich would end the process where stdout is closed."""
+        console = self._console(self.out)
+        with console.capture() as text:
+            console.print(what, soft_wrap=soft_wrap)
+        self.out.write(text.get())
 
     def _console(self, stream: TextIO) -> Any:
         from rich.console import Console
@@ -110,7 +131,7 @@ class Screen:
         )
 
 
-def shown(value: Any) -> str:
+def cell_text(value: Any) -> str:
     """A cell of a table."""
     if value is None:
         return "-"
@@ -119,21 +140,6 @@ def shown(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     return one_line(str(value))
-
-
-def plain(value: Any) -> Any:
-    """A value as JSON can hold it: NumPy's scalars and arrays as Python's, numbers that are none as null."""
-    if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(v) for v in value]
-    if hasattr(value, "tolist"):
-        return plain(value.tolist())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if value is None or isinstance(value, (str, int)):
-        return value
-    return str(value)
 
 
 def one_line(text: str) -> str:

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trainer.commands.screen import Screen, plain
+from runtime.program.plain_values import plain
+from runtime.program.screen import Screen
 
 
 def test_colour_is_for_terminals_and_no_color_turns_it_off(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -34,9 +35,9 @@ def test_colour_is_for_terminals_and_no_color_turns_it_off(monkeypatch: pytest.M
 
 def test_progress_is_for_terminals() -> None:
     err = io.StringIO()
-    with Screen(io.StringIO(), err).progress("fitting") as told:
-        told(0.5, "half")
-        told(1.0)
+    with Screen(io.StringIO(), err).progress("fitting") as progress:
+        progress(0.5, "half")
+        progress(1.0)
     assert err.getvalue() == ""
 
 

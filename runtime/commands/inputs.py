@@ -1,0 +1,21 @@
+"""What several commands are given: a bundle, and a headset."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, _ActionsContainer
+from pathlib import Path
+
+
+def bundle_argument(parser: ArgumentParser, what: str = "folder that hololoop-trainer exported") -> None:
+    """The bundle."""
+    parser.add_argument("bundle", metavar="BUNDLE", type=Path, help=what)
+
+
+def headset_option(parser: _ActionsContainer, required: bool) -> None:
+    """--headset, in a parser or in a group of options."""
+    parser.add_argument(
+        "--headset",
+        metavar="SPEC",
+        required=required,
+        help="a service's configuration, virtual:NAME, or a virtual bench's TOML file",
+    )

@@ -1,0 +1,130 @@
+"""`hololoop-runtime show`: patterns on a headset's panel, lit, and what its camera sees."""
+
+from __future__ import annotations
+
+import time
+from argparse import ArgumentParser, Namespace
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from firmware_iface.errors import InputError
+from runtime.commands.inputs import headset_option
+from runtime.program.command import Command, Result
+from runtime.program.options import exposure_ms
+from runtime.program.screen import Screen
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from runtime.headset.open_devices import Devices
+
+DESCRIPTION = """Show patterns on a headset, one after the other, and save what its camera sees of each.
+
+PATTERN is an 8-bit gray PNG of the panel's size, as `solve` writes it. Lasers are lit while patterns are shown and
+dark afterwards, whatever happens. Pictures are 16-bit gray PNGs of the camera's counts: NAME-seen.png.
+
+With --emulated, the headset of a virtual bench is emulated down to the bytes of its buses and driven through the real
+pyusb, smbus2 and depthai libraries, as real hardware would be."""
+
+
+def options(parser: ArgumentParser) -> None:
+    """The options of `show`."""
+    parser.add_argument("patterns", metavar="PATTERN", type=Path, nargs="+", help="8-bit gray PNGs")
+    headset_option(parser, required=True)
+    parser.add_argument("--emulated", action="store_true", help="emulate the virtual bench's buses as well")
+    parser.add_argument("--channel", metavar="C", help="the laser to light (default: the headset's first)")
+    parser.add_argument(
+        "--exposure-ms", metavar="T", type=exposure_ms, help="of the camera (default: as it is)"
+    )
+    parser.add_argument("--out", metavar="DIR", type=Path, help="folder for what the camera sees")
+
+
+def run(args: Namespace, screen: Screen) -> Result:
+    """Show and capture.
+
+    Raises
+    ------
+    InputError
+        Where a pattern or the headset cannot be used.
+    DeviceError
+        Where a device fails.
+    """
+    from runtime.headset.open_devices import emulated, open_devices
+    from runtime.solver.pattern_files import read_pattern
+
+    grays = [read_pattern(path) for path in args.patterns]
+    with ExitStack() as stack:
+        opened = emulated(args.headset) if args.emulated else open_devices(args.headset)
+        devices = stack.enter_context(opened)
+        channel = _laser(args.channel, devices)
+        if args.exposure_ms is not None:
+            devices.camera.exposure_ms = args.exposure_ms
+        devices.light(channel)
+        top = 2**devices.camera.bit_depth - 1
+        shown = []
+        for path, gray in zip(args.patterns, grays, strict=True):
+            begin = time.perf_counter()
+            devices.panel.show(gray)
+            took_ms = 1000 * (time.perf_counter() - begin)
+            counts = devices.camera.capture()
+            shown.append(
+                {
+                    "pattern": str(path),
+                    "show_ms": round(took_ms, 3),
+                    "seen": None if args.out is None else str(_write_counts(counts, args.out, path)),
+                    "mean_counts": round(float(counts.mean()), 2),
+                    "brightest_counts": int(counts.max()),
+                    "saturated_share": float((counts >= top).mean()),
+                }
+            )
+        exposure = devices.camera.exposure_ms
+    return {"headset": args.headset, "channel": channel, "exposure_ms": exposure, "shown": shown}
+
+
+def _laser(asked: str | None, devices: Devices) -> str:
+    """The laser to light: the one that is asked for, or the first that has a power."""
+    known = [c for c in devices.lasers.channels if not devices.power or c in devices.power]
+    if asked is not None and asked not in devices.lasers.channels:
+        raise InputError(f"there is no laser '{asked}'; use one of {', '.join(devices.lasers.channels)}")
+    return asked or known[0]
+
+
+def _write_counts(counts: np.ndarray, folder: Path, pattern: Path) -> Path:
+    """Write what the camera saw of a pattern, uint16 [H, W]; returns the file."""
+    from PIL import Image
+
+    from runtime.bundle.whole_files import whole_file
+
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{pattern.stem}-seen.png"
+    with whole_file(path) as file:
+        Image.fromarray(counts).save(file, "PNG")
+    return path
+
+
+def show(result: Result, args: Namespace, screen: Screen) -> None:
+    """What was seen, a line a pattern."""
+    screen.say(f"{result['headset']}, {result['channel']}, {result['exposure_ms']:g} ms")
+    for one in result["shown"]:
+        saturated = f", {100 * one['saturated_share']:.2g} % saturated" if one["saturated_share"] else ""
+        where = f" -> {one['seen']}" if one["seen"] else ""
+        screen.say(
+            f"{one['pattern']}: shown in {one['show_ms']:.1f} ms; {one['mean_counts']:.1f} counts in the mean, "
+            f"{one['brightest_counts']} at most{saturated}{where}"
+        )
+
+
+COMMAND = Command(
+    name="show",
+    about="Show patterns on a headset and save what its camera sees.",
+    options=options,
+    run=run,
+    show=show,
+    examples=(
+        "show pattern.png --headset headset.toml --out seen/",
+        "show pattern.png --headset virtual:demo --emulated",
+    ),
+    after="Correct what has drifted: calibrate bundle/ --headset headset.toml --report calibration.html",
+    description=DESCRIPTION,
+)

@@ -1,0 +1,152 @@
+"""A program with commands: runs one, prints its result, and turns what goes wrong into one line and an exit code.
+
+Exit codes: 0 done; 2 the input cannot be used (one line on stderr says what to change); 130 interrupted; 141 whoever
+read stdout has closed it.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from argparse import Namespace
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout, suppress
+from dataclasses import dataclass
+
+from firmware_iface.errors import DeviceError, InputError
+from runtime.program.command import Command
+from runtime.program.interrupt import Interrupted
+from runtime.program.parser import ProgramParser
+from runtime.program.screen import Screen, one_line
+from runtime.program.version import installed_version
+
+DONE, BAD_INPUT, INTERRUPTED, NO_READER = 0, 2, 130, 141
+OWN_PACKAGES = ("trainer", "runtime", "firmware_iface")
+
+
+@dataclass(frozen=True)
+class Program:
+    """A program with commands.
+
+    Attributes
+    ----------
+    name : str
+        What a person types.
+    about : str
+        What its help says first.
+    commands : tuple of Command
+        In the order in which they are used.
+    package : str
+        What pip installs so that every command works.
+    """
+
+    name: str
+    about: str
+    commands: tuple[Command, ...]
+    package: str
+
+    def parser(self) -> ProgramParser:
+        """The parser of all commands."""
+        return ProgramParser(self.name, self.about, self.commands)
+
+    def main(self, arguments: Sequence[str] | None = None) -> int:
+        """Run one command.
+
+        Parameters
+        ----------
+        arguments : sequence of str
+            The command line without the program; by default the process's own.
+
+        Returns
+        -------
+        int
+            The exit code.
+        """
+        try:
+            return self._main(list(sys.argv[1:] if arguments is None else arguments))
+        except _NoReader:
+            return NO_READER
+        except (DeviceError, InputError) as error:
+            return self._stopped(str(error), BAD_INPUT)
+        except Interrupted as stop:
+            return self._stopped(str(stop), INTERRUPTED)
+        except KeyboardInterrupt:
+            return self._stopped(
+                "interrupted; what was finished is kept, and nothing is half written", INTERRUPTED
+            )
+        except OSError as error:
+            where = f"{error.filename}: " if error.filename else ""
+            return self._stopped(f"{where}{error.strerror or error}", BAD_INPUT)
+        except ModuleNotFoundError as error:
+            if error.name is None or error.name.split(".")[0] in OWN_PACKAGES:
+                raise
+            line = f"pip install '{self.package}'"
+            return self._stopped(f"{error.name} is not installed; get it with: {line}", BAD_INPUT)
+        except MemoryError:
+            return self._stopped(
+                "there is not enough memory: give it less to do at a time, or use a machine with more",
+                BAD_INPUT,
+            )
+
+    def _main(self, arguments: list[str]) -> int:
+        parser = self.parser()
+        with _output():
+            try:
+                args = parser.parse(arguments)
+            except SystemExit as stop:  # the help has been printed
+                return int(stop.code or 0)
+            if args.version:
+                print(f"{self.name} {installed_version()}")
+                return DONE
+            if args.command is None:
+                parser.whole.print_help()
+                return BAD_INPUT if arguments else DONE
+        return run(args.chosen, args)
+
+    def _stopped(self, sentence: str, code: int) -> int:
+        with suppress(OSError, ValueError):
+            print(f"{self.name}: {one_line(sentence)}", file=sys.stderr)
+        return code
+
+
+def run(command: Command, args: Namespace) -> int:
+    """Run a command and print its result; returns the exit code."""
+    screen = Screen()
+    with redirect_stdout(sys.stderr):  # what a library prints is not the command's output
+        result = command.run(args, screen)
+    with _output():
+        if args.json:
+            screen.json(result)
+        else:
+            command.show(result, args, screen)
+        screen.out.flush()
+    return DONE
+
+
+class _NoReader(Exception):
+    """Nobody reads stdout any more."""
+
+
+@contextmanager
+def _output() -> Iterator[None]:
+    """A block that writes to stdout: what stdout's encoding lacks is replaced, and all is written at its end.
+
+    Raises
+    ------
+    _NoReader
+        Where whoever read stdout has closed it.
+    """
+    with suppress(AttributeError, ValueError):
+        sys.stdout.reconfigure(errors="replace")  # type: ignore[union-attr]
+    try:
+        yield
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        with suppress(
+            OSError, ValueError, AttributeError
+        ):  # what is still buffered goes nowhere, without a message
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, sys.stdout.fileno())
+            os.close(nowhere)
+        raise _NoReader from None

@@ -1,0 +1,107 @@
+"""Patterns in files: 8-bit gray PNGs, and which file each picture's pattern goes to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from firmware_iface.errors import InputError
+from runtime.bundle.whole_files import whole_file
+
+
+@dataclass(frozen=True)
+class PatternFile:
+    """Where a pattern goes.
+
+    Attributes
+    ----------
+    target : Path
+        The picture that the pattern shows.
+    channel : str
+        The colour of the picture that it shows.
+    out : Path
+        The file that it is written to.
+    """
+
+    target: Path
+    channel: str
+    out: Path
+
+
+def pattern_files(targets: Sequence[Path], channels: Sequence[str], out: Path) -> list[PatternFile]:
+    """Which file each colour of each picture goes to; makes the folder.
+
+    Parameters
+    ----------
+    targets : sequence of Path
+        The pictures.
+    channels : sequence of str
+        The colours of each; where there are several, their names are added to the file's name.
+    out : Path
+        A PNG, for one picture, or a folder.
+
+    Raises
+    ------
+    InputError
+        Where two patterns would go to one file, a pattern would go to its own picture's, or nothing can be written.
+    """
+    single = out.suffix.lower() == ".png" and not out.is_dir()
+    if single and len(targets) > 1:
+        raise InputError(f"--out {out} is one file and there are {len(targets)} pictures: give a folder")
+    if not single and out.suffix and not out.is_dir():
+        raise InputError(f"--out {out}: patterns are PNG; give a name that ends in .png, or a folder")
+    files = []
+    for target in targets:
+        base = out if single else out / f"{target.stem}.png"
+        for channel in channels:
+            name = base if len(channels) == 1 else base.with_name(f"{base.stem}-{channel}{base.suffix}")
+            files.append(PatternFile(target, channel, name))
+    owners: dict[Path, Path] = {}
+    for file in files:
+        if file.out in owners:
+            raise InputError(
+                f"{owners[file.out]} and {file.target} would both be written to {file.out}: rename one"
+            )
+        if file.out.resolve() == file.target.resolve():
+            raise InputError(f"{file.target} would be overwritten by its own pattern: give another --out")
+        owners[file.out] = file.target
+    if not single:
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"--out {out} cannot be made ({error.strerror}): give another folder") from None
+    elif not out.absolute().parent.is_dir():
+        raise InputError(f"--out {out}: there is no folder {out.absolute().parent}; make it first")
+    return files
+
+
+def write_pattern(path: Path, gray: np.ndarray) -> None:
+    """Write gray levels, uint8 [H, W], as an 8-bit gray PNG that appears whole or not at all."""
+    with whole_file(path) as file:
+        Image.fromarray(gray).save(file, format="PNG")
+
+
+def read_pattern(path: Path) -> np.ndarray:
+    """Gray levels, uint8 [H, W], of an 8-bit gray PNG.
+
+    Raises
+    ------
+    InputError
+        Where the file is missing, is no picture, or is not 8-bit gray.
+    """
+    try:
+        with Image.open(path) as image:
+            image.load()
+            if image.mode != "L":
+                raise InputError(
+                    f"{path} is not 8-bit gray ({image.mode}): give a pattern as `solve` writes it"
+                )
+            return np.array(image, np.uint8)
+    except FileNotFoundError:
+        raise InputError(f"{path} is missing: give a pattern as `solve` writes it") from None
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(f"{path} is not a picture ({error}): give a pattern as `solve` writes it") from None

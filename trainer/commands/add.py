@@ -1,0 +1,75 @@
+"""`hololoop-trainer add`: one effect more."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+
+from runtime.program.command import Command, Result
+from runtime.program.screen import Screen
+from trainer.commands.command_line import command_line
+from trainer.commands.inputs import captures_argument, inputs_of, model_options, origin
+from trainer.commands.number_text import sizes_text, small_text
+from trainer.commands.outputs import out_option, refuse_folder
+from trainer.commands.workers import use_every_core
+
+
+def options(parser: ArgumentParser) -> None:
+    """The options of `add`."""
+    parser.add_argument(
+        "effect", metavar="EFFECT", help="name of an effect; 'hololoop-trainer effects' lists them"
+    )
+    captures_argument(parser)
+    model_options(parser)
+    out_option(parser, "NEW.toml", "where the new model goes")
+
+
+def run(args: Namespace, screen: Screen) -> Result:
+    """One effect more."""
+    refuse_folder(args.out, "--out")
+    from trainer.effects.effect_catalogue import catalogue, find_effect
+
+    effect = find_effect(catalogue(args.effects), args.effect)
+    captures, known, model = inputs_of(args)
+    from trainer.diagnosis.explain import add
+    from trainer.model.model_file import write_model
+
+    use_every_core()
+    with screen.progress(f"adding {effect.name}") as progress:
+        found = add(captures, model, effect, known, progress)
+    write_model(args.out, found.model, origin(captures))
+    return found.as_json()
+
+
+def show(result: Result, args: Namespace, screen: Screen) -> None:
+    """What was gained, and the effect's size."""
+    before, after = result["before"], result["after"]
+    size = sizes_text(result["parameters"])
+    worse = (
+        after["excess"] is not None and before["excess"] is not None and after["excess"] >= before["excess"]
+    )
+    gained = "which is no gain: leave it out" if worse else f"from {small_text(before['excess'])}"
+    screen.say(
+        f"With {args.effect} ({size}), "
+        f"the excess on held-out captures is {small_text(after['excess'])}, {gained}.",
+        style="yellow" if worse else "bold",
+    )
+    screen.table(
+        ("", "nrmse", "noise_nrmse", "excess"),
+        [
+            (when, e["nrmse"], e["noise_nrmse"], e["excess"])
+            for when, e in (("before", before), ("after", after))
+        ],
+    )
+    screen.say(f"\nThe model is {args.out}.")
+    screen.next(command_line("diagnose", args.captures, args=args, model=args.model if worse else args.out))
+
+
+COMMAND = Command(
+    name="add",
+    about="Add one effect to a model, fit it, and say what is gained on captures the fit did not see.",
+    options=options,
+    run=run,
+    show=show,
+    examples=("add zero_order captures/ --out better.toml",),
+    after="See what is still missing: diagnose captures/ --model better.toml",
+)

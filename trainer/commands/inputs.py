@@ -1,0 +1,96 @@
+"""What several commands are given: captures, a model, effects of one's own."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from firmware_iface.errors import InputError
+from runtime.program.screen import Screen
+from runtime.program.version import installed_version
+from trainer.commands.command_line import command_line
+
+if TYPE_CHECKING:
+    from trainer.captures.capture_set import CaptureSet
+    from trainer.effects.effect_catalogue import Catalogue
+    from trainer.model.model import Model
+
+
+def captures_argument(parser: ArgumentParser) -> None:
+    """The capture set."""
+    parser.add_argument(
+        "captures", metavar="CAPTURES", type=Path, help="folder of a capture set, with its bench.toml"
+    )
+
+
+def model_options(parser: ArgumentParser) -> None:
+    """--model and --effects."""
+    parser.add_argument(
+        "--model",
+        metavar="M.toml",
+        type=Path,
+        help="start from this model; without it, from the bench's ideal one",
+    )
+    effects_option(parser)
+
+
+def effects_option(parser: ArgumentParser) -> None:
+    """--effects."""
+    parser.add_argument(
+        "--effects",
+        metavar="FILE.py",
+        type=Path,
+        action="append",
+        default=[],
+        help="a Python file that defines effects of your own; may be given several times",
+    )
+
+
+def inputs_of(args: Namespace) -> tuple[CaptureSet, Catalogue, Model]:
+    """The capture set, the effects that are known, and the model to start from.
+
+    Raises
+    ------
+    InputError
+        Where one of the files cannot be used, or the model is of another bench.
+    """
+    from trainer.captures.capture_set import read_captures
+    from trainer.effects.effect_catalogue import catalogue
+    from trainer.model.model import Model
+    from trainer.model.model_file import read_model
+
+    captures = read_captures(args.captures)
+    known = catalogue(args.effects)
+    model = read_model(args.model, known, captures.bench) if args.model else Model(captures.bench)
+    return captures, known, model
+
+
+def origin(captures: CaptureSet) -> dict[str, Any]:
+    """Where a model comes from, for its file."""
+    return {
+        "written_by": f"hololoop {installed_version()}",
+        "captures": captures.folder.name,
+        "captures_sha256": captures.content_hash(),
+    }
+
+
+def refuse_misread(folder: Path, screen: Screen) -> None:
+    """Refuse captures that are not what bench.toml says, and warn on stderr of other errors of the set.
+
+    Other errors may be what is to be explained.
+
+    Raises
+    ------
+    InputError
+        Where the captures are misread, so that every number would be wrong.
+    """
+    from trainer.captures.check_set import MISREAD, check_captures
+
+    errors = [p for p in check_captures(folder) if p.severity == "error"]
+    for problem in errors:
+        if problem.kind in MISREAD:
+            raise InputError(problem.message)
+    if errors:
+        more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+        screen.note(f"warning: {errors[0].message}{more}; see: {command_line('check', folder)}")

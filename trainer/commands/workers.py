@@ -1,0 +1,42 @@
+"""How many processes a command uses: --workers and --cluster."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+
+from runtime.program.options import whole
+
+
+def worker_options(parser: ArgumentParser, cluster: bool = True) -> None:
+    """--workers and --cluster."""
+    workers_option(
+        parser, "processes that fit candidates at the same time (default: one a core; 1: this process alone)"
+    )
+    if cluster:
+        parser.add_argument(
+            "--cluster", metavar="ADDRESS", help="fit on a Dask cluster instead, such as tcp://10.0.0.5:8786"
+        )
+
+
+def workers_option(parser: ArgumentParser, what: str) -> None:
+    """--workers."""
+    parser.add_argument("--workers", metavar="N", type=whole(1, 4096), default=None, help=what)
+
+
+def workers_of(args: Namespace) -> int:
+    """How many processes to use; with one, this process takes every core."""
+    from trainer.fitting.pool import cores
+
+    workers = int(args.workers or cores())
+    if workers == 1:
+        use_every_core()
+    return workers
+
+
+def use_every_core() -> None:
+    """Let torch use all of this process's processors: for work that is done in this process."""
+    import torch
+
+    from trainer.fitting.pool import cores
+
+    torch.set_num_threads(cores())
