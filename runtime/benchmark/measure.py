@@ -22,6 +22,7 @@ from firmware_iface.errors import InputError
 from runtime.lightpath import fft
 from runtime.lightpath.ideal_path import ideal_path, single
 from runtime.lightpath.light_path import LightPath
+from runtime.program.progress import Progress, no_progress, part_of
 from runtime.solver import Solver
 from runtime.solver.targets import decode_srgb, fit_area
 
@@ -44,13 +45,9 @@ ROUNDS = 15
 FRAMES, STEP = 8, (1, 3)  # of the video, and pixels that it moves from frame to frame
 BORDER = 100  # of the panel's height at 1080 rows: left out of the video's region
 
-Progress = Callable[
-    [float, str], None
-]  # takes the share that is done, 0 to 1, and the name of what is measured
-
 
 def measure(
-    shapes: Sequence[tuple[int, int]] = SHAPES, solves: int = 40, progress: Progress = lambda done, what: None
+    shapes: Sequence[tuple[int, int]] = SHAPES, solves: int = 40, progress: Progress = no_progress
 ) -> dict[str, Any]:
     """Everything that `benchmark --json` prints.
 
@@ -78,7 +75,7 @@ def measure(
     floor, pruned, iteration = _against_ffts(solver, first)
     cold = _median(lambda: solver.solve(first, 0))
     progress(0.1, "convergence")
-    curves, final, pace = _convergence(path, pictures, lambda done, what: progress(0.1 + 0.6 * done, what))
+    curves, final, pace = _convergence(path, pictures, part_of(progress, 0.1, 0.7))
     progress(0.7, "deadlines")
     deadline = solver.begin.usual + 5.5 * solver.step.usual + solver.finish.usual
     took = [solver.solve(first, deadline_ms=deadline).milliseconds for _ in range(solves)]

@@ -40,7 +40,7 @@ from runtime.solver.solver_input import (
 )
 from runtime.solver.video_motion import is_cut, motion_between
 
-Progress = Callable[[int, float], None]
+IterationReport = Callable[[int, float], None]
 GRIDS = ("panel", "fine")
 WAYS = ("gradient", "predistorted")
 ITERATIONS = 20
@@ -141,7 +141,7 @@ class Solver:
         *,
         deadline_ms: float | None = None,
         start: np.ndarray | None = None,
-        progress: Progress | None = None,
+        progress: IterationReport | None = None,
     ) -> Solution:
         """The best pattern met in a number of iterations, or by a deadline, whichever is first.
 
@@ -237,7 +237,7 @@ class Solver:
         begun: float,
         iterations: int | None,
         deadline_ms: float | None,
-        progress: Progress | None,
+        progress: IterationReport | None,
     ) -> Solution:
         """Steps from phases[0] until the iterations or the time are used up; the solution from the best phase met."""
         self.before[...] = targets[0, 0]
@@ -307,7 +307,7 @@ def solve(
     iterations: int | None = None,
     levels: int = 256,
     start: np.ndarray | None = None,
-    progress: Progress | None = None,
+    progress: IterationReport | None = None,
     **options: Any,
 ) -> Solution:
     """One picture through one path: `Solver(path, levels, **options).solve(target, iterations, ...)`.

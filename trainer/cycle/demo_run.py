@@ -8,7 +8,7 @@ with safety controller and heartbeat), the camera over its link (depthai).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from runtime.bundle.bundle_folder import read_bundle
 from runtime.bundle.light_path_arrays import load_light_path
 from runtime.bundle.whole_files import whole_file
 from runtime.headset.open_devices import Devices, emulated
+from runtime.program.progress import Progress, no_progress, part_of
 from runtime.solver import Quality, quality, solve
 from runtime.solver.pattern_files import write_pattern
 from runtime.solver.targets import encode_srgb, fit_area
@@ -33,8 +34,6 @@ from trainer.model.export import export_bundle
 from trainer.model.model import Model
 from trainer.report.display_section import DisplayedPicture, with_display
 from trainer.training.photographs import photograph
-
-Progress = Callable[[float, str], None]
 
 BENCH, QUICK_BENCH = "virtual:demo", "virtual:small_demo"
 PICTURES = ("astronaut", "coffee")  # not among those that are captured
@@ -94,7 +93,7 @@ def run_demo(
     from trainer.model.model_file import write_model
     from trainer.report import write_report
 
-    say = progress or (lambda done, what: None)
+    say = progress or no_progress
     _make_empty(folder)
     spec = QUICK_BENCH if quick else BENCH
     headset = open_headset(spec, seed=1)
@@ -122,9 +121,7 @@ def run_demo(
     export_bundle(found.model, captures, bundles["after"])
     pictures = PICTURES[:1] if quick else PICTURES
     patterns = folder / "patterns"
-    solved = _patterns(
-        headset, captures.bench, bundles, pictures, patterns, lambda d, w: say(0.62 + 0.25 * d, w)
-    )
+    solved = _patterns(headset, captures.bench, bundles, pictures, patterns, part_of(say, 0.62, 0.87))
     say(0.88, "showing")
     with emulated(spec, seed=2) as devices:
         shown = [_show(devices, captures.bench, *each, patterns) for each in solved]
@@ -195,9 +192,7 @@ def _patterns(
             gray[which] = solve(path, target, ITERATIONS).gray
         gray["oracle"] = _oracle(
             headset, target, channel, gray["after"],
-            lambda done, name=name, begin=begin, part=part: say(  # type: ignore[misc]
-                begin + (0.2 + 0.8 * done) * part, f"asking the oracle: {name}"
-            ),
+            part_of(say, begin + 0.2 * part, begin + part, f"asking the oracle: {name}"),
         )  # fmt: skip
         for which, levels in gray.items():
             write_pattern(folder / f"{name}-{which}.png", levels)
@@ -231,7 +226,7 @@ def _oracle(
     target: np.ndarray,
     channel: str,
     start: np.ndarray,
-    progress: Callable[[float], None],
+    progress: Progress,
 ) -> np.ndarray:
     """The better of a start and of the oracle's pattern from it, by the quality on the true bench."""
     wanted = target.astype(np.float64)

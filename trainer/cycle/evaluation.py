@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from firmware_iface.errors import InputError, nearest
+from runtime.program.progress import Progress, no_progress
 from trainer.cycle.evaluation_bench import EvaluationBench, EvaluationSizes
 from trainer.cycle.hardware_in_the_loop import run_cycle
 from trainer.cycle.phase_retrieval import retrieve
@@ -44,8 +45,6 @@ METHODS = tuple(dict.fromkeys((*PREDICTION, *DISPLAY)))
 DEPTHS = (0.9, 1.0, 1.1)  # planes of the stack, in units of the bench's distance
 ONLINE = {"online": 2, "field_online": 4}  # rounds of refinement; a field is quick to refine
 ORACLE_ITERATIONS = 300  # from the best pattern of the methods on; more gain little
-
-Progress = Callable[[float, str], None]
 
 
 def run_evaluation(
@@ -102,7 +101,7 @@ def run_evaluation(
             workers,
             Path(folder),
         )
-        return _MethodComparison(bench).table(methods, progress or (lambda done, what: None))
+        return _MethodComparison(bench).table(methods, progress or no_progress)
 
 
 @dataclass

@@ -14,7 +14,7 @@ ones before. Recorded captures can take the camera's place: one set for each rou
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ import numpy as np
 import torch
 
 from firmware_iface.errors import InputError
+from runtime.program.progress import Progress
 from runtime.solver.pattern_files import write_pattern
 from trainer.captures.capture_set import CaptureSet
 from trainer.cycle.cycle_settings import CycleSettings
@@ -37,8 +38,6 @@ from trainer.networks.approximator import Approximator, write_approximator
 from trainer.training.image_metrics import ImageMetrics
 from trainer.training.training_pairs import Pairs, pairs_of
 from trainer.training.training_run import train
-
-Progress = Callable[[float, str], None]
 
 
 @dataclass
@@ -128,9 +127,9 @@ def run_cycle(
     for number in range(steps):
         here = folder / f"round-{number}"
 
-        def say(share: float, what: str, number: int = number) -> None:
+        def say(done: float, what: str = "", number: int = number) -> None:
             if progress:
-                progress((number + share) / steps, f"round {number}: {what}")
+                progress((number + done) / steps, f"round {number}: {what}")
 
         last = number == settings.rounds
         sets = recorded[number : number + 1]

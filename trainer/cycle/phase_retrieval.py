@@ -21,6 +21,7 @@ from torch import Tensor
 
 from firmware_iface.errors import InputError, nearest
 from runtime.lightpath.light_path import LightPath, irradiance, panel_phase, pixel_irradiance
+from runtime.program.progress import Progress
 from runtime.solver import DriveRange, solve
 from trainer.cycle.target_pictures import TargetVolume
 from trainer.effects.effect_catalogue import BUILT_IN
@@ -42,8 +43,6 @@ ITERATIONS = 60
 RATE, BETAS = 0.05, (0.8, 0.95)  # of Adam, rad: quick and without overshoot from a start that is nearly right
 # Of the panel's band: centre of the iris that keeps the zero order out, and its half width.
 CARRIER, OPENING = 0.3, 0.26
-
-Progress = Callable[[float], None]
 
 
 def beside_zero_order(model: Model) -> Model:

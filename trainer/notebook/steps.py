@@ -7,11 +7,12 @@ return an object instead of printing.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from firmware_iface.errors import InputError
+from runtime.program.progress import Progress
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.check_set import MISREAD, check_captures
 from trainer.commands.inputs import origin
@@ -80,7 +81,7 @@ def diagnose(
     effects: Iterable[File] = (),
     thresholds: Thresholds | None = None,
     workers: int = 1,
-    progress: Callable[[float, str], None] | None = None,
+    progress: Progress | None = None,
 ) -> DiagnosisResult:
     """Say what is missing from a model: which stage, which effect, how large.
 
@@ -121,7 +122,7 @@ def explain(
     effects: Iterable[File] = (),
     thresholds: Thresholds | None = None,
     workers: int = 1,
-    progress: Callable[[float, str], None] | None = None,
+    progress: Progress | None = None,
 ) -> ExplanationResult:
     """Diagnose and add effects, again and again, until nothing more is worth adding.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from firmware_iface.errors import InputError
 from runtime.bundle.bundle_folder import INITIALISER, Bundle, read_bundle, write_bundle
 from runtime.bundle.light_path_arrays import bundle_paths, load_light_path
 from runtime.lightpath.light_path import LightPath
+from runtime.program.progress import Progress, part_of
 from runtime.solver import Solver
 from runtime.solver.targets import fit_area
 from trainer.networks.initialiser_network import PATCH, InitialiserNetwork, initialiser_onnx
@@ -27,8 +28,6 @@ ITERATIONS = 40  # of the solves that are learned from
 REPORTED = 5  # iterations that the result is reported for
 CROP = 160  # pixels, even, so that the chequerboard keeps its place
 BATCH = 8
-
-Progress = Callable[[float, str], None]
 
 
 def train_initialiser(
@@ -78,7 +77,7 @@ def train_initialiser(
             solution = solver.solve(np.ascontiguousarray(picture), ITERATIONS)
             solved.append((_amplitude(picture), torch.tensor(solution.phase)))
     network = InitialiserNetwork()
-    _fit(network, solved, steps, lambda done: progress(0.5 + 0.4 * done, "learning"))
+    _fit(network, solved, steps, part_of(progress, 0.5, 0.9, "learning"))
     progress(0.9, "comparing")
     return network, {
         "double_phase": _psnr_by_iteration(path, None, held_out),
@@ -116,7 +115,7 @@ def _fit(
     network: InitialiserNetwork,
     solved: Sequence[tuple[Tensor, Tensor]],
     steps: int,
-    progress: Callable[[float], None],
+    progress: Progress,
 ) -> None:
     """Minimise one minus the cosine of the phase's error, over crops, by Adam with a falling rate."""
     optimizer = torch.optim.Adam(network.parameters(), 2e-3)

@@ -10,7 +10,7 @@ with the difference carried from the camera's pixels to the panel's where the tw
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from torch import Tensor
 
 from firmware_iface.errors import InputError
 from runtime.lightpath.light_path import irradiance, panel_phase, pixel_irradiance
+from runtime.program.progress import Progress
 from trainer.captures.batches import Batch, load_batch
 from trainer.captures.capture_set import Capture, CaptureSet
 from trainer.fitting.predictor import Predictor
@@ -32,8 +33,6 @@ from trainer.training.camera_to_panel import onto_panel
 MOST_COLOURS = 3
 WHITE = 0.999  # quantile of measured irradiance that is called white
 DULL = 0.02  # of the greatest sensitivity: below it the camera measures too little
-
-Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ from trainer.training.training_pairs import Pairs
 NETWORK = "network.safetensors"
 EVERY = 500  # steps between checkpoints and between metrics of the held-out pictures
 
-Progress = Callable[[int, float], None]
+StepReport = Callable[[int, float], None]
 
 
 def train(
@@ -52,7 +52,7 @@ def train(
     seed: int = 0,
     every: int = EVERY,
     about: dict[str, Any] | None = None,
-    progress: Progress | None = None,
+    progress: StepReport | None = None,
 ) -> Approximator:
     """A network trained on pairs.
 
@@ -156,7 +156,7 @@ class _TrainingRun:
         adam = torch.optim.Adam(module.parameters(), lr=self.recipe.rate, betas=self.recipe.betas)
         return self.fabric.setup(module, adam)
 
-    def run(self, held_out: Pairs | None, progress: Progress | None) -> Approximator:
+    def run(self, held_out: Pairs | None, progress: StepReport | None) -> Approximator:
         self._resume()
         while self.step < self.steps:
             losses = self._step()

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+from runtime.program.progress import Progress, no_progress, part_of
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import split
 from trainer.fitting.gains import with_gains
 from trainer.model.model import Model
 from trainer.training.training_pairs import Pairs, pairs_of
-
-Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
@@ -62,11 +60,9 @@ def training_sets(
     model = with_gains(captures, replace(model, gain={}), parts.fitted)
     share = len(parts.fitted) / max(1, len(captures))
 
-    def part_of(begin: float, part: float) -> Progress | None:
-        return None if progress is None else lambda done: progress(begin + part * done)
-
-    fitted = pairs_of(captures, parts.fitted, model, part_of(0, share))
-    held_out = pairs_of(captures, parts.held_out, model, part_of(share, 1 - share))
+    say = progress or no_progress
+    fitted = pairs_of(captures, parts.fitted, model, part_of(say, 0, share))
+    held_out = pairs_of(captures, parts.held_out, model, part_of(say, share, 1))
     about = {
         "captures": captures.folder.name,
         "captures_sha256": captures.content_hash(),
