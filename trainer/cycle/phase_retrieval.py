@@ -103,7 +103,7 @@ def retrieve(
         network = None
     if SOLVERS[method] != "bfgs":
         start = None
-    if network is not None or (len(wanted.planes_mm) > 1 and SOLVERS[method] == "default"):
+    if network is not None or (len(wanted.planes_mm) > 1 and SOLVERS[method] == "bfgs"):
         return _through_network(model, wanted, network, iterations, progress, start)
     if len(wanted.planes_mm) > 1:
         raise InputError(
