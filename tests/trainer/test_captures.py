@@ -14,8 +14,10 @@ from PIL import Image
 
 from firmware_iface.errors import InputError
 from tests.trainer.made_sets import bench_tables, make_set
-from trainer.captures.capture_set import CaptureSet, CaptureWriter, read_bench, read_captures, write_captures
-from trainer.captures.capture_set import bench_tables as tables_of
+from trainer.captures.bench_file import bench_tables as tables_of
+from trainer.captures.bench_file import read_bench
+from trainer.captures.capture_set import CaptureSet, read_captures
+from trainer.captures.capture_writer import CaptureWriter, write_captures
 
 FUZZ = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 

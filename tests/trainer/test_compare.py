@@ -13,7 +13,8 @@ from scipy.ndimage import gaussian_filter
 
 from firmware_iface.errors import InputError
 from trainer.captures.batches import load
-from trainer.captures.capture_set import CaptureSet, read_captures, write_captures
+from trainer.captures.capture_set import CaptureSet, read_captures
+from trainer.captures.capture_writer import write_captures
 from trainer.diagnosis import compare as module
 from trainer.diagnosis.compare import Comparison, compare
 from trainer.effects import catalogue

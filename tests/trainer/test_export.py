@@ -18,7 +18,8 @@ from runtime.bundle.light_path_arrays import bundle_channels, load_light_path, p
 from runtime.lightpath.light_path import irradiance, panel_phase
 from tests.trainer.test_effects import HEIGHT, PLANE, WIDTH, bench, gray, present
 from tests.trainer.test_networks import disturbed
-from trainer.captures.capture_set import read_captures, write_captures
+from trainer.captures.capture_set import read_captures
+from trainer.captures.capture_writer import write_captures
 from trainer.effects import catalogue
 from trainer.model.export import export_bundle
 from trainer.model.model import EffectInstance, Model, absent

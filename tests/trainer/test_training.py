@@ -21,7 +21,8 @@ from tests.trainer.made_sets import bench_tables, counted, irradiance
 from tests.trainer.test_perceptual import random_weights
 from trainer.captures.batches import load_batch
 from trainer.captures.bench_file import read_bench
-from trainer.captures.capture_set import CaptureSet, read_captures, write_captures
+from trainer.captures.capture_set import CaptureSet, read_captures
+from trainer.captures.capture_writer import write_captures
 from trainer.cli import main
 from trainer.effects import catalogue
 from trainer.fitting.gains import with_gains

@@ -78,7 +78,7 @@ class CaptureSummary:
         }
 
 
-def capture_from(
+def acquire_from(
     spec: str,
     folder: Path,
     patterns: int | None = None,
@@ -96,10 +96,12 @@ def capture_from(
     """
     with open_bench(spec, seed, read_bench(known) if known else None) as opened:
         planes = tuple(planes_mm) if planes_mm else opened.planes_mm
-        return capture_set(opened.headset, opened.bench, folder, patterns, planes, channels, seed, progress)
+        return acquire_captures(
+            opened.headset, opened.bench, folder, patterns, planes, channels, seed, progress
+        )
 
 
-def capture_set(
+def acquire_captures(
     headset: Headset,
     bench: Bench,
     folder: Path,

@@ -18,7 +18,8 @@ from firmware_iface.errors import InputError
 from runtime.excess import PredictionErrors, prediction_errors
 from runtime.lightpath.grid import MARGIN
 from trainer.captures.bench_file import Bench
-from trainer.captures.capture_set import Capture, CaptureSet
+from trainer.captures.capture_set import CaptureSet
+from trainer.captures.capture_table import Capture
 from trainer.captures.held_out import scenes
 
 PAST = (

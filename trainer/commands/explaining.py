@@ -41,15 +41,17 @@ if TYPE_CHECKING:
 
 def run_check(args: Namespace, screen: Screen) -> Result:
     """Everything that is wrong with a capture set."""
-    from trainer.captures.capture_set import read_bench, scan_rows
+    from trainer.captures.bench_file import read_bench
+    from trainer.captures.capture_table import scan_rows
     from trainer.captures.check_set import check_captures
+    from trainer.model.model_stages import ideal_irradiance
 
     folder: Path = args.captures
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder: name a capture set, with bench.toml and captures.csv")
     use_every_core()
     with screen.progress("checking the captures") as told:
-        problems = check_captures(folder, lambda done, count: told(done / max(1, count)))
+        problems = check_captures(folder, ideal_irradiance, lambda done, count: told(done / max(1, count)))
     try:
         rows, _ = scan_rows(folder, read_bench(folder / "bench.toml"))
     except InputError:
@@ -190,9 +192,11 @@ def refuse_misread(folder: Path, screen: Screen) -> None:
     """Raises InputError where the captures are not what bench.toml says, so that every number would be wrong; a
     line on stderr for other errors of the set, which may be what is to be explained.
     """
-    from trainer.captures.check_set import MISREAD, check_captures
+    from trainer.captures.check_set import check_captures
+    from trainer.captures.problems import MISREAD
+    from trainer.model.model_stages import ideal_irradiance
 
-    errors = [p for p in check_captures(folder) if p.severity == "error"]
+    errors = [p for p in check_captures(folder, ideal_irradiance) if p.severity == "error"]
     for problem in errors:
         if problem.kind in MISREAD:
             raise InputError(problem.message)

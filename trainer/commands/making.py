@@ -108,10 +108,10 @@ def show_new_effect(result: Result, args: Namespace, screen: Screen) -> None:
 
 def run_capture(args: Namespace, screen: Screen) -> Result:
     """Patterns shown on a bench and captured."""
-    from trainer.captures.acquire import capture_from
+    from trainer.captures.acquire import acquire_from
 
     with screen.progress("capturing") as told:
-        taken = capture_from(
+        taken = acquire_from(
             args.bench, args.out, args.patterns, args.planes, args.channels, args.seed, told, args.known
         )
     return taken.as_json()
