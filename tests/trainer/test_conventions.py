@@ -12,7 +12,8 @@ from scipy.ndimage import gaussian_filter
 from firmware_iface.errors import InputError
 from tests.trainer.made_sets import bench_tables, counted, irradiance, make_set
 from trainer.captures.bench_file import Bench, read_bench
-from trainer.captures.conventions import TURNS, Sample, compare_conventions, turned
+from trainer.captures.conventions import Sample, compare_conventions
+from trainer.captures.image_turns import TURNS, turned
 from trainer.model.model_stages import ideal_irradiance
 
 BACK = {"turn_90_left": "turn_90_right", "turn_90_right": "turn_90_left"}  # all others undo themselves
@@ -61,7 +62,7 @@ def test_all_sixteen(
 def test_the_change_is_right(
     bench: Bench, grays: list[np.ndarray], lights: dict[int, list[np.ndarray]]
 ) -> None:
-    """Turning the images as told makes the stated convention the best."""
+    """Turning the images as the change says makes the stated convention the best."""
     first = samples(bench, grays, [np.rot90(light) for light in lights[1]])
     result = compare_conventions(bench, first, ideal_irradiance)
     turn = result.best.turn

@@ -15,9 +15,16 @@ from typing import Any
 import numpy as np
 
 from firmware_iface.errors import InputError
-from trainer.captures.bench_keys import TOP_KEYS, KeyRule, checked_table, checked_value, printed, suggestion
-
-Matrix = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+from trainer.captures.bench_keys import (
+    TOP_KEYS,
+    KeyRule,
+    Matrix,
+    checked_matrix,
+    checked_table,
+    checked_value,
+    printed,
+    suggestion,
+)
 
 
 @dataclass(frozen=True)
@@ -311,29 +318,4 @@ def _camera(values: dict[str, Any], panel: Panel) -> Camera:
             "camera.homography is missing: with registered = false, give the 3 x 3 matrix from "
             "the centre of a camera pixel (x, y, 1) to panel pixels"
         )
-    return Camera(**{**values, "homography": _matrix(given)})
-
-
-def _matrix(given: Any) -> Matrix:
-    rows = given
-    if isinstance(given, (list, tuple)) and len(given) == 9:
-        rows = [given[0:3], given[3:6], given[6:9]]
-    wrong = InputError(
-        "camera.homography is not an invertible 3 x 3 matrix of finite numbers: "
-        "write [[a, b, c], [d, e, f], [g, h, i]], one list a row"
-    )
-    if not isinstance(rows, (list, tuple)) or len(rows) != 3:
-        raise wrong
-    flat: list[float] = []
-    for row in rows:
-        if not isinstance(row, (list, tuple)) or len(row) != 3:
-            raise wrong
-        for value in row:
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= 1e12:
-                raise wrong
-            flat.append(float(value))
-    a, b, c, d, e, f, g, h, i = flat
-    scale = max(map(abs, flat)) or 1.0
-    if abs(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)) <= 1e-15 * scale**3:
-        raise wrong
-    return (a, b, c), (d, e, f), (g, h, i)
+    return Camera(**{**values, "homography": checked_matrix(given)})

@@ -10,6 +10,8 @@ from typing import Any
 
 from firmware_iface.errors import InputError
 
+Matrix = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+
 
 @dataclass(frozen=True)
 class KeyRule:
@@ -148,3 +150,35 @@ def suggestion(key: str, known: tuple[str, ...]) -> str:
     """What to do about an unknown key."""
     near = get_close_matches(str(key), known, 1)
     return f"did you mean {near[0]!r}?" if near else f"use {', '.join(known)}, or remove it"
+
+
+def checked_matrix(given: Any) -> Matrix:
+    """The camera's homography, from three rows of three numbers or nine numbers.
+
+    Raises
+    ------
+    InputError
+        Where it is not an invertible matrix of finite numbers.
+    """
+    rows = given
+    if isinstance(given, (list, tuple)) and len(given) == 9:
+        rows = [given[0:3], given[3:6], given[6:9]]
+    wrong = InputError(
+        "camera.homography is not an invertible 3 x 3 matrix of finite numbers: "
+        "write [[a, b, c], [d, e, f], [g, h, i]], one list a row"
+    )
+    if not isinstance(rows, (list, tuple)) or len(rows) != 3:
+        raise wrong
+    flat: list[float] = []
+    for row in rows:
+        if not isinstance(row, (list, tuple)) or len(row) != 3:
+            raise wrong
+        for value in row:
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= 1e12:
+                raise wrong
+            flat.append(float(value))
+    a, b, c, d, e, f, g, h, i = flat
+    scale = max(map(abs, flat)) or 1.0
+    if abs(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)) <= 1e-15 * scale**3:
+        raise wrong
+    return (a, b, c), (d, e, f), (g, h, i)

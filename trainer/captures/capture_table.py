@@ -223,7 +223,7 @@ def _row(
         if cells[column] and not there:
             fault(
                 "missing_file",
-                f"{column} {str(relative)[:80]!r} is not there; put the file back or take the row out",
+                f"{column} {str(relative)[:80]!r} is not there; put the file back or remove the row",
             )
     if faults:
         return None, faults

@@ -92,8 +92,8 @@ def check_brightness(counts: np.ndarray, camera: Camera, name: str) -> list[Prob
         ]
     share = float((counts == top).mean())
     bright = top > camera.black_level + 0.25 * camera.full_scale
-    beside = float(((counts < top) & (counts >= top - 16)).mean()) / 16
-    if share > SATURATED_SHARE and bright and share > 10 * beside:
+    near_top = float(((counts < top) & (counts >= top - 16)).mean()) / 16
+    if share > SATURATED_SHARE and bright and share > 10 * near_top:
         return [
             Problem(
                 "error",

@@ -92,6 +92,7 @@ def check_captures(folder: Path | str, predict: Predict, progress: Progress | No
 
 
 def _load(capture: Capture, bench: Bench, statistics: _SetStatistics) -> tuple[np.ndarray, np.ndarray]:
+    """A capture's gray levels [H, W] and its counts [h, w], shifted to the bits that bit_depth says."""
     gray = read_picture(capture.phase, bench.panel.shape, 8, f"the pattern of capture {capture.capture}")
     counts = read_picture(
         capture.image,
@@ -139,6 +140,7 @@ def _one(bench: Bench, capture: Capture, statistics: _SetStatistics) -> list[Pro
 
 
 def _patterns(bench: Bench, statistics: _SetStatistics) -> list[Problem]:
+    """Whether each channel has enough different patterns."""
     problems = []
     for channel in bench.channels:
         number = len(statistics.patterns.get(channel.name, {}))

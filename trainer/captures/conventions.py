@@ -23,6 +23,7 @@ from scipy.ndimage import gaussian_filter
 
 from firmware_iface.errors import InputError
 from trainer.captures.bench_file import Bench
+from trainer.captures.image_turns import TURN_WORDS, TURNS, turned
 
 T_LEVEL = 6.0
 R_RATIO = 2.0
@@ -31,27 +32,6 @@ WINDOW = 8  # pixels, the largest shift that is looked for along each axis
 CORE = 512  # pixels, the part of a large registered image that is compared
 
 Predict = Callable[[Bench, np.ndarray, str, float], np.ndarray]
-
-_TURNS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "as_stated": lambda a: a,
-    "mirror_left_right": lambda a: a[:, ::-1],
-    "mirror_top_bottom": lambda a: a[::-1],
-    "turn_180": lambda a: a[::-1, ::-1],
-    "transpose": lambda a: a.T,
-    "turn_90_left": np.rot90,
-    "turn_90_right": lambda a: np.rot90(a, -1),
-    "transpose_other_diagonal": lambda a: a[::-1, ::-1].T,
-}
-TURNS = tuple(_TURNS)
-_WORDS = {
-    "mirror_left_right": "mirror the images left-right",
-    "mirror_top_bottom": "mirror the images top-bottom",
-    "turn_180": "turn the images by 180 degrees",
-    "transpose": "exchange the images' rows and columns",
-    "turn_90_left": "turn the images by 90 degrees to the left",
-    "turn_90_right": "turn the images by 90 degrees to the right",
-    "transpose_other_diagonal": "exchange the images' rows and columns and turn them by 180 degrees",
-}
 
 
 @dataclass(frozen=True)
@@ -128,25 +108,6 @@ class Convention:
     change: str
     scores: tuple[Score, ...]
     alike: tuple[Score, ...] = ()
-
-
-def turned(image: np.ndarray, turn: str) -> np.ndarray:
-    """The image after a named change.
-
-    Parameters
-    ----------
-    image : array [h, w]
-    turn : str
-        One of TURNS.
-
-    Raises
-    ------
-    InputError
-        For an unknown name.
-    """
-    if turn not in _TURNS:
-        raise InputError(f"{turn!r} is no way to turn an image: use one of {', '.join(TURNS)}")
-    return _TURNS[turn](image)
 
 
 def compare_conventions(
@@ -245,8 +206,10 @@ def _steps(score: Score, stated: Score) -> str:
             f"{'less' if score.phase_sign < 0 else 'more'} phase; a distance counted the other way "
             "looks the same, and this corrects it too)"
         )
-    if score.turn in _WORDS:
-        steps.append(_WORDS[score.turn] + " (or the panel's patterns)" * (score.turn.startswith("mirror")))
+    if score.turn in TURN_WORDS:
+        steps.append(
+            TURN_WORDS[score.turn] + " (or the panel's patterns)" * (score.turn.startswith("mirror"))
+        )
     return " and ".join(steps) or "leave everything as stated"
 
 

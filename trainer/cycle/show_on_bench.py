@@ -60,7 +60,7 @@ class BenchDisplay:
         Raises
         ------
         InputError
-            As from `capture_set`.
+            As from `acquire_captures`.
         """
         names = [c.name for c in self.bench.channels]
 
