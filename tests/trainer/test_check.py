@@ -1,4 +1,4 @@
-"""Every way in which a set goes wrong is found and pinned on its capture; sound sets are left in peace."""
+"""Every fault of a set is found and reported with its capture; sound sets have no problems."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from trainer.model.model_stages import ideal_irradiance
 FUZZ = settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
-def unknowing(bench: Bench, gray: np.ndarray, channel: str, plane_mm: float) -> np.ndarray:
+def flat_prediction(bench: Bench, gray: np.ndarray, channel: str, plane_mm: float) -> np.ndarray:
     """A prediction that fits nothing: for tests that are not about conventions."""
     return np.ones(bench.camera.shape, np.float32)
 
@@ -39,7 +39,7 @@ def copy(made: CaptureSet, tmp_path: Path) -> Path:
 
 
 def found(folder: Path) -> list[tuple[str, str, str]]:
-    return [(p.severity, p.kind, p.capture) for p in check_captures(folder, unknowing)]
+    return [(p.severity, p.kind, p.capture) for p in check_captures(folder, flat_prediction)]
 
 
 def edit(path: Path, old: str, new: str) -> None:
@@ -135,7 +135,7 @@ def test_few_saturated_pixels_are_nothing(copy: Path) -> None:
 def test_left_justified_counts(copy: Path, up: object) -> None:
     repaint(copy, up)
     assert found(copy) == [("error", "left_justified", f"{n:04d}") for n in range(6)]
-    assert "by 16" in check_captures(copy, unknowing)[0].message
+    assert "by 16" in check_captures(copy, flat_prediction)[0].message
 
 
 def test_left_justified_counts_of_a_dim_picture(tmp_path: Path) -> None:
@@ -161,7 +161,7 @@ def test_counts_above_the_stated_depth_and_steps_below_it(copy: Path) -> None:
 )
 def test_wrong_black_level(copy: Path, stated: int, says: str) -> None:
     edit(copy / "bench.toml", "black_level = 64", f"black_level = {stated}")
-    problems = check_captures(copy, unknowing)
+    problems = check_captures(copy, flat_prediction)
     assert [(p.kind, p.capture) for p in problems] == [("black_level", "")]
     assert says in problems[0].message and f"= {stated}" in problems[0].message
 
@@ -188,7 +188,7 @@ def test_repeats_point_to_the_black_level(tmp_path: Path) -> None:
 
 def test_too_few_patterns_say_what_is_enough(tmp_path: Path) -> None:
     make_set(tmp_path / "set", bench_tables(channels=("red", "green")), patterns=3)
-    problems = check_captures(tmp_path / "set", unknowing)
+    problems = check_captures(tmp_path / "set", flat_prediction)
     assert [(p.severity, p.kind) for p in problems] == [("warning", "too_few")] * 2
     assert "'red' has 3" in problems[0].message and "at least 4" in problems[0].message
 
@@ -234,7 +234,7 @@ def test_nothing_in_the_files_raises(made: CaptureSet, copy: Path, data: st.Data
         put = data.draw(st.binary(max_size=6) | st.sampled_from([b"nan", b"-1", b"9e9", b"\n", b'"', b",,"]))
         end = data.draw(st.sampled_from([start, start + 1, start + 9, len(whole)]))
         (copy / name).write_bytes(whole[:start] + put + whole[end:] if data.draw(st.booleans()) else whole)
-    assert all(isinstance(p, Problem) and p.message for p in check_captures(copy, unknowing))
+    assert all(isinstance(p, Problem) and p.message for p in check_captures(copy, flat_prediction))
 
 
 def test_practice_sets_are_clean(shared: Path) -> None:

@@ -74,7 +74,7 @@ def test_the_change_is_right(
 def test_a_poor_bench_is_no_convention(
     bench: Bench, grays: list[np.ndarray], lights: dict[int, list[np.ndarray]]
 ) -> None:
-    """Blur, a narrow beam, saturation and noise lower the correlation, and nothing else is said to fit."""
+    """Blur, a narrow beam, saturation and noise lower the correlation, and no other convention fits."""
     y, x = np.mgrid[-1:1:96j, -1:1:96j]
     beam = np.exp(-((x - 0.3) ** 2 + y**2))
     poor = [gaussian_filter(s, 1.5) * beam * 8 + 0.5 for s in lights[1]]

@@ -21,7 +21,20 @@ from trainer.prediction.stages import Drive, Panel, Pupil, Sensor
 
 @dataclass(frozen=True)
 class Scene:
-    """One colour and one plane of a bench: sizes, and coordinates as tensors of one precision."""
+    """One colour and one plane of a bench.
+
+    Attributes
+    ----------
+    bench : Bench
+    channel : str
+    plane_mm : float, mm
+        Panel to image plane.
+    method : str
+        Of propagation.
+    grid : Grid
+    dtype : torch.dtype
+        Of all real tensors of the scene.
+    """
 
     bench: Bench
     channel: str
@@ -49,7 +62,7 @@ def scene_at(
     Parameters
     ----------
     opened : float
-        Room for effects that open or move the iris, in units of what the bench says.
+        Room for effects that open or move the iris, as a factor on what the bench states.
 
     Raises
     ------
