@@ -1,6 +1,6 @@
 """Capture sets: a folder of patterns and camera pictures.
 
-A set holds ``bench.toml`` (what is known before anything is measured), ``captures.csv`` (one row a capture),
+A set holds ``bench.toml`` (what is known before anything is measured), ``captures.csv`` (one row for each capture),
 8-bit panel patterns and 16-bit raw camera pictures. Arrays are [row, column]; counts are raw camera counts.
 Pictures are read only when needed, so a set may be larger than memory. Anything wrong with a set is an
 `InputError` of one sentence.
@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from html import escape
 from pathlib import Path
@@ -47,17 +47,13 @@ class CaptureSet:
     @property
     def channels(self) -> tuple[str, ...]:
         """Names of the channels that have captures, in the bench's order."""
-        seen = {c.channel for c in self.captures}
-        return tuple(c.name for c in self.bench.channels if c.name in seen)
+        used = {c.channel for c in self.captures}
+        return tuple(c.name for c in self.bench.channels if c.name in used)
 
     @property
     def planes(self) -> tuple[float, ...]:
         """Distances that have captures, mm, ascending."""
         return tuple(sorted({c.plane_mm for c in self.captures}))
-
-    def select(self, captures: Iterable[Capture]) -> CaptureSet:
-        """The same bench with only these captures."""
-        return replace(self, captures=tuple(captures))
 
     def gray(self, capture: Capture) -> np.ndarray:
         """Gray levels sent to the panel.

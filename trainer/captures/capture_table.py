@@ -1,4 +1,4 @@
-"""captures.csv, the table of a capture set: one row a capture, read with everything that is wrong with it."""
+"""captures.csv, the table of a capture set: one row for each capture, read with everything that is wrong with it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Capture:
     channel : str
         Name of the bench's channel.
     plane_mm : float, mm
-        Panel to image plane, as asked for.
+        Panel to image plane, as set on the bench.
     pattern : str
         Rows of one pattern show the same gray levels.
     phase, image : Path
@@ -96,7 +96,7 @@ def scan_rows(folder: Path, bench: Bench) -> tuple[list[Capture], list[RowFault]
                 "unreadable",
                 "",
                 f"{path} cannot be read ({error.strerror}): "
-                "a capture set needs a captures.csv with one row a capture",
+                "a capture set needs a captures.csv with one row for each capture",
             )
         ]
     except (UnicodeDecodeError, csv.Error) as error:
@@ -114,7 +114,7 @@ def scan_rows(folder: Path, bench: Bench) -> tuple[list[Capture], list[RowFault]
         return [], [fault]
     captures: list[Capture] = []
     faults: list[RowFault] = []
-    seen: set[str] = set()
+    ids: set[str] = set()
     for number, row in numbered[1:]:
         cells = dict(zip(header, (cell.strip() for cell in row), strict=False))
         name = cells.get("capture", "")
@@ -130,7 +130,7 @@ def scan_rows(folder: Path, bench: Bench) -> tuple[list[Capture], list[RowFault]
             )
             continue
         capture, wrong = _row(folder, bench, cells, where, len(captures))
-        if name in seen:
+        if name in ids:
             wrong.insert(
                 0,
                 RowFault(
@@ -139,7 +139,7 @@ def scan_rows(folder: Path, bench: Bench) -> tuple[list[Capture], list[RowFault]
                     f"{where} repeats the id of an earlier row: give every capture its own id",
                 ),
             )
-        seen.add(name)
+        ids.add(name)
         faults += wrong
         if capture:
             captures.append(capture)
@@ -160,7 +160,7 @@ def _header_fault(path: Path, header: list[str], rows: int) -> RowFault | None:
     if twice:
         return RowFault("unreadable", "", f"{path} has two columns {twice[0]!r}: keep one")
     if rows < 2:
-        return RowFault("too_few", "", f"{path} has no captures: add one row a capture")
+        return RowFault("too_few", "", f"{path} has no captures: add one row for each capture")
     return None
 
 

@@ -7,7 +7,7 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -146,21 +146,6 @@ class CaptureWriter:
         self._rows.append(row)
         return name
 
-    def attach(self, name: str, text: str) -> None:
-        """Add a text file, such as truth.json, to the set.
-
-        Raises
-        ------
-        InputError
-            If the set has it already, or the name is not a plain file name.
-        """
-        path = self._work / name
-        if Path(name).name != name or path.exists() or name in ("captures.csv", ""):
-            raise InputError(
-                f"{name!r} cannot be attached: choose a plain file name that the set does not use"
-            )
-        path.write_text(text, encoding="utf-8")
-
     def __enter__(self) -> Self:
         return self
 
@@ -197,36 +182,6 @@ class CaptureWriter:
             raise InputError(
                 f"{path} exists already and is not empty: choose another folder, or remove it first"
             )
-
-
-def write_captures(
-    folder: Path | str, bench: Bench | Mapping[str, Any], rows: Iterable[Mapping[str, Any]]
-) -> Path:
-    """Write a capture set from rows.
-
-    Parameters
-    ----------
-    folder : path
-        Where the set is written; new or empty.
-    bench : Bench or mapping
-        A bench, or the tables of bench.toml.
-    rows : iterable of mapping
-        Each with the arguments of `CaptureWriter.add`.
-
-    Returns
-    -------
-    Path
-        The folder.
-
-    Raises
-    ------
-    InputError
-        As `CaptureWriter` does; then no folder is left behind.
-    """
-    with CaptureWriter(folder, bench) as writer:
-        for row in rows:
-            writer.add(**row)
-    return writer.folder
 
 
 def _toml_text(tables: Mapping[str, Any]) -> str:

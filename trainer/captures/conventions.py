@@ -145,10 +145,10 @@ def compare_conventions(
             made = np.asarray(predict(model, gray, sample.channel, sample.plane_mm), dtype=np.float32)[core]
             flat = _flattened(made, np.ones(made.shape, bool))
             for turn in TURNS:
-                seen, good = turned(image, turn), turned(valid, turn)
-                if seen.shape != made.shape:
+                observed, good = turned(image, turn), turned(valid, turn)
+                if observed.shape != made.shape:
                     continue
-                values, shift = _tile_correlations(_flattened(seen, good), good, flat)
+                values, shift = _tile_correlations(_flattened(observed, good), good, flat)
                 tiles.setdefault((turn, sign), []).append(values)
                 shifts.setdefault((turn, sign), []).append(shift)
             if quick and R_RATIO * float(np.mean(tiles["as_stated", stated_sign][0])) > 1:

@@ -20,7 +20,7 @@ from trainer.prediction.predict import light_on_camera, trace
 from trainer.prediction.scene import bare_stages
 
 MOST_CAPTURES = 3
-FINER = 8  # samples of the spectrum a whole cycle over the map: a peak is placed to a fraction of a cycle
+FINER = 8  # samples of the spectrum for one cycle over the map: a peak is located to a fraction of a cycle
 
 
 def pull(

@@ -29,7 +29,9 @@ def small_bench(rows: int = 72, columns: int = 96) -> Bench:
     return Bench("small", Panel(columns, rows, 8.0), (Channel("green", 520.0),), 6.0, Iris(), camera)
 
 
-def placed(effect: Effect, bench: Bench, values: ParameterValues, order: int | None = None) -> EffectInstance:
+def instance_with(
+    effect: Effect, bench: Bench, values: ParameterValues, order: int | None = None
+) -> EffectInstance:
     """The effect with these values, at its lowest order or a stated one; parameters not named stay absent."""
     base = absent(effect, bench, order)
     given = {
@@ -50,7 +52,7 @@ def change_when_absent(effect: Effect) -> float:
 def slopes(effect: Effect, values: ParameterValues) -> dict[str, float]:
     """Size of a prediction's derivative by each parameter at these values, by automatic differentiation."""
     bench = small_bench()
-    model = Model(bench).having(placed(effect, bench, values))
+    model = Model(bench).having(instance_with(effect, bench, values))
     tensors = {
         n: torch.tensor(v, dtype=torch.float32, requires_grad=True)
         for n, v in model.present[0].values.items()
@@ -91,7 +93,7 @@ def captures_with(
     CaptureSet
     """
     bench = small_bench()
-    model = Model(bench).having(placed(effect, bench, values, order))
+    model = Model(bench).having(instance_with(effect, bench, values, order))
     rng = np.random.default_rng(seed)
     with CaptureWriter(folder, bench) as writer, torch.no_grad():
         for number, pattern in enumerate(choose_patterns(bench, "green", bench.distance_mm, patterns, seed)):
