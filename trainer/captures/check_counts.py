@@ -111,7 +111,7 @@ def check_brightness(counts: np.ndarray, camera: Camera, name: str) -> list[Prob
                 "no_signal",
                 name,
                 f"the image of capture {name} holds nothing above the "
-                "camera's noise: see that the laser was on and the exposure long enough",
+                "camera's noise: check that the laser was on and the exposure long enough",
             )
         ]
     return []

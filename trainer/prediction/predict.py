@@ -67,7 +67,7 @@ def _far_field(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
 
 
 def display_filter(stages: Stages) -> Tensor | None:
-    """The irradiance filter that the eye sees too: source extent and ghosts."""
+    """The irradiance filter that applies to the eye too: source extent and ghosts."""
     parts = [f for f in (stages.pupil.irradiance_filter, stages.sensor.irradiance_filter) if f is not None]
     if not parts:
         return None

@@ -1,7 +1,7 @@
 """Scenes: one colour and one plane of a bench, and its four stages as the bench file has them.
 
 A `Scene` holds what is fixed for one colour and one plane; `Stages` are its drive, panel, pupil and sensor as effects
-see them. `trainer.model.model_stages` applies the effects of a model to them.
+receive them. `trainer.model.model_stages` applies the effects of a model to them.
 """
 
 from __future__ import annotations
