@@ -22,7 +22,7 @@ import pytest
 import torch
 
 from tests.trainer.hidden import bench_file
-from trainer.captures.acquire import capture_from
+from trainer.captures.acquire import acquire_from
 from trainer.captures.batches import load
 from trainer.captures.capture_set import read_captures
 from trainer.captures.held_out import capture_roles
@@ -64,7 +64,7 @@ def median_seconds(run: Callable[[], object], times: int = 7) -> float:
 @pytest.mark.parametrize(("name", "hidden"), [("zero_order", "one effect"), ("demo", "three effects")])
 def test_explain_sixteen_captures(name, hidden, tmp_path):
     captures = tmp_path / "captures"
-    capture_from(f"virtual:{name}", captures, patterns=15)
+    acquire_from(f"virtual:{name}", captures, patterns=15)
     start = time.perf_counter()
     command = [HOLOLOOP, "explain", captures, "--out", tmp_path / "model.toml", "--json"]
     subprocess.run([str(c) for c in command], check=True, capture_output=True)
@@ -76,7 +76,7 @@ def test_explain_sixteen_captures(name, hidden, tmp_path):
 
 def test_screen_against_fits(tmp_path):
     captures = tmp_path / "captures"
-    capture_from("virtual:zero_order", captures, patterns=15)
+    acquire_from("virtual:zero_order", captures, patterns=15)
     known = catalogue()
     rows = read_captures(captures)
     parts = capture_roles(rows)
@@ -138,7 +138,7 @@ def test_forward_over_its_ffts(tmp_path):
 def read_captures_bench(folder: Path):
     """The bench of a small set, for its geometry at 240 x 320."""
     path = bench_file(folder, width=320, height=240, distance_mm=30)
-    capture_from(str(path), folder / "bench", patterns=2)
+    acquire_from(str(path), folder / "bench", patterns=2)
     return read_captures(folder / "bench").bench
 
 
@@ -146,7 +146,7 @@ def test_growth(tmp_path):
     def seconds(side: int, count: int) -> float:
         path = Path(tempfile.mkdtemp(dir=tmp_path))
         spec = bench_file(path, 'kind = "zero_order"', width=side, height=side, distance_mm=10)
-        capture_from(str(spec), path / "captures", patterns=count - 1)
+        acquire_from(str(spec), path / "captures", patterns=count - 1)
         rows = read_captures(path / "captures")
         model = fit(Model(rows.bench), [], load(rows, rows.captures[:1])).model
         return median_seconds(lambda: evaluate_captures(rows, rows.captures, model), 3)

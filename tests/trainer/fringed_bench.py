@@ -6,7 +6,7 @@ from pathlib import Path
 
 from firmware_iface.virtual import BenchDescription, VirtualHeadset, make_defect
 from firmware_iface.virtual.bench_description import ChannelDescription
-from trainer.captures.acquire import capture_set
+from trainer.captures.acquire import acquire_captures
 from trainer.captures.bench_file import Bench
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.open_bench import nominal_bench
@@ -31,5 +31,5 @@ def known(headset: VirtualHeadset) -> Bench:
 def captured(folder: Path, patterns: int = 18, colours: bool = False) -> CaptureSet:
     """A capture set of it."""
     headset = fringed(colours)
-    capture_set(headset, known(headset), folder, patterns=patterns)
+    acquire_captures(headset, known(headset), folder, patterns=patterns)
     return read_captures(folder)

@@ -1,4 +1,4 @@
-"""Small capture sets for tests, made by a light path of their own: sub-pixel, nothing of the product's.
+"""Small capture sets for tests, made by an independent light path that shares no code with the product's.
 
 Every panel and camera pixel is 4 x 4 samples; the field is propagated by the angular spectrum, with an iris
 that passes the central order, and the camera adds light over its pixel, then shot, read and rounding noise.
@@ -6,11 +6,13 @@ that passes the central order, and the camera adds light over its pixel, then sh
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from trainer.captures.bench_file import Bench
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.capture_writer import CaptureWriter
 
@@ -97,3 +99,11 @@ def make_set(
                         exposure_ms=10.0,
                     )
     return read_captures(folder)
+
+
+def write_captures(folder: Path, bench: Bench | Mapping[str, Any], rows: Iterable[Mapping[str, Any]]) -> Path:
+    """Write a capture set from rows, each with the arguments of `CaptureWriter.add`; returns its folder."""
+    with CaptureWriter(folder, bench) as writer:
+        for row in rows:
+            writer.add(**row)
+    return writer.folder

@@ -9,12 +9,13 @@ import pytest
 
 from firmware_iface.errors import InputError
 from firmware_iface.virtual import VirtualHeadset, load_bench
-from trainer.captures.acquire import CaptureSummary, capture_from, capture_set
+from trainer.captures.acquire import CaptureSummary, acquire_captures, acquire_from
 from trainer.captures.bench_file import Bench, read_bench
 from trainer.captures.capture_set import read_captures
 from trainer.captures.check_set import check_captures
 from trainer.captures.patterns import choose_patterns, default_count
 from trainer.effects.testing import small_bench
+from trainer.model.model_stages import ideal_irradiance
 
 ROWS, COLUMNS, DISTANCE = 72, 96, 6.0
 
@@ -28,7 +29,7 @@ def small(name: str, seed: int = 0) -> tuple[VirtualHeadset, Bench]:
 
 def take(folder: Path, name: str, **options: object) -> CaptureSummary:
     headset, bench = small(name)
-    return capture_set(headset, bench, folder, **options)  # type: ignore[arg-type]
+    return acquire_captures(headset, bench, folder, **options)  # type: ignore[arg-type]
 
 
 def test_the_patterns_are_many_kinds_and_use_every_gray_level() -> None:
@@ -70,7 +71,7 @@ def test_a_set_is_sound_with_a_repeat_for_the_noise(tmp_path: Path) -> None:
     brightest = max(float(np.quantile(captures.counts(c), 0.99)) for c in captures.captures)
     assert brightest > 0.4 * captures.bench.camera.saturation
     assert [c.time_s for c in captures.captures] == sorted(c.time_s for c in captures.captures)
-    assert not [p for p in check_captures(tmp_path / "set") if p.severity == "error"]
+    assert not [p for p in check_captures(tmp_path / "set", ideal_irradiance) if p.severity == "error"]
     assert steps == sorted(steps)
     assert (steps[0], steps[-1]) == (0.0, 1.0)
 
@@ -91,7 +92,7 @@ def test_a_bright_bench_gets_a_short_exposure(tmp_path: Path) -> None:
     description = load_bench("virtual:ideal").resized(ROWS, COLUMNS, DISTANCE)
     description = replace(description, simulation=replace(description.simulation, signal_share=5.0))
     _, bench = small("ideal")
-    taken = capture_set(VirtualHeadset(description), bench, tmp_path / "set", 3)
+    taken = acquire_captures(VirtualHeadset(description), bench, tmp_path / "set", 3)
     assert taken.exposure_ms["green"] < 1.0
     assert 0 < taken.saturated < 0.003
 
@@ -108,14 +109,14 @@ def test_a_bright_bench_gets_a_short_exposure(tmp_path: Path) -> None:
 )
 def test_what_cannot_be_captured_gets_a_sentence(tmp_path: Path, options: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        capture_from(**{"spec": "virtual:ideal", "folder": tmp_path / "set", "patterns": 1, **options})
+        acquire_from(**{"spec": "virtual:ideal", "folder": tmp_path / "set", "patterns": 1, **options})
     assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(InputError, match="not empty"):
-        capture_from("virtual:ideal", tmp_path, 1)
+        acquire_from("virtual:ideal", tmp_path, 1)
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
 
 
@@ -123,4 +124,4 @@ def test_a_dark_bench_is_said_to_be_dark(tmp_path: Path) -> None:
     headset, bench = small("ideal")
     headset.lasers.set_power = lambda channel, fraction: None  # type: ignore[method-assign]
     with pytest.raises(InputError, match="sees nothing"):
-        capture_set(headset, bench, tmp_path / "set", 1)
+        acquire_captures(headset, bench, tmp_path / "set", 1)

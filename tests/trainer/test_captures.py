@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,11 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from firmware_iface.errors import InputError
-from tests.trainer.made_sets import bench_tables, make_set
-from trainer.captures.capture_set import CaptureSet, CaptureWriter, read_bench, read_captures, write_captures
-from trainer.captures.capture_set import bench_tables as tables_of
+from tests.trainer.made_sets import bench_tables, make_set, write_captures
+from trainer.captures.bench_file import bench_tables as tables_of
+from trainer.captures.bench_file import read_bench
+from trainer.captures.capture_set import CaptureSet, read_captures
+from trainer.captures.capture_writer import CaptureWriter
 
 FUZZ = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -49,7 +52,7 @@ def test_bench_survives_being_written(made: CaptureSet) -> None:
 
 def test_set_tells_what_it_holds(made: CaptureSet) -> None:
     assert made.channels == ("green", "red") and made.planes == (5.0,) and len(made) == 6
-    green = made.select(c for c in made.captures if c.channel == "green")
+    green = replace(made, captures=tuple(c for c in made.captures if c.channel == "green"))
     assert green.channels == ("green",) and green.bench is made.bench
 
 
@@ -272,7 +275,6 @@ def test_writer_refuses_to_overwrite_and_to_write_nonsense(made: CaptureSet, tmp
     gray, counts = made.gray(made.captures[0]), made.counts(made.captures[0])
     with CaptureWriter(tmp_path / "empty", made.bench) as writer:
         writer.add(gray, counts, "green")
-        writer.attach("truth.json", "{}")
         for wrong in (
             {"gray": gray[1:]},
             {"counts": counts.astype(float)},

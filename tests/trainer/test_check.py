@@ -1,4 +1,4 @@
-"""Every way in which a set goes wrong is found and pinned on its capture; sound sets are left in peace."""
+"""Every fault of a set is found and reported with its capture; sound sets have no problems."""
 
 from __future__ import annotations
 
@@ -12,15 +12,17 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from tests.trainer.made_sets import bench_tables, counted, irradiance, make_set
-from trainer.captures.bench_file import Bench
+from trainer.captures.bench_file import Bench, read_bench
 from trainer.captures.camera_noise import black_estimate, compare_repeats
-from trainer.captures.capture_set import CaptureSet, read_bench
-from trainer.captures.check_set import Problem, check_captures
+from trainer.captures.capture_set import CaptureSet
+from trainer.captures.check_set import check_captures
+from trainer.captures.problems import Problem
+from trainer.model.model_stages import ideal_irradiance
 
 FUZZ = settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
-def unknowing(bench: Bench, gray: np.ndarray, channel: str, plane_mm: float) -> np.ndarray:
+def flat_prediction(bench: Bench, gray: np.ndarray, channel: str, plane_mm: float) -> np.ndarray:
     """A prediction that fits nothing: for tests that are not about conventions."""
     return np.ones(bench.camera.shape, np.float32)
 
@@ -37,7 +39,7 @@ def copy(made: CaptureSet, tmp_path: Path) -> Path:
 
 
 def found(folder: Path) -> list[tuple[str, str, str]]:
-    return [(p.severity, p.kind, p.capture) for p in check_captures(folder, predict=unknowing)]
+    return [(p.severity, p.kind, p.capture) for p in check_captures(folder, flat_prediction)]
 
 
 def edit(path: Path, old: str, new: str) -> None:
@@ -53,7 +55,7 @@ def repaint(folder: Path, change: object, names: str = "*") -> None:
 
 def test_a_sound_set_has_no_problems(made: CaptureSet) -> None:
     steps: list[tuple[int, int]] = []
-    assert check_captures(made.folder, progress=lambda done, of: steps.append((done, of))) == []
+    assert check_captures(made.folder, ideal_irradiance, lambda done, of: steps.append((done, of))) == []
     assert steps == [(n, 6) for n in range(1, 7)]
 
 
@@ -133,7 +135,7 @@ def test_few_saturated_pixels_are_nothing(copy: Path) -> None:
 def test_left_justified_counts(copy: Path, up: object) -> None:
     repaint(copy, up)
     assert found(copy) == [("error", "left_justified", f"{n:04d}") for n in range(6)]
-    assert "by 16" in check_captures(copy, predict=unknowing)[0].message
+    assert "by 16" in check_captures(copy, flat_prediction)[0].message
 
 
 def test_left_justified_counts_of_a_dim_picture(tmp_path: Path) -> None:
@@ -159,7 +161,7 @@ def test_counts_above_the_stated_depth_and_steps_below_it(copy: Path) -> None:
 )
 def test_wrong_black_level(copy: Path, stated: int, says: str) -> None:
     edit(copy / "bench.toml", "black_level = 64", f"black_level = {stated}")
-    problems = check_captures(copy, predict=unknowing)
+    problems = check_captures(copy, flat_prediction)
     assert [(p.kind, p.capture) for p in problems] == [("black_level", "")]
     assert says in problems[0].message and f"= {stated}" in problems[0].message
 
@@ -186,7 +188,7 @@ def test_repeats_point_to_the_black_level(tmp_path: Path) -> None:
 
 def test_too_few_patterns_say_what_is_enough(tmp_path: Path) -> None:
     make_set(tmp_path / "set", bench_tables(channels=("red", "green")), patterns=3)
-    problems = check_captures(tmp_path / "set", predict=unknowing)
+    problems = check_captures(tmp_path / "set", flat_prediction)
     assert [(p.severity, p.kind) for p in problems] == [("warning", "too_few")] * 2
     assert "'red' has 3" in problems[0].message and "at least 4" in problems[0].message
 
@@ -218,7 +220,7 @@ def test_conventions_are_looked_for(copy: Path, edits: str, says: str) -> None:
     else:
         for path in (copy / "phase").glob("*.png"):
             Image.fromarray((-np.asarray(Image.open(path)).astype(int) % 256).astype(np.uint8)).save(path)
-    problems = check_captures(copy)
+    problems = check_captures(copy, ideal_irradiance)
     assert [(p.severity, p.kind) for p in problems] == [("error", "convention")]
     assert says in problems[0].message
 
@@ -232,9 +234,9 @@ def test_nothing_in_the_files_raises(made: CaptureSet, copy: Path, data: st.Data
         put = data.draw(st.binary(max_size=6) | st.sampled_from([b"nan", b"-1", b"9e9", b"\n", b'"', b",,"]))
         end = data.draw(st.sampled_from([start, start + 1, start + 9, len(whole)]))
         (copy / name).write_bytes(whole[:start] + put + whole[end:] if data.draw(st.booleans()) else whole)
-    assert all(isinstance(p, Problem) and p.message for p in check_captures(copy, predict=unknowing))
+    assert all(isinstance(p, Problem) and p.message for p in check_captures(copy, flat_prediction))
 
 
 def test_practice_sets_are_clean(shared: Path) -> None:
     for folder in sorted((shared / "practice").iterdir()):
-        assert check_captures(folder) == []
+        assert check_captures(folder, ideal_irradiance) == []

@@ -12,8 +12,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from firmware_iface.errors import InputError
+from tests.trainer.made_sets import write_captures
 from trainer.captures.batches import load
-from trainer.captures.capture_set import CaptureSet, read_captures, write_captures
+from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.diagnosis import compare as module
 from trainer.diagnosis.compare import Comparison, compare
 from trainer.effects import catalogue

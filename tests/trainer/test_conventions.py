@@ -12,7 +12,9 @@ from scipy.ndimage import gaussian_filter
 from firmware_iface.errors import InputError
 from tests.trainer.made_sets import bench_tables, counted, irradiance, make_set
 from trainer.captures.bench_file import Bench, read_bench
-from trainer.captures.conventions import TURNS, Sample, compare_conventions, find_convention, turned
+from trainer.captures.conventions import Sample, compare_conventions
+from trainer.captures.image_turns import TURNS, turned
+from trainer.model.model_stages import ideal_irradiance
 
 BACK = {"turn_90_left": "turn_90_right", "turn_90_right": "turn_90_left"}  # all others undo themselves
 TABLES = bench_tables((96, 96))
@@ -50,7 +52,7 @@ def test_all_sixteen(
     bench: Bench, grays: list[np.ndarray], lights: dict[int, list[np.ndarray]], turn: str, sign: int
 ) -> None:
     seen = [np.roll(turned(light, BACK.get(turn, turn)), (2, -3), (0, 1)) for light in lights[sign]]
-    result = compare_conventions(bench, samples(bench, grays, seen))
+    result = compare_conventions(bench, samples(bench, grays, seen), ideal_irradiance)
     assert (result.best.turn, result.best.phase_sign) == (turn, sign) and len(result.scores) == 16
     assert result.decisive == ((turn, sign) != ("as_stated", 1)) and result.alike == ()
     assert bool(result.change) == result.decisive
@@ -60,23 +62,23 @@ def test_all_sixteen(
 def test_the_change_is_right(
     bench: Bench, grays: list[np.ndarray], lights: dict[int, list[np.ndarray]]
 ) -> None:
-    """Turning the images as told makes the stated convention the best."""
+    """Turning the images as the change says makes the stated convention the best."""
     first = samples(bench, grays, [np.rot90(light) for light in lights[1]])
-    result = compare_conventions(bench, first)
+    result = compare_conventions(bench, first, ideal_irradiance)
     turn = result.best.turn
-    put_right = [replace(s, signal=turned(s.signal, turn), valid=turned(s.valid, turn)) for s in first]
+    corrected = [replace(s, signal=turned(s.signal, turn), valid=turned(s.valid, turn)) for s in first]
     assert result.decisive and "to the right" in result.change
-    assert not compare_conventions(bench, put_right).decisive
+    assert not compare_conventions(bench, corrected, ideal_irradiance).decisive
 
 
 def test_a_poor_bench_is_no_convention(
     bench: Bench, grays: list[np.ndarray], lights: dict[int, list[np.ndarray]]
 ) -> None:
-    """Blur, a narrow beam, saturation and noise lower the correlation, and nothing else is said to fit."""
+    """Blur, a narrow beam, saturation and noise lower the correlation, and no other convention fits."""
     y, x = np.mgrid[-1:1:96j, -1:1:96j]
     beam = np.exp(-((x - 0.3) ** 2 + y**2))
     poor = [gaussian_filter(s, 1.5) * beam * 8 + 0.5 for s in lights[1]]
-    result = compare_conventions(bench, samples(bench, grays, poor))
+    result = compare_conventions(bench, samples(bench, grays, poor), ideal_irradiance)
     assert result.best is result.stated and not result.decisive and result.change == ""
 
 
@@ -84,17 +86,17 @@ def test_other_data_decide_nothing(bench: Bench, grays: list[np.ndarray]) -> Non
     rng = np.random.default_rng(4)
     for _ in range(3):
         other = [irradiance(rng.integers(0, 256, (96, 96))) for _ in grays]
-        assert not compare_conventions(bench, samples(bench, grays, other)).decisive
+        assert not compare_conventions(bench, samples(bench, grays, other), ideal_irradiance).decisive
 
 
 def test_what_cannot_be_told_apart_is_said(bench: Bench) -> None:
-    """A binary pattern of 0 and pi has no sign; mirrored, either sign puts it right."""
+    """A binary pattern of 0 and pi has no sign; mirrored, either sign corrects it."""
     rng = np.random.default_rng(9)
     gray = rng.choice([0, 128], (96, 96)).astype(np.uint8)
     light = irradiance(gray)
-    plain = compare_conventions(bench, [sample(bench, gray, light, 0)])
+    plain = compare_conventions(bench, [sample(bench, gray, light, 0)], ideal_irradiance)
     assert not plain.decisive
-    mirrored = compare_conventions(bench, [sample(bench, gray, light[::-1], 0)])
+    mirrored = compare_conventions(bench, [sample(bench, gray, light[::-1], 0)], ideal_irradiance)
     assert mirrored.decisive and mirrored.best.turn == "mirror_top_bottom"
     other = ("mirror_top_bottom", -mirrored.best.phase_sign)
     assert [(s.turn, s.phase_sign) for s in mirrored.alike] == [other]
@@ -105,24 +107,29 @@ def test_a_stated_sign_is_the_start(grays: list[np.ndarray], lights: dict[int, l
     tables = bench_tables((96, 96))
     tables["panel"]["phase_sign"] = -1
     bench = read_bench(tables)
-    assert not compare_conventions(bench, [sample(bench, grays[0], lights[-1][0], 0)]).decisive
-    result = compare_conventions(bench, [sample(bench, grays[0], lights[1][0], 0)])
+    assert not compare_conventions(
+        bench, [sample(bench, grays[0], lights[-1][0], 0)], ideal_irradiance
+    ).decisive
+    result = compare_conventions(bench, [sample(bench, grays[0], lights[1][0], 0)], ideal_irradiance)
     assert result.decisive and "phase_sign = 1" in result.change
 
 
 def test_oblong_cameras_cannot_be_transposed(tmp_path: Path) -> None:
     made = make_set(tmp_path / "set")
-    result = find_convention(made)
+    distinct = list({c.pattern: c for c in made.captures}.values())[::2]
+    several = [Sample(c.capture, made.gray(c), *made.signal(c), c.channel, c.plane_mm) for c in distinct]
+    result = compare_conventions(made.bench, several, ideal_irradiance)
     quick = compare_conventions(
         made.bench,
         [sample(made.bench, made.gray(c), made.signal(c)[0] / 300, 0) for c in made.captures[:1]],
+        ideal_irradiance,
         quick=True,
     )
     assert quick.best is quick.stated and len(quick.scores) == 4
     assert len(result.scores) == 8 and not result.decisive and result.stated.correlation > 0.8
     assert result.stated.shift == ((0, 0),) * 3
     with pytest.raises(InputError, match="no captures"):
-        find_convention(made.select([]))
+        compare_conventions(made.bench, [], ideal_irradiance)
     with pytest.raises(InputError, match="no way"):
         turned(np.zeros((2, 2)), "upside_down")
 

@@ -16,9 +16,10 @@ from firmware_iface.errors import InputError
 from runtime.bundle.bundle_folder import ADAPTERS, APPROXIMATOR, GRADIENT, Bundle, read_bundle, write_bundle
 from runtime.bundle.light_path_arrays import bundle_channels, load_light_path, plane_of
 from runtime.lightpath.light_path import irradiance, panel_phase
+from tests.trainer.made_sets import write_captures
 from tests.trainer.test_effects import HEIGHT, PLANE, WIDTH, bench, gray, present
 from tests.trainer.test_networks import disturbed
-from trainer.captures.capture_set import read_captures, write_captures
+from trainer.captures.capture_set import read_captures
 from trainer.effects import catalogue
 from trainer.model.export import export_bundle
 from trainer.model.model import EffectInstance, Model, absent

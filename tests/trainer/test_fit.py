@@ -11,7 +11,7 @@ from runtime.lightpath.legendre import legendre_count
 from trainer.captures.batches import Batch, load
 from trainer.captures.capture_set import CaptureSet
 from trainer.effects import catalogue
-from trainer.effects.testing import captures_with, placed
+from trainer.effects.testing import captures_with, instance_with
 from trainer.fitting.gauss_newton import fit
 from trainer.fitting.refit import least_for_order, raise_order
 from trainer.model.model import EffectInstance, Model, absent
@@ -42,7 +42,9 @@ def test_true_values_lie_within_the_stated_errors(name: str, truth: dict[str, fl
     scores = []
     for seed in range(4):
         captures = captures_with(tmp_path / str(seed), effect, truth, patterns=3, seed=seed)
-        found = fitted(captures, placed(effect, captures.bench, {k: 0.9 * v for k, v in truth.items()}))
+        found = fitted(
+            captures, instance_with(effect, captures.bench, {k: 0.9 * v for k, v in truth.items()})
+        )
         assert found.errors is not None
         for key, value in truth.items():
             true = float(np.asarray(value))
@@ -68,5 +70,5 @@ def test_an_order_is_raised_as_far_as_the_captures_ask_and_no_farther(tmp_path: 
 def test_a_value_stays_in_its_physical_range(tmp_path: Path) -> None:
     effect = KNOWN["zero_order"]
     captures = captures_with(tmp_path, effect, {"fill_factor": 1.0}, patterns=3)
-    found = fitted(captures, placed(effect, captures.bench, {"fill_factor": 0.99}))
+    found = fitted(captures, instance_with(effect, captures.bench, {"fill_factor": 0.99}))
     assert 0.99 < float(found.values["fill_factor"]) <= 1.0

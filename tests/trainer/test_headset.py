@@ -13,7 +13,7 @@ from firmware_iface.virtual import open_headset
 from tests.campaigns.headset import hardware, write_configuration
 from tests.trainer.fringed_bench import SHAPE, fringed, known
 from tests.trainer.hidden import ran
-from trainer.captures.acquire import capture_set
+from trainer.captures.acquire import acquire_captures
 from trainer.captures.bench_file import bench_tables
 from trainer.captures.open_bench import RealHeadset, nominal_bench, open_bench
 from trainer.cli import main
@@ -25,7 +25,7 @@ def test_real_lasers_stay_within_the_power_that_is_set(tmp_path: Path) -> None:
     real = RealHeadset(virtual.panel, virtual.lasers, virtual.camera, {"green": 0.25}, 6.0)
     real.lasers.set_power("green", 1.0)
     assert virtual.lasers.power("green") == 0.25
-    taken = capture_set(real, known(virtual), tmp_path / "captures", patterns=2)
+    taken = acquire_captures(real, known(virtual), tmp_path / "captures", patterns=2)
     assert taken.captures == 3 and taken.saturated < 0.02
     assert virtual.lasers.power("green") == 0
 

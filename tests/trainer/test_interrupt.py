@@ -16,7 +16,7 @@ import pytest
 
 from firmware_iface.errors import InputError
 from tests.trainer.hidden import bench_file
-from trainer.captures.acquire import capture_from
+from trainer.captures.acquire import acquire_from
 from trainer.effects.effect_catalogue import catalogue
 from trainer.model.model import Model
 from trainer.model.model_file import read_model
@@ -33,7 +33,7 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("interrupted")
     defects = ('kind = "distance"', 'kind = "zero_order"')
     bench = bench_file(folder, *defects, width=128, height=96, distance_mm=10)
-    capture_from(str(bench), folder / "captures", patterns=6)
+    acquire_from(str(bench), folder / "captures", patterns=6)
     return folder / "captures"
 
 

@@ -18,7 +18,7 @@ from runtime.bundle.light_path_arrays import load_light_path
 from runtime.lightpath.light_path import irradiance, panel_phase
 from tests.trainer.fringed_bench import SHAPE
 from tests.trainer.hidden import ran
-from trainer.captures.acquire import capture_set
+from trainer.captures.acquire import acquire_captures
 from trainer.captures.bench_file import Bench
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.open_bench import nominal_bench
@@ -46,7 +46,7 @@ def headset(*kinds: str) -> VirtualHeadset:
 
 def taken(folder: Path, *kinds: str, patterns: int = 18) -> CaptureSet:
     there = headset(*kinds)
-    capture_set(there, nominal_bench(there), folder, patterns=patterns)
+    acquire_captures(there, nominal_bench(there), folder, patterns=patterns)
     return read_captures(folder)
 
 

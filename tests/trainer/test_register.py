@@ -29,8 +29,8 @@ def test_dots_shown_seen_and_found(tmp_path: Path, capsys) -> None:
 
     # The user's bench file: no homography yet, and a comment that must stay.
     bench = tmp_path / "bench.toml"
-    told = text.replace(camera, "registered = false  # measured by hand, roughly")
-    bench.write_text("schema = 1\n" + told)
+    user_text = text.replace(camera, "registered = false  # measured by hand, roughly")
+    bench.write_text("schema = 1\n" + user_text)
     shown = ran(capsys, "register", bench, "--spacing", 20, "--out", tmp_path / "dots.png")
     headset.panel.show(np.asarray(Image.open(shown["pattern"])))
     headset.lasers.set_power("green", 1.0)

@@ -17,11 +17,11 @@ from safetensors.torch import save_file
 from firmware_iface.errors import InputError
 from tests.conftest import ROOT
 from tests.trainer.fringed_bench import SHAPE, captured
-from tests.trainer.made_sets import bench_tables, counted, irradiance
+from tests.trainer.made_sets import bench_tables, counted, irradiance, write_captures
 from tests.trainer.test_perceptual import random_weights
 from trainer.captures.batches import load_batch
 from trainer.captures.bench_file import read_bench
-from trainer.captures.capture_set import CaptureSet, read_captures, write_captures
+from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.cli import main
 from trainer.effects import catalogue
 from trainer.fitting.gains import with_gains

@@ -11,7 +11,7 @@ import pytest
 
 from firmware_iface.errors import InputError
 from tests.trainer.hidden import bench_file
-from trainer.captures.acquire import capture_from
+from trainer.captures.acquire import acquire_from
 from trainer.captures.batches import in_view
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.diagnosis.compare import compare
@@ -61,7 +61,7 @@ def taken(
         assert text.count(old) == 1
         text = text.replace(old, new)
     path.write_text(text)
-    capture_from(str(path), folder / "captures", patterns=5)
+    acquire_from(str(path), folder / "captures", patterns=5)
     return read_captures(folder / "captures")
 
 

@@ -1,7 +1,7 @@
 """Takes a capture set from a bench: chooses patterns, sets the exposure, shows and captures.
 
-The exposure of each colour is set once, from a look at all of its patterns, and then stays, so that the
-laser's power is the only thing that changes the gain.
+The exposure of each colour is set once, from pictures of all of its patterns, and then stays the same. So only the
+laser's power changes the gain.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from trainer.captures.open_bench import open_bench
 from trainer.captures.patterns import Pattern, choose_patterns, default_count
 
 Progress = Callable[[float, str], None]
-Choose = Callable[[str, float], list[Pattern]]
+PatternChooser = Callable[[str, float], list[Pattern]]
 
 SATURATED = 0.002  # of all pixels of a colour
 SATURATED_IN_ONE = 0.01  # of the pixels of one capture
@@ -41,7 +41,7 @@ class Lasers(Protocol):
 
 
 class Headset(Protocol):
-    """What is needed of a bench: its panel, lasers and camera, a focus, and a clock."""
+    """What a bench must have: a panel, lasers and a camera, a focus, and a clock."""
 
     @property
     def panel(self) -> Any: ...
@@ -61,7 +61,18 @@ class Headset(Protocol):
 
 @dataclass(frozen=True)
 class CaptureSummary:
-    """A capture set that was taken."""
+    """A capture set that was taken.
+
+    Attributes
+    ----------
+    folder : Path
+    captures : int
+        How many.
+    exposure_ms : dict of str to float, ms
+        By channel.
+    saturated : float
+        Share of the pixels.
+    """
 
     folder: Path
     captures: int
@@ -69,7 +80,7 @@ class CaptureSummary:
     saturated: float
 
     def as_json(self) -> dict[str, Any]:
-        """For `--json`."""
+        """Keys `folder`, `captures`, `exposure_ms` and `saturated_share` of `capture --json`."""
         return {
             "folder": str(self.folder),
             "captures": self.captures,
@@ -78,7 +89,7 @@ class CaptureSummary:
         }
 
 
-def capture_from(
+def acquire_from(
     spec: str,
     folder: Path,
     patterns: int | None = None,
@@ -88,18 +99,38 @@ def capture_from(
     progress: Progress | None = None,
     known: Path | None = None,
 ) -> CaptureSummary:
-    """A capture set from the bench that `spec` names: `virtual:NAME`, the TOML file of a virtual bench, or the
-    configuration of a real headset, with the bench.toml `known`.
+    """Open a bench by name and take a capture set from it.
 
-    Raises InputError for an unknown bench, channel or plane, or a folder that holds something already; DeviceError
-    where a device fails.
+    Parameters
+    ----------
+    spec : str
+        `virtual:NAME`, the TOML file of a virtual bench, or the configuration of a real headset.
+    folder : Path
+        Where the set is written; new or empty.
+    patterns, planes_mm, channels, seed, progress
+        As from `acquire_captures`.
+    known : Path, optional
+        bench.toml of a real headset.
+
+    Returns
+    -------
+    CaptureSummary
+
+    Raises
+    ------
+    InputError
+        For an unknown bench, channel or plane, or a folder that is not empty.
+    DeviceError
+        Where a device fails.
     """
     with open_bench(spec, seed, read_bench(known) if known else None) as opened:
         planes = tuple(planes_mm) if planes_mm else opened.planes_mm
-        return capture_set(opened.headset, opened.bench, folder, patterns, planes, channels, seed, progress)
+        return acquire_captures(
+            opened.headset, opened.bench, folder, patterns, planes, channels, seed, progress
+        )
 
 
-def capture_set(
+def acquire_captures(
     headset: Headset,
     bench: Bench,
     folder: Path,
@@ -108,12 +139,39 @@ def capture_set(
     channels: Sequence[str] | None = None,
     seed: int = 0,
     progress: Progress | None = None,
-    choose: Choose | None = None,
+    choose: PatternChooser | None = None,
 ) -> CaptureSummary:
     """Show patterns on a bench, capture them, and write the set.
 
-    patterns : how many for each colour and plane; the first is shown twice, for the noise
-    choose : gives the patterns of a colour and plane instead
+    Parameters
+    ----------
+    headset : Headset
+    bench : Bench
+    folder : Path
+        Where the set is written; new or empty.
+    patterns : int, optional
+        How many for each colour and plane. The first is shown twice, to measure the noise.
+    planes_mm : sequence of float, mm
+        By default the bench's distance.
+    channels : sequence of str, optional
+        By default all of the bench's.
+    seed : int
+        For the choice of patterns.
+    progress : callable, optional
+        Called with the share done, 0 to 1, and what is done now.
+    choose : callable, optional
+        Gives the patterns of a channel and plane, in place of `choose_patterns`.
+
+    Returns
+    -------
+    CaptureSummary
+
+    Raises
+    ------
+    InputError
+        For an unknown channel or plane, a folder that is not empty, or a dark bench.
+    DeviceError
+        Where a device fails.
     """
     names = [c.name for c in bench.channels]
     chosen = list(dict.fromkeys(channels or names))
@@ -129,13 +187,13 @@ def capture_set(
     steps = len(chosen) * len(planes) * (2 * count + 1)
     done = 0
 
-    def say(what: str) -> None:
+    def report(what: str) -> None:
         nonlocal done
         if progress:
             progress(done / steps, what)
         done += 1
 
-    for plane in planes:  # before the patterns are made: a plane out of reach is said at once
+    for plane in planes:  # before the patterns are made: a plane out of reach is reported at once
         headset.move_to_plane(plane)
     exposures: dict[str, float] = {}
     saturated: list[float] = []
@@ -146,14 +204,14 @@ def capture_set(
             headset.lasers.off()
             headset.lasers.set_power(channel, 1.0)
             try:
-                exposures[channel] = _expose(headset, bench.camera, shown, channel, say)
+                exposures[channel] = _expose(headset, bench.camera, shown, channel, report)
                 for plane, several in shown:
                     headset.move_to_plane(plane)
                     for number, pattern in _with_repeat(several):
-                        say(f"{channel}, {plane:g} mm")
+                        report(f"{channel}, {plane:g} mm")
                         started = headset.time_s if started is None else started
                         time = headset.time_s - started
-                        counts = _shot(headset, pattern)
+                        counts = _capture(headset, pattern)
                         saturated.append(float((counts >= bench.camera.saturation).mean()))
                         writer.add(
                             pattern.gray,
@@ -176,7 +234,7 @@ def _with_repeat(patterns: list[Pattern]) -> list[tuple[int, Pattern]]:
     return [(0, patterns[0]), *enumerate(patterns)]
 
 
-def _shot(headset: Headset, pattern: Pattern) -> NDArray[np.uint16]:
+def _capture(headset: Headset, pattern: Pattern) -> NDArray[np.uint16]:
     headset.panel.show(pattern.gray)
     counts: NDArray[np.uint16] = headset.camera.capture()
     return counts
@@ -187,35 +245,35 @@ def _expose(
     camera: Camera,
     shown: list[tuple[float, list[Pattern]]],
     channel: str,
-    say: Callable[[str], None],
+    report: Callable[[str], None],
 ) -> float:
-    """Sets and returns the exposure, ms, at which few pixels of these patterns saturate."""
+    """Set and return the exposure, ms, at which few pixels of these patterns saturate."""
     exposure = 10.0
     headset.camera.exposure_ms = exposure
-    looks: list[NDArray[np.uint16]] = []
+    pictures: list[NDArray[np.uint16]] = []
     for plane, several in shown:
         headset.move_to_plane(plane)
         for pattern in several:
-            say(f"exposure for {channel}")
-            counts = _shot(headset, pattern)
+            report(f"exposure for {channel}")
+            counts = _capture(headset, pattern)
             while _too_bright(counts, camera) and exposure > 2 * EXPOSURES_MS[0]:
                 exposure /= 4
                 headset.camera.exposure_ms = exposure
-                looks = [_dimmed(c, camera) for c in looks]
-                counts = _shot(headset, pattern)
-            looks.append(counts)
-    every = float(np.quantile(np.concatenate([c.reshape(-1) for c in looks]), 1 - SATURATED))
-    single = max(float(np.quantile(c, 1 - SATURATED_IN_ONE)) for c in looks)
+                pictures = [_dimmed(c, camera) for c in pictures]
+                counts = _capture(headset, pattern)
+            pictures.append(counts)
+    every = float(np.quantile(np.concatenate([c.reshape(-1) for c in pictures]), 1 - SATURATED))
+    single = max(float(np.quantile(c, 1 - SATURATED_IN_ONE)) for c in pictures)
     bright = max(every, single) - camera.black_level
     if bright <= 3 * camera.read_noise_e * camera.counts_per_electron + 1:
         raise InputError(
-            f"the camera sees nothing at {exposure:g} ms: see that the laser is on and the light path open, "
+            f"the camera sees nothing at {exposure:g} ms: check that the laser is on and the light path open, "
             "and try again"
         )
     factor = AIM * camera.full_scale / bright
     longest = min(EXPOSURES_MS[1], headset.camera.longest_exposure_ms)
-    wanted = min(max(exposure * factor, EXPOSURES_MS[0]), longest)
-    exposure = float(f"{wanted:.3g}")
+    needed = min(max(exposure * factor, EXPOSURES_MS[0]), longest)
+    exposure = float(f"{needed:.3g}")
     headset.camera.exposure_ms = exposure
     return exposure
 
@@ -225,6 +283,6 @@ def _too_bright(counts: NDArray[np.uint16], camera: Camera) -> bool:
 
 
 def _dimmed(counts: NDArray[np.uint16], camera: Camera) -> NDArray[np.uint16]:
-    """What counts would be at a quarter of the exposure."""
+    """What the counts would be at a quarter of the exposure."""
     below = (counts.astype(np.float32) - camera.black_level) / 4 + camera.black_level
     return np.maximum(np.rint(below), 0).astype(np.uint16)

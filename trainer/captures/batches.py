@@ -1,8 +1,4 @@
-"""Captures as tensors, and which of them a fit may see.
-
-A fit sees some patterns; every number that is reported comes from others. Repeats of one pattern never stand on
-both sides.
-"""
+"""Captures as tensors: one batch for each colour and plane."""
 
 from __future__ import annotations
 
@@ -18,20 +14,32 @@ from firmware_iface.errors import InputError
 from runtime.excess import PredictionErrors, prediction_errors
 from runtime.lightpath.grid import MARGIN
 from trainer.captures.bench_file import Bench
-from trainer.captures.capture_set import Capture, CaptureSet
+from trainer.captures.capture_set import CaptureSet
+from trainer.captures.capture_table import Capture
 from trainer.captures.held_out import scenes
 
-PAST = (
-    MARGIN - 8
-)  # panel pixels beyond the panel's border that are compared: all that splines reach is computed
+# Panel pixels beyond the panel's border that are compared. The splines' reach beyond them is computed too.
+PAST_BORDER = MARGIN - 8
 
 
 @dataclass(frozen=True)
 class Batch:
     """Captures of one colour and one plane.
 
-    gray [B, H, W] integers; signal [B, h, w] counts above black; mask [B, h, w] 1 where the pixel says something
-    (not saturated), else 0; noise [B, h, w] expected variance of the camera's noise, counts^2; exposure [B], ms.
+    Attributes
+    ----------
+    channel : str
+    plane_mm : float, mm
+    ids : tuple of str
+        The captures'.
+    gray : int Tensor [B, H, W]
+        Gray levels sent to the panel.
+    signal : Tensor [B, h, w], counts above black
+    mask : Tensor [B, h, w]
+        1 where the pixel can be used (not saturated, and in view of the panel), else 0.
+    noise : Tensor [B, h, w], counts^2
+        Expected variance of the camera's noise.
+    exposure : Tensor [B], ms
     """
 
     channel: str
@@ -44,12 +52,18 @@ class Batch:
     exposure: Tensor
 
     def errors(self, prediction: Tensor) -> PredictionErrors:
-        """Errors of predicted counts [B, h, w]."""
+        """Errors of predicted counts above black, Tensor [B, h, w]."""
         return prediction_errors(self.ids, self.signal, prediction, self.noise, self.mask)
 
 
 def load(captures: CaptureSet, chosen: Iterable[Capture], dtype: torch.dtype = torch.float32) -> list[Batch]:
-    """The chosen captures as one batch a colour and plane. Raises InputError as the capture set's reader does."""
+    """The chosen captures as one batch for each colour and plane.
+
+    Raises
+    ------
+    InputError
+        As the capture set's reader does.
+    """
     chosen = list(chosen)
     return [
         load_batch(captures, [c for c in chosen if (c.channel, c.plane_mm) == scene], dtype)
@@ -59,22 +73,36 @@ def load(captures: CaptureSet, chosen: Iterable[Capture], dtype: torch.dtype = t
 
 @lru_cache(maxsize=4)
 def in_view(bench: Bench) -> np.ndarray | None:
-    """Which camera pixels look at the panel, or not far past it, bool [h, w]; None where all of them do.
+    """Which camera pixels look at the panel, or at most PAST_BORDER panel pixels beyond it.
 
-    Farther out nothing is predicted: most cameras see more than the panel's picture. Raises InputError where the
-    homography puts no pixel there.
+    Farther out nothing is predicted: most cameras see more than the panel's picture.
+
+    Returns
+    -------
+    bool array [h, w] or None
+        None where all of them do.
+
+    Raises
+    ------
+    InputError
+        Where the homography puts no pixel there.
     """
     if bench.camera.registered:
         return None
     y, x = bench.camera.looks_at()
     height, width = bench.panel.shape
-    seen = (y >= -PAST) & (y <= height - 1 + PAST) & (x >= -PAST) & (x <= width - 1 + PAST)
-    if not seen.any():
+    inside = (
+        (y >= -PAST_BORDER)
+        & (y <= height - 1 + PAST_BORDER)
+        & (x >= -PAST_BORDER)
+        & (x <= width - 1 + PAST_BORDER)
+    )
+    if not inside.any():
         raise InputError(
             "camera.homography puts no pixel of the camera on the panel: give the matrix from camera pixels "
             "(x, y, 1) to panel pixels, not its inverse, or find it with: hololoop-trainer register bench.toml"
         )
-    return seen
+    return inside
 
 
 def load_batch(captures: CaptureSet, chosen: list[Capture], dtype: torch.dtype = torch.float32) -> Batch:

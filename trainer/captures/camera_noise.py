@@ -1,30 +1,35 @@
-"""What repeated pictures of one pattern say of a camera: its noise against its signal, and its black level.
+"""The camera's noise model, and what repeated pictures of one pattern tell about the camera.
 
-Light makes noise whose variance grows in proportion to the counts above black, so the line of variance
-against mean count points to the true black level, whatever light is in the picture (stray light carries
-its noise with it).
+Light makes noise whose variance grows in proportion to the counts above black. So the line of variance against mean
+count points to the true black level. Stray light does not change this, because it brings its own noise.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from trainer.captures.capture_set import Camera
+from trainer.captures.bench_file import Camera
 
 BINS = 32
 SLOPE_DOUBT = 0.008  # relative standard error that a stated full well has at best
 
 
 @dataclass(frozen=True)
-class Repeats:
+class RepeatNoise:
     """Variance against mean of pictures of one pattern, in bins of about equal numbers of pixels.
 
-    mean : float [n], raw counts; variance : float [n], counts^2
-    error : float [n], standard error of variance
-    ratio : measured noise over the camera model's, both averaged over the pixels
+    Attributes
+    ----------
+    mean : float array [n], raw counts
+    variance : float array [n], counts^2
+    error : float array [n], counts^2
+        Standard error of the variance.
+    ratio : float
+        Measured noise over the camera model's, both averaged over the pixels.
     """
 
     mean: np.ndarray
@@ -35,16 +40,50 @@ class Repeats:
 
 @dataclass(frozen=True)
 class BlackEstimate:
-    """The black level that the noise points to, and its standard error, raw counts."""
+    """The black level that the noise points to.
+
+    Attributes
+    ----------
+    level : float, raw counts
+    error : float, raw counts
+        Standard error of the level.
+    """
 
     level: float
     error: float
 
 
-def compare_repeats(first: np.ndarray, second: np.ndarray, camera: Camera) -> Repeats | None:
-    """The noise of two pictures of one pattern, counts [h, w]; None where too few pixels are unsaturated.
+def noise_variance(signal: Any, camera: Camera) -> Any:
+    """Variance that the camera's noise gives a signal: shot noise, read noise and the rounding to whole counts.
 
-    A difference in brightness between the two (the laser's drift) is taken out first.
+    Parameters
+    ----------
+    signal : float or float array, counts above black
+    camera : Camera
+
+    Returns
+    -------
+    float or float array, counts^2
+        Of the signal's shape.
+    """
+    gain = camera.counts_per_electron
+    return np.maximum(signal, 0) * gain + ((camera.read_noise_e * gain) ** 2 + 1 / 12)
+
+
+def compare_repeats(first: np.ndarray, second: np.ndarray, camera: Camera) -> RepeatNoise | None:
+    """The noise of two pictures of one pattern.
+
+    A difference in brightness between the two (the laser's drift) is removed first.
+
+    Parameters
+    ----------
+    first, second : uint16 array [h, w], raw counts
+    camera : Camera
+
+    Returns
+    -------
+    RepeatNoise or None
+        None where too few pixels are unsaturated.
     """
     use = (first < camera.saturation) & (second < camera.saturation)
     if int(use.sum()) < 256:
@@ -60,16 +99,19 @@ def compare_repeats(first: np.ndarray, second: np.ndarray, camera: Camera) -> Re
     full = number >= 32
     center = np.bincount(place, mean, minlength=len(number))[full] / number[full]
     variance = np.bincount(place, halved, minlength=len(number))[full] / number[full]
-    expected = _expected(mean - camera.black_level, camera)
-    return Repeats(
+    expected = noise_variance(mean - camera.black_level, camera)
+    return RepeatNoise(
         center, variance, variance * np.sqrt(2 / number[full]), float(halved.mean() / expected.mean())
     )
 
 
-def black_estimate(repeats: list[Repeats], camera: Camera) -> BlackEstimate | None:
+def black_estimate(repeats: list[RepeatNoise], camera: Camera) -> BlackEstimate | None:
     """The black level at which the line of variance against mean reaches the stated read noise.
 
-    None where the pictures hold too little range of brightness to draw a line, or none rises.
+    Returns
+    -------
+    BlackEstimate or None
+        None where the range of brightness is too small to draw a line, or where no line rises.
     """
     mean = np.concatenate([r.mean for r in repeats]) if repeats else np.zeros(0)
     variance = np.concatenate([r.variance for r in repeats]) if repeats else np.zeros(0)
@@ -78,7 +120,7 @@ def black_estimate(repeats: list[Repeats], camera: Camera) -> BlackEstimate | No
     relative = np.concatenate([r.error for r in repeats]) / variance + 1e-3
     low, step = float(mean.min()), float(np.ptp(mean))
     place = (mean - low) / step
-    floor = float(_expected(np.zeros(1), camera)[0])
+    floor = float(noise_variance(0.0, camera))
     line = _fit(np.stack([np.ones_like(place), place], 1), variance, relative)
     bent = _fit(np.stack([np.ones_like(place), place, place**2], 1), variance, relative)
     if line is None or bent is None:
@@ -119,8 +161,3 @@ def _fit(
         return fit, np.linalg.inv(scaled.T @ scaled)
     except np.linalg.LinAlgError:
         return None
-
-
-def _expected(signal: np.ndarray, camera: Camera) -> np.ndarray:
-    gain = camera.counts_per_electron
-    return np.maximum(signal, 0) * gain + (camera.read_noise_e * gain) ** 2 + 1 / 12

@@ -1,90 +1,41 @@
-"""Capture sets: a folder of patterns and camera pictures, its reader and its writer.
+"""Capture sets: a folder of patterns and camera pictures.
 
-A set holds ``bench.toml`` (what is known before anything is measured), ``captures.csv`` (one row a capture),
+A set holds ``bench.toml`` (what is known before anything is measured), ``captures.csv`` (one row for each capture),
 8-bit panel patterns and 16-bit raw camera pictures. Arrays are [row, column]; counts are raw camera counts.
-Pictures are read when asked for, so that a set may be larger than memory. Whatever is wrong with a set is an
+Pictures are read only when needed, so a set may be larger than memory. Anything wrong with a set is an
 `InputError` of one sentence.
 """
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
-import math
 import os
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
-from difflib import get_close_matches
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from html import escape
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from firmware_iface.errors import InputError
-from trainer.captures.bench_file import Bench, Camera, Channel, Iris, Panel, bench_tables, read_bench
-from trainer.captures.capture_writer import CaptureWriter, write_captures
-from trainer.captures.png_reader import PictureError, read_picture, reason
-
-__all__ = [
-    "Bench",
-    "Camera",
-    "Capture",
-    "CaptureSet",
-    "CaptureWriter",
-    "Channel",
-    "Iris",
-    "Panel",
-    "PictureError",
-    "RowFault",
-    "bench_tables",
-    "read_bench",
-    "read_captures",
-    "read_picture",
-    "scan_rows",
-    "write_captures",
-]
-
-REQUIRED = ("capture", "channel", "phase", "image")
-KNOWN = (*REQUIRED, "plane_mm", "pattern", "exposure_ms", "time_s")
-
-
-@dataclass(frozen=True)
-class Capture:
-    """One row of captures.csv.
-
-    plane_mm : float, mm, panel to image plane as asked for
-    phase, image : absolute paths of the panel's pattern and of the camera's picture
-    exposure_ms : float, ms
-    time_s : float, seconds from the first capture (the row's number where the set does not say)
-    extra : the columns that this reader does not know, as text
-    """
-
-    capture: str
-    channel: str
-    plane_mm: float
-    pattern: str
-    phase: Path
-    image: Path
-    exposure_ms: float = 1.0
-    time_s: float = 0.0
-    extra: dict[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class RowFault:
-    """A thing that is wrong with captures.csv: its kind, the capture's id ("" for the file), one sentence."""
-
-    kind: str
-    capture: str
-    message: str
+from trainer.captures.bench_file import Bench, read_bench
+from trainer.captures.camera_noise import noise_variance
+from trainer.captures.capture_table import Capture, scan_rows
+from trainer.captures.png_reader import read_picture
 
 
 @dataclass(frozen=True)
 class CaptureSet:
-    """A readable capture set; pictures are read from disk at each call and nothing is kept."""
+    """A capture set that can be read; pictures are read from disk at each call and nothing is kept.
+
+    Attributes
+    ----------
+    folder : Path
+    bench : Bench
+    captures : tuple of Capture
+    """
 
     folder: Path
     bench: Bench
@@ -96,31 +47,40 @@ class CaptureSet:
     @property
     def channels(self) -> tuple[str, ...]:
         """Names of the channels that have captures, in the bench's order."""
-        seen = {c.channel for c in self.captures}
-        return tuple(c.name for c in self.bench.channels if c.name in seen)
+        used = {c.channel for c in self.captures}
+        return tuple(c.name for c in self.bench.channels if c.name in used)
 
     @property
     def planes(self) -> tuple[float, ...]:
         """Distances that have captures, mm, ascending."""
         return tuple(sorted({c.plane_mm for c in self.captures}))
 
-    def select(self, captures: Iterable[Capture]) -> CaptureSet:
-        """The same bench with only these captures."""
-        return replace(self, captures=tuple(captures))
-
     def gray(self, capture: Capture) -> np.ndarray:
-        """Gray levels sent to the panel, uint8 [H, W].
+        """Gray levels sent to the panel.
 
-        Raises InputError if the file is missing, damaged, not 8-bit gray, or not of the panel's size.
+        Returns
+        -------
+        uint8 array [H, W]
+
+        Raises
+        ------
+        InputError
+            If the file is missing, damaged, not 8-bit gray, or not of the panel's size.
         """
         what = f"the pattern of capture {capture.capture}"
         return read_picture(capture.phase, self.bench.panel.shape, 8, what)
 
     def counts(self, capture: Capture) -> np.ndarray:
-        """Raw camera counts, uint16 [h, w].
+        """Raw camera counts.
 
-        Raises InputError if the file is missing, damaged, of the wrong kind or size, or holds counts that the
-        bench's bit depth does not reach.
+        Returns
+        -------
+        uint16 array [h, w]
+
+        Raises
+        ------
+        InputError
+            If the file is missing, damaged, of the wrong kind or size, or holds counts above the bench's bit depth.
         """
         camera = self.bench.camera
         what = f"the image of capture {capture.capture}"
@@ -135,9 +95,18 @@ class CaptureSet:
         return counts
 
     def signal(self, capture: Capture) -> tuple[np.ndarray, np.ndarray]:
-        """Counts above black, float32 [h, w], and where they mean something (not saturated), bool [h, w].
+        """Counts above black, and where they can be used.
 
-        Raises InputError as `counts` does.
+        Returns
+        -------
+        float32 array [h, w], counts above black
+        bool array [h, w]
+            True where the pixel is not saturated.
+
+        Raises
+        ------
+        InputError
+            As `counts` does.
         """
         counts = self.counts(capture)
         return counts.astype(np.float32) - np.float32(
@@ -145,13 +114,8 @@ class CaptureSet:
         ), counts < self.bench.camera.saturation
 
     def noise_variance(self, signal: Any) -> Any:
-        """Variance that the camera's noise gives a signal of counts above black, counts^2, same shape.
-
-        Shot noise, read noise and the rounding to whole counts.
-        """
-        gain = self.bench.camera.counts_per_electron
-        floor = (self.bench.camera.read_noise_e * gain) ** 2 + 1 / 12
-        return np.maximum(signal, 0) * gain + floor
+        """Variance of the camera's noise, counts^2, of a signal of counts above black; in the signal's shape."""
+        return noise_variance(signal, self.bench.camera)
 
     def _repr_html_(self) -> str:
         """What a notebook shows."""
@@ -169,7 +133,10 @@ class CaptureSet:
     def content_hash(self) -> str:
         """SHA-256, hex, over bench.toml, captures.csv, and the ids and files of this selection.
 
-        Raises InputError when a file cannot be read.
+        Raises
+        ------
+        InputError
+            When a file cannot be read.
         """
         digest = hashlib.sha256()
         files = [self.folder / "bench.toml", self.folder / "captures.csv"]
@@ -188,9 +155,20 @@ class CaptureSet:
 
 
 def read_captures(folder: Path | str) -> CaptureSet:
-    """The capture set in a folder; its pictures are looked for but not opened.
+    """The capture set in a folder; its pictures must exist but are not opened.
 
-    Raises InputError at the first thing that is wrong with bench.toml or captures.csv, or a missing file.
+    Parameters
+    ----------
+    folder : path
+
+    Returns
+    -------
+    CaptureSet
+
+    Raises
+    ------
+    InputError
+        At the first thing that is wrong with bench.toml or captures.csv, or for a missing file.
     """
     folder = Path(folder).absolute()
     if not folder.is_dir():
@@ -202,160 +180,8 @@ def read_captures(folder: Path | str) -> CaptureSet:
     return CaptureSet(folder, bench, tuple(captures))
 
 
-def scan_rows(folder: Path, bench: Bench) -> tuple[list[Capture], list[RowFault]]:
-    """All usable rows of a folder's captures.csv, and everything that is wrong with the file; never raises.
-
-    A row with a fault that leaves no doubt about what was captured (a duplicate id) is in both lists.
-    """
-    path = folder / "captures.csv"
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-        table = list(csv.reader(io.StringIO(text, newline=""), strict=True))
-    except OSError as error:
-        return [], [
-            RowFault(
-                "unreadable",
-                "",
-                f"{path} cannot be read ({error.strerror}): "
-                "a capture set needs a captures.csv with one row a capture",
-            )
-        ]
-    except (UnicodeDecodeError, csv.Error) as error:
-        return [], [
-            RowFault(
-                "unreadable",
-                "",
-                f"{path} is not a comma-separated UTF-8 table ({reason(error)}): save it again as CSV, UTF-8",
-            )
-        ]
-    numbered = [(n, row) for n, row in enumerate(table, 1) if any(cell.strip() for cell in row)]
-    header = [cell.strip() for cell in numbered[0][1]] if numbered else []
-    fault = _header_fault(path, header, len(numbered))
-    if fault:
-        return [], [fault]
-    captures: list[Capture] = []
-    faults: list[RowFault] = []
-    seen: set[str] = set()
-    for number, row in numbered[1:]:
-        cells = dict(zip(header, (cell.strip() for cell in row), strict=False))
-        name = cells.get("capture", "")
-        where = f"captures.csv row {number} (capture {name})" if name else f"captures.csv row {number}"
-        if len(row) != len(header):
-            faults.append(
-                RowFault(
-                    "unreadable",
-                    name,
-                    f"{where} has {len(row)} cells, but the header has "
-                    f"{len(header)}: put the row right, with quotes around text with commas",
-                )
-            )
-            continue
-        capture, wrong = _row(folder, bench, cells, where, len(captures))
-        if name in seen:
-            wrong.insert(
-                0,
-                RowFault(
-                    "duplicate",
-                    name,
-                    f"{where} repeats the id of an earlier row: give every capture its own id",
-                ),
-            )
-        seen.add(name)
-        faults += wrong
-        if capture:
-            captures.append(capture)
-    return captures, faults
-
-
-def _header_fault(path: Path, header: list[str], rows: int) -> RowFault | None:
-    if not header:
-        return RowFault("unreadable", "", f"{path} is empty: give it the columns {', '.join(REQUIRED)}")
-    for column in REQUIRED:
-        if column not in header:
-            near = get_close_matches(column, header, 1)
-            hint = f"rename the column {near[0]!r}" if near else "add it"
-            if len(header) == 1 and (";" in header[0] or "\t" in header[0]):
-                hint = "separate the columns with commas"
-            return RowFault("unreadable", "", f"{path} has no column {column!r}: {hint}")
-    twice = [column for column in dict.fromkeys(header) if header.count(column) > 1]
-    if twice:
-        return RowFault("unreadable", "", f"{path} has two columns {twice[0]!r}: keep one")
-    if rows < 2:
-        return RowFault("too_few", "", f"{path} has no captures: add one row a capture")
-    return None
-
-
-def _row(
-    folder: Path, bench: Bench, cells: dict[str, str], where: str, index: int
-) -> tuple[Capture | None, list[RowFault]]:
-    """The capture that a row of cells describes (None where it cannot be known), and the row's faults."""
-    faults: list[RowFault] = []
-    name = cells["capture"]
-
-    def fault(kind: str, message: str) -> None:
-        faults.append(RowFault(kind, name, f"{where}: {message}"))
-
-    def number(column: str, default: float, low: float, high: float, allowed: str) -> float:
-        text = cells.get(column, "")
-        if not text:
-            return default
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not low <= value <= high:
-            fault("not_a_number", f"{column} is {text[:40]!r}; write {allowed}")
-            return default
-        return value
-
-    for column in REQUIRED:
-        if not cells[column]:
-            fault("unreadable", f"{column} is empty; fill it in")
-    names = [c.name for c in bench.channels]
-    if cells["channel"] and cells["channel"] not in names:
-        near = get_close_matches(cells["channel"], names, 1)
-        fault(
-            "unknown_channel",
-            f"channel {cells['channel'][:40]!r} is not in bench.toml; "
-            + (
-                f"did you mean {near[0]!r}?"
-                if near
-                else f"use one of {', '.join(names)}, or add a [[channel]]"
-            ),
-        )
-    plane = number("plane_mm", bench.distance_mm, -1e4, 1e4, "a distance in mm, from -10000 to 10000")
-    exposure = number("exposure_ms", 1.0, 1e-6, 1e7, "an exposure in ms, above 0")
-    time = number("time_s", float(index), -1e9, 1e9, "a time in seconds")
-    files: list[Path] = []
-    for column in ("phase", "image"):
-        relative = PurePosixPath(cells[column].replace("\\", "/"))
-        if relative.is_absolute() or ".." in relative.parts or ":" in str(relative) or "\0" in str(relative):
-            fault(
-                "missing_file",
-                f"{column} {str(relative)[:80]!r} is not inside the set; "
-                "copy the file into the folder and give its path from there",
-            )
-            continue
-        files.append(folder / relative)
-        try:
-            there = files[-1].is_file()
-        except OSError:
-            there = False
-        if cells[column] and not there:
-            fault(
-                "missing_file",
-                f"{column} {str(relative)[:80]!r} is not there; put the file back or take the row out",
-            )
-    if faults:
-        return None, faults
-    extra = {column: text for column, text in cells.items() if column not in KNOWN}
-    return Capture(
-        name, cells["channel"], plane, cells.get("pattern") or name, files[0], files[1], exposure, time, extra
-    ), faults
-
-
 def opened(folder: Path) -> CaptureSet:
-    """The capture set of a folder, read once a process, and again when its tables have changed."""
+    """The capture set of a folder, read once in a process, and again when its tables have changed."""
     return _opened(folder, *((folder / name).stat().st_mtime_ns for name in ("bench.toml", "captures.csv")))
 
 

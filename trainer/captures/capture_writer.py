@@ -7,7 +7,7 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -27,14 +27,24 @@ class CaptureWriter:
         with CaptureWriter(folder, bench) as writer:
             writer.add(gray=gray, counts=counts, channel="green", pattern="p0", temperature_c=21.5)
 
-    The set is built in a temporary folder beside its destination and renamed when the block ends; an
+    The set is built in a temporary folder next to its destination and renamed when the block ends. An
     exception leaves nothing behind. At least one capture is needed.
     """
 
     def __init__(self, folder: Path | str, bench: Bench | Mapping[str, Any]) -> None:
-        """folder : where the set shall be; bench : a Bench, or the tables of bench.toml.
+        """Make the temporary folder.
 
-        Raises InputError if the folder holds something already or cannot be made, or the bench is not valid.
+        Parameters
+        ----------
+        folder : path
+            Where the set is written.
+        bench : Bench or mapping
+            A bench, or the tables of bench.toml.
+
+        Raises
+        ------
+        InputError
+            If the folder is not empty or cannot be made, or the bench is not valid.
         """
         self.folder = Path(folder).absolute()
         self.tables = dict(bench_tables(bench) if isinstance(bench, Bench) else bench)
@@ -47,7 +57,7 @@ class CaptureWriter:
             self._work = Path(tempfile.mkdtemp(prefix=f".{self.folder.name}.", dir=self.folder.parent))
             (self._work / "phase").mkdir()
             (self._work / "image").mkdir()
-            (self._work / "bench.toml").write_text(toml_text(self.tables), encoding="utf-8")
+            (self._work / "bench.toml").write_text(_toml_text(self.tables), encoding="utf-8")
         except OSError as error:
             raise InputError(
                 f"{self.folder} cannot be made ({error.strerror}): choose another folder"
@@ -65,14 +75,35 @@ class CaptureWriter:
         time_s: float | None = None,
         **extra: Any,
     ) -> str:
-        """Writes one capture and returns its id.
+        """Write one capture.
 
-        gray : uint8 [H, W], gray levels sent; counts : uint16 [h, w], raw camera counts
-        capture : id, by default its number; plane_mm : mm, by default the bench's distance
-        pattern : by default its own; exposure_ms : ms; time_s : seconds from the first capture
-        extra : further columns, written as text
-        Raises InputError if an array has the wrong shape, type or range, the id is taken or the channel
-        unknown.
+        Parameters
+        ----------
+        gray : uint8 array [H, W]
+            Gray levels sent to the panel.
+        counts : uint16 array [h, w], raw camera counts
+        channel : str
+        capture : str, optional
+            Its id; by default its number.
+        plane_mm : float, mm, optional
+            By default the bench's distance.
+        pattern : str, optional
+            By default the capture's id: a pattern of its own.
+        exposure_ms : float, ms
+        time_s : float, s, optional
+            From the first capture; by default the capture's number.
+        **extra
+            Further columns, written as text.
+
+        Returns
+        -------
+        str
+            The capture's id.
+
+        Raises
+        ------
+        InputError
+            If an array has the wrong shape, type or range, the id is used already, or the channel is unknown.
         """
         index = len(self._rows)
         name = f"{index:04d}" if capture is None else str(capture)
@@ -115,15 +146,6 @@ class CaptureWriter:
         self._rows.append(row)
         return name
 
-    def attach(self, name: str, text: str) -> None:
-        """Adds a text file, such as truth.json, to the set. Raises InputError if the set has it already."""
-        path = self._work / name
-        if Path(name).name != name or path.exists() or name in ("captures.csv", ""):
-            raise InputError(
-                f"{name!r} cannot be attached: choose a plain file name that the set does not use"
-            )
-        path.write_text(text, encoding="utf-8")
-
     def __enter__(self) -> Self:
         return self
 
@@ -162,21 +184,8 @@ class CaptureWriter:
             )
 
 
-def write_captures(
-    folder: Path | str, bench: Bench | Mapping[str, Any], rows: Iterable[Mapping[str, Any]]
-) -> Path:
-    """Writes a capture set from an iterator of rows, each with the arguments of `CaptureWriter.add`.
-
-    Returns the folder. Raises InputError as the writer does; then no folder is left behind.
-    """
-    with CaptureWriter(folder, bench) as writer:
-        for row in rows:
-            writer.add(**row)
-    return writer.folder
-
-
-def toml_text(tables: Mapping[str, Any]) -> str:
-    """TOML for the tables of a bench: plain values first, then one table each, lists of tables as [[...]]."""
+def _toml_text(tables: Mapping[str, Any]) -> str:
+    """TOML for the tables of a bench: plain values, then one table for each mapping, lists of tables as [[...]]."""
     lines = [
         f"{key} = {_literal(value)}"
         for key, value in tables.items()

@@ -1,15 +1,14 @@
-"""Which way round the camera sees, and which way the panel counts: the mismatch that is no physics.
+"""How the camera's image is turned, and which sign the panel's phase has: a mismatch of conventions, not of physics.
 
-Sixteen combinations are compared: eight ways to turn and mirror the camera's image, times two signs of the
-panel's phase. (Mirroring the panel's pattern is the same as mirroring the image. Turning the sign of the
-phase conjugates the field, and so does counting the distance the other way: one picture cannot tell them
-apart, and one change puts both right.)
+Sixteen combinations are compared: eight ways to turn and mirror the camera's image, times two signs of the panel's
+phase. (To mirror the panel's pattern is the same as to mirror the image. Another sign of the phase conjugates the
+field, and so does counting the distance the other way: one picture cannot tell them apart, and one change corrects
+both.)
 
-A combination's score is the correlation of the ideal prediction with the measured images, after the slow
-variation of beam and field is taken out, at the best shift within a few pixels. Another combination than the
-stated one is *decisively* better when, over the images' tiles, the paired difference of Fisher's z has a
-t-statistic above `T_LEVEL`, its correlation is at least `R_RATIO` times the stated one's, and is at least
-`R_LEAST`.
+A combination's score is the correlation of the ideal prediction with the measured images, at the best shift within a
+few pixels, after the slow variation of beam and field is removed. A combination is *decisively* better than the
+stated one when three things hold: over the images' tiles, the paired difference of Fisher's z has a t-statistic above
+`T_LEVEL`; its correlation is at least `R_RATIO` times the stated one's; and it is at least `R_LEAST`.
 """
 
 from __future__ import annotations
@@ -23,7 +22,8 @@ from scipy import fft as spfft
 from scipy.ndimage import gaussian_filter
 
 from firmware_iface.errors import InputError
-from trainer.captures.capture_set import Bench, CaptureSet
+from trainer.captures.bench_file import Bench
+from trainer.captures.image_turns import TURN_WORDS, TURNS, turned
 
 T_LEVEL = 6.0
 R_RATIO = 2.0
@@ -33,31 +33,23 @@ CORE = 512  # pixels, the part of a large registered image that is compared
 
 Predict = Callable[[Bench, np.ndarray, str, float], np.ndarray]
 
-_TURNS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "as_stated": lambda a: a,
-    "mirror_left_right": lambda a: a[:, ::-1],
-    "mirror_top_bottom": lambda a: a[::-1],
-    "turn_180": lambda a: a[::-1, ::-1],
-    "transpose": lambda a: a.T,
-    "turn_90_left": np.rot90,
-    "turn_90_right": lambda a: np.rot90(a, -1),
-    "transpose_other_diagonal": lambda a: a[::-1, ::-1].T,
-}
-TURNS = tuple(_TURNS)
-_WORDS = {
-    "mirror_left_right": "mirror the images left-right",
-    "mirror_top_bottom": "mirror the images top-bottom",
-    "turn_180": "turn the images by 180 degrees",
-    "transpose": "exchange the images' rows and columns",
-    "turn_90_left": "turn the images by 90 degrees to the left",
-    "turn_90_right": "turn the images by 90 degrees to the right",
-    "transpose_other_diagonal": "exchange the images' rows and columns and turn them by 180 degrees",
-}
-
 
 @dataclass(frozen=True)
 class Sample:
-    """One capture in memory: gray uint8 [H, W]; signal float [h, w], above black; valid bool [h, w]."""
+    """One capture in memory.
+
+    Attributes
+    ----------
+    capture : str
+        Its id.
+    gray : uint8 array [H, W]
+        Gray levels sent to the panel.
+    signal : float array [h, w], counts above black
+    valid : bool array [h, w]
+        Where the signal can be used.
+    channel : str
+    plane_mm : float, mm
+    """
 
     capture: str
     gray: np.ndarray
@@ -69,11 +61,20 @@ class Sample:
 
 @dataclass(frozen=True)
 class Score:
-    """One combination: what is done to the images, the panel's phase sign, and how well they fit.
+    """One combination, and how well the images fit it.
 
-    correlation : of prediction and images, -1 to 1, over all tiles
-    shift : (row, column) of the image against the prediction, pixels, one for each sample
-    t : t-statistic of its advantage over the stated combination
+    Attributes
+    ----------
+    turn : str
+        What is done to the images, one of TURNS.
+    phase_sign : int
+        The panel's.
+    correlation : float
+        Of prediction and images, -1 to 1, over all tiles.
+    shift : tuple of (int, int), pixels
+        (row, column) of the image against the prediction, one for each sample.
+    t : float
+        t-statistic of its advantage over the stated combination.
     """
 
     turn: str
@@ -85,10 +86,20 @@ class Score:
 
 @dataclass(frozen=True)
 class Convention:
-    """The outcome. change : what to do, one sentence; "" when the stated convention stands.
+    """The result of a comparison of conventions.
 
-    scores : all combinations, best first; stated is the bench's own; decisive : another is surely right
-    alike : combinations that the data cannot tell from the best
+    Attributes
+    ----------
+    best, stated : Score
+        The best combination, and the bench's own.
+    decisive : bool
+        Another combination than the stated one is surely right.
+    change : str
+        What to do, one sentence; "" when the stated convention holds.
+    scores : tuple of Score
+        All combinations, best first.
+    alike : tuple of Score
+        Combinations that the data cannot tell from the best.
     """
 
     best: Score
@@ -99,44 +110,29 @@ class Convention:
     alike: tuple[Score, ...] = ()
 
 
-def turned(image: np.ndarray, turn: str) -> np.ndarray:
-    """The image [h, w] after the named change (one of TURNS). Raises InputError for an unknown name."""
-    if turn not in _TURNS:
-        raise InputError(f"{turn!r} is no way to turn an image: use one of {', '.join(TURNS)}")
-    return _TURNS[turn](image)
-
-
-def find_convention(captures: CaptureSet, count: int = 3, predict: Predict | None = None) -> Convention:
-    """Compares the sixteen combinations on a few captures with different patterns.
-
-    Raises InputError if the set is empty or a picture cannot be used.
-    """
-    first = {c.pattern: c for c in reversed(captures.captures)}
-    distinct = [c for c in captures.captures if first[c.pattern] is c]
-    if not distinct:
-        raise InputError(f"{captures.folder} has no captures to compare: add at least one")
-    picks = sorted({round(i) for i in np.linspace(0, len(distinct) - 1, min(count, len(distinct)))})
-    samples = []
-    for capture in (distinct[i] for i in picks):
-        signal, valid = captures.signal(capture)
-        gray = captures.gray(capture)
-        samples.append(Sample(capture.capture, gray, signal, valid, capture.channel, capture.plane_mm))
-    return compare_conventions(captures.bench, samples, predict)
-
-
 def compare_conventions(
-    bench: Bench, samples: Sequence[Sample], predict: Predict | None = None, quick: bool = False
+    bench: Bench, samples: Sequence[Sample], predict: Predict, quick: bool = False
 ) -> Convention:
-    """Scores every combination that the image's shape allows; see the module's text for the test.
+    """Score every combination that the image's shape allows; the module's text describes the test.
 
-    predict : (bench, gray, channel, plane_mm) -> irradiance [h, w], any scale; the ideal model by default
-    quick : stop when a sample fits so well as stated that no other combination can be decisively better
-    Raises InputError if there is no sample.
+    Parameters
+    ----------
+    bench : Bench
+    samples : sequence of Sample
+    predict : callable
+        The ideal model: (bench, gray, channel, plane_mm) -> irradiance [h, w] on any scale.
+    quick : bool
+        Stop when a sample fits so well as stated that no other combination can be decisively better.
+
+    Returns
+    -------
+    Convention
+
+    Raises
+    ------
+    InputError
+        If there is no sample.
     """
-    if predict is None:
-        from trainer.model.model_stages import ideal_irradiance
-
-        predict = ideal_irradiance
     if not samples:
         raise InputError("there are no captures to compare conventions on: give at least one")
     stated_sign = bench.panel.phase_sign
@@ -149,10 +145,10 @@ def compare_conventions(
             made = np.asarray(predict(model, gray, sample.channel, sample.plane_mm), dtype=np.float32)[core]
             flat = _flattened(made, np.ones(made.shape, bool))
             for turn in TURNS:
-                seen, good = turned(image, turn), turned(valid, turn)
-                if seen.shape != made.shape:
+                observed, good = turned(image, turn), turned(valid, turn)
+                if observed.shape != made.shape:
                     continue
-                values, shift = _tile_correlations(_flattened(seen, good), good, flat)
+                values, shift = _tile_correlations(_flattened(observed, good), good, flat)
                 tiles.setdefault((turn, sign), []).append(values)
                 shifts.setdefault((turn, sign), []).append(shift)
             if quick and R_RATIO * float(np.mean(tiles["as_stated", stated_sign][0])) > 1:
@@ -208,10 +204,12 @@ def _steps(score: Score, stated: Score) -> str:
         steps.append(
             f"in bench.toml [panel] set phase_sign = {score.phase_sign} (more gray means "
             f"{'less' if score.phase_sign < 0 else 'more'} phase; a distance counted the other way "
-            "looks the same, and this puts it right too)"
+            "looks the same, and this corrects it too)"
         )
-    if score.turn in _WORDS:
-        steps.append(_WORDS[score.turn] + " (or the panel's patterns)" * (score.turn.startswith("mirror")))
+    if score.turn in TURN_WORDS:
+        steps.append(
+            TURN_WORDS[score.turn] + " (or the panel's patterns)" * (score.turn.startswith("mirror"))
+        )
     return " and ".join(steps) or "leave everything as stated"
 
 
@@ -220,8 +218,14 @@ def _central(
 ) -> tuple[Bench, np.ndarray, np.ndarray, np.ndarray, tuple[slice, slice]]:
     """A large registered capture, cut to its centre and what diffracts into it.
 
-    Returns the smaller bench and gray pattern, the image and its mask, and where the image is in the
-    prediction.
+    Returns
+    -------
+    Bench, uint8 array
+        The smaller bench and gray pattern.
+    float array, bool array
+        The image and its mask.
+    tuple of slice
+        Where the image is in the prediction.
     """
     whole = (slice(None), slice(None))
     if not bench.camera.registered:
@@ -263,7 +267,7 @@ def _flattened(image: np.ndarray, valid: np.ndarray) -> np.ndarray:
 def _tile_correlations(
     image: np.ndarray, valid: np.ndarray, model: np.ndarray
 ) -> tuple[np.ndarray, tuple[int, int]]:
-    """Correlation of each tile, at the shift (row, column) within WINDOW that suits the whole best."""
+    """Correlation of each tile, at the shift (row, column) within WINDOW that fits the whole best."""
     rows, columns = image.shape
     window = max(1, min(WINDOW, min(rows, columns) // 8))
     cross = spfft.irfft2(spfft.rfft2(image) * np.conj(spfft.rfft2(model)), s=image.shape)

@@ -1,7 +1,7 @@
 """Which captures a fit may see, and which are held out to judge it.
 
-A fit sees some patterns; every number that is reported comes from others. Repeats of one pattern never stand on both
-sides.
+A fit sees some patterns; every number that is reported comes from others. All repeats of a pattern are on the same
+side.
 """
 
 from __future__ import annotations
@@ -10,14 +10,23 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from trainer.captures.capture_set import Capture, CaptureSet
+from trainer.captures.capture_set import CaptureSet
+from trainer.captures.capture_table import Capture
 
 FIT_PIXELS = 4 * 240 * 320  # about four small pictures hold a few dozen parameters to far below the noise
+FIT_CAPTURES = 4
+PROBE_CAPTURES = 9
+HELD_PIXELS = 24 * 480 * 640  # held-out pixels that a candidate is judged on
 
 
 @dataclass(frozen=True)
 class CaptureSplit:
-    """Captures for fitting and captures held out, as a partition of the set."""
+    """Captures for fitting and captures held out, as a partition of the set.
+
+    Attributes
+    ----------
+    fitted, held_out : tuple of Capture
+    """
 
     fitted: tuple[Capture, ...]
     held_out: tuple[Capture, ...]
@@ -26,9 +35,9 @@ class CaptureSplit:
 def split(captures: CaptureSet) -> CaptureSplit:
     """Every third pattern of each colour and plane is held out, from the second on (at least one).
 
-    The choice depends on the order of the captures alone, so every command holds out the same ones. A colour and
-    plane with a single pattern is held out only if all of them are like that, with its fit on the same capture's
-    repeats; otherwise it is fitted.
+    The choice depends only on the order of the captures, so every command holds out the same ones. A colour and plane
+    with a single pattern is fitted. Only where every colour and plane has a single pattern, the last capture is both
+    fitted and held out.
     """
     fitted: list[Capture] = []
     held: list[Capture] = []
@@ -49,18 +58,31 @@ def scenes(captures: Iterable[Capture]) -> list[tuple[str, float]]:
 
 
 def sample(captures: Iterable[Capture], pixels: int, most: int) -> list[Capture]:
-    """Different patterns for a fit, spread over colours and planes: at most `most`, at least one a scene."""
+    """Different patterns for a fit, spread over colours and planes.
+
+    Parameters
+    ----------
+    captures : iterable of Capture
+    pixels : int
+        Of one capture; FIT_PIXELS in all are enough for each colour and plane.
+    most : int
+        Captures at most, but at least one for each colour and plane.
+
+    Returns
+    -------
+    list of Capture
+    """
     by_scene: dict[tuple[str, float], dict[str, Capture]] = {}
     for c in captures:
         by_scene.setdefault((c.channel, c.plane_mm), {}).setdefault(c.pattern, c)
     columns = [list(patterns.values()) for patterns in by_scene.values()]
     # Patterns of one kind often follow each other: spread the choice over the whole list.
     columns = [[column[i] for i in _spread(len(column))] for column in columns]
-    wanted = max(len(columns), min(most, FIT_PIXELS * max(1, len(columns)) // max(1, pixels)))
+    needed = max(len(columns), min(most, FIT_PIXELS * max(1, len(columns)) // max(1, pixels)))
     chosen: list[Capture] = []
     depth = 0
-    while len(chosen) < wanted and any(depth < len(column) for column in columns):
-        chosen += [column[depth] for column in columns if depth < len(column)][: wanted - len(chosen)]
+    while len(chosen) < needed and any(depth < len(column) for column in columns):
+        chosen += [column[depth] for column in columns if depth < len(column)][: needed - len(chosen)]
         depth += 1
     return chosen
 
@@ -72,18 +94,22 @@ def _spread(count: int) -> list[int]:
     return [k for k in order if k < count]
 
 
-FIT_CAPTURES = 4
-
-
-PROBE_CAPTURES = 9
-
-
-HELD_PIXELS = 24 * 480 * 640  # held-out pixels a candidate is judged on
-
-
 @dataclass(frozen=True)
 class CaptureRoles:
-    """Which captures a diagnosis uses for what."""
+    """Which captures a diagnosis uses for what.
+
+    Attributes
+    ----------
+    captures : CaptureSet
+    fitted : tuple of Capture
+        For fits.
+    screened : tuple of Capture
+        For the screen.
+    probed : tuple of Capture
+        For the probes.
+    held_out : tuple of Capture
+        For the judgement.
+    """
 
     captures: CaptureSet
     fitted: tuple[Capture, ...]

@@ -16,8 +16,18 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class OpenedBench:
-    """A headset, what is known of its bench, and the planes worth capturing (mm)."""
+class OpenBench:
+    """A bench that is open.
+
+    Attributes
+    ----------
+    headset : object
+        Its panel, lasers and camera, as `trainer.captures.acquire.Headset` describes.
+    bench : Bench
+        What is known of it.
+    planes_mm : tuple of float, mm
+        The planes worth capturing.
+    """
 
     headset: Any
     bench: Bench
@@ -26,9 +36,19 @@ class OpenedBench:
 
 @dataclass
 class RealHeadset:
-    """Real devices as `capture_set` wants them: lasers within their set powers, a clock, and a focus.
+    """Real devices as `acquire_captures` needs them: lasers within their set powers, a clock, and a focus.
 
-    power : fraction of full of each colour while it is lit. focus_mm : the plane that the camera is focused on
+    Attributes
+    ----------
+    panel, lasers, camera : devices
+    power : mapping of str to float
+        Fraction of full power of each colour while it is lit.
+    focus_mm : float, mm
+        The plane that the camera is focused on.
+    focus : callable, optional
+        Moves the focus to a plane, mm.
+    started : float, s
+        Of the monotonic clock.
     """
 
     panel: Any
@@ -40,7 +60,7 @@ class RealHeadset:
     started: float = field(default_factory=time.monotonic)
 
     def __post_init__(self) -> None:
-        self.lasers = _Dimmed(self.lasers, self.power)
+        self.lasers = _LimitedLasers(self.lasers, self.power)
 
     @property
     def time_s(self) -> float:
@@ -48,7 +68,13 @@ class RealHeadset:
         return time.monotonic() - self.started
 
     def move_to_plane(self, plane_mm: float) -> None:
-        """Focus the camera on a plane. Raises InputError where the focus stays where it is and that is elsewhere."""
+        """Focus the camera on a plane.
+
+        Raises
+        ------
+        InputError
+            Where the focus cannot be moved and the plane is another one.
+        """
         if self.focus is not None:
             self.focus(plane_mm)
         elif abs(plane_mm - self.focus_mm) > 1e-6:
@@ -59,7 +85,7 @@ class RealHeadset:
 
 
 @dataclass
-class _Dimmed:
+class _LimitedLasers:
     """Lasers whose full power is what the configuration allows."""
 
     lasers: Any
@@ -73,18 +99,35 @@ class _Dimmed:
 
 
 @contextmanager
-def open_bench(spec: str, seed: int = 0, known: Bench | None = None) -> Iterator[OpenedBench]:
-    """The bench of `virtual:NAME`, of a virtual bench's TOML file, or of a real headset's configuration; then dark.
+def open_bench(spec: str, seed: int = 0, known: Bench | None = None) -> Iterator[OpenBench]:
+    """Open a bench; its lasers are off when the block ends.
 
-    known : what is known of a real headset's bench, which its configuration does not say
-    Raises InputError, and DeviceError where a device fails.
+    Parameters
+    ----------
+    spec : str
+        `virtual:NAME`, a virtual bench's TOML file, or a real headset's configuration.
+    seed : int
+        Of a virtual bench's noise.
+    known : Bench, optional
+        What is known of a real headset's bench; its configuration does not hold it.
+
+    Yields
+    ------
+    OpenBench
+
+    Raises
+    ------
+    InputError
+        For an unknown bench, or devices that are not those of `known`.
+    DeviceError
+        Where a device fails.
     """
     from firmware_iface.virtual import open_headset
     from runtime.headset.open_devices import configuration_of, open_devices
 
     if configuration_of(spec) is None:
         virtual = open_headset(spec, seed)
-        yield OpenedBench(virtual, nominal_bench(virtual), virtual.description.planes_mm)
+        yield OpenBench(virtual, nominal_bench(virtual), virtual.description.planes_mm)
         return
     if known is None:
         raise InputError(
@@ -95,18 +138,18 @@ def open_bench(spec: str, seed: int = 0, known: Bench | None = None) -> Iterator
         headset = RealHeadset(
             devices.panel, devices.lasers, devices.camera, devices.power, known.distance_mm, devices.focus
         )
-        yield OpenedBench(headset, known, (known.distance_mm,))
+        yield OpenBench(headset, known, (known.distance_mm,))
 
 
 def _check(devices: Devices, bench: Bench) -> None:
-    """Raises InputError where the devices are not those of the bench."""
-    for what, has, said in (
+    """Raise InputError where the devices are not those of the bench."""
+    for what, actual, stated in (
         ("panel is (rows, columns)", devices.panel.shape, bench.panel.shape),
         ("camera's picture is (rows, columns)", devices.camera.shape, bench.camera.shape),
         ("camera's bit depth is", devices.camera.bit_depth, bench.camera.bit_depth),
     ):
-        if has != said:
-            raise InputError(f"the {what} {has} and the bench file says {said}: correct it there")
+        if actual != stated:
+            raise InputError(f"the {what} {actual} and the bench file says {stated}: correct it there")
     for channel in bench.channels:
         if channel.name not in devices.lasers.channels:
             names = ", ".join(devices.lasers.channels)
@@ -116,7 +159,7 @@ def _check(devices: Devices, bench: Bench) -> None:
 
 
 def nominal_bench(headset: Any) -> Bench:
-    """What a person would write down of a virtual headset's bench."""
+    """The bench file that a person would write for a virtual headset: nothing of what is hidden in it."""
     tables = headset.description.nominal()
     levels = tables["panel"]["levels"]
     if float(levels).is_integer():

@@ -36,28 +36,41 @@ PICTURES = ("camera", "coins", "text", "chelsea", "page", "moon", "coffee", "ast
 
 @dataclass(frozen=True)
 class Pattern:
-    """Gray levels to show, and what kind of pattern they are."""
+    """Gray levels to show.
+
+    Attributes
+    ----------
+    kind : str
+        The family of the pattern, such as "grains".
+    gray : uint8 array [H, W]
+    """
 
     kind: str
     gray: Gray
 
 
 @dataclass(frozen=True)
-class _Setting:
-    """What a pattern is made for."""
+class _PatternRequest:
+    """What a pattern is made for.
+
+    Attributes
+    ----------
+    turn : int
+        How many patterns of this kind came before.
+    """
 
     bench: Bench
     channel: str
     plane_mm: float
     rng: np.random.Generator
-    turn: int  # how many patterns of this kind came before
+    turn: int
 
     @property
     def shape(self) -> tuple[int, int]:
         return self.bench.panel.shape
 
     def gray(self, phase: Array) -> Gray:
-        """Gray levels of a phase, rad, a wave to a wave."""
+        """Gray levels of a phase, rad, modulo one wave."""
         panel = self.bench.panel
         wave = np.mod(panel.phase_sign * phase / (2 * math.pi), 1) * panel.levels
         level = np.rint(wave).astype(np.int64) % panel.levels
@@ -65,15 +78,32 @@ class _Setting:
 
 
 def default_count(channels: int) -> int:
-    """How many patterns a colour and plane should have."""
+    """How many patterns each colour and plane should have."""
     return ONE_COLOUR if channels == 1 else EACH_OF_SEVERAL
 
 
 def choose_patterns(bench: Bench, channel: str, plane_mm: float, count: int, seed: int = 0) -> list[Pattern]:
-    """`count` patterns for one colour and plane; the same seed gives the same ones.
+    """Patterns for one colour and plane; the same seed gives the same ones.
 
-    The order is part of the choice: every third, from the second on, is held out by the commands that fit, so
-    each family has members on both sides.
+    The order is part of the choice: the commands that fit hold out every third pattern, from the second on, so each
+    family has members on both sides.
+
+    Parameters
+    ----------
+    bench : Bench
+    channel : str
+    plane_mm : float, mm
+    count : int
+    seed : int
+
+    Returns
+    -------
+    list of Pattern
+
+    Raises
+    ------
+    InputError
+        Where the count is below one, or the plane is out of reach.
     """
     if count < 1:
         raise InputError(f"--patterns {count}: show at least one pattern, and better 7 or more")
@@ -82,49 +112,64 @@ def choose_patterns(bench: Bench, channel: str, plane_mm: float, count: int, see
     patterns, turns = [], dict.fromkeys(_ORDER, 0)
     for number in range(count):
         kind = _ORDER[number % len(_ORDER)]
-        setting = _Setting(bench, channel, plane_mm, rng, turns[kind])
+        request = _PatternRequest(bench, channel, plane_mm, rng, turns[kind])
         turns[kind] += 1
-        patterns.append(Pattern(kind, _KINDS[kind](setting)))
+        patterns.append(Pattern(kind, _KINDS[kind](request)))
     return patterns
 
 
 def dots_to_show(bench: Bench, channel: str, plane_mm: float, spacing: float) -> Gray:
-    """Gray levels that show the dot pattern of `runtime.camera.registration` in a plane, for finding the camera.
+    """Gray levels that show the dot pattern of `runtime.camera.registration` in a plane, to find the camera's place.
 
-    Raises InputError as `dot_pattern` does, and where the plane is out of reach.
+    Parameters
+    ----------
+    bench : Bench
+    channel : str
+    plane_mm : float, mm
+    spacing : float, panel pixels
+        Between dots.
+
+    Returns
+    -------
+    uint8 array [H, W]
+
+    Raises
+    ------
+    InputError
+        As `dot_pattern` does, and where the plane is out of reach.
     """
-    setting = _Setting(bench, channel, plane_mm, np.random.default_rng(0), 0)
+    request = _PatternRequest(bench, channel, plane_mm, np.random.default_rng(0), 0)
     picture = np.maximum(dot_pattern(bench.panel.shape, spacing).astype(float), 1e-3)
-    return setting.gray(_hologram(setting, picture, _bent(setting, 0.1)))
+    return request.gray(_hologram(request, picture, _quadratic(request, 0.1)))
 
 
-def _bent(s: _Setting, edge: float) -> Array:
+def _quadratic(s: _PatternRequest, edge: float) -> Array:
     """A quadratic phase over the picture, as behind a lens; `edge` is its slope at the border, cycles a pixel."""
     height, width = s.shape
     y, x = _centred(height) / height, _centred(width) / width
     return math.pi * edge * (height * y[:, None] ** 2 + width * x[None, :] ** 2)
 
 
-def _smooth_picture(s: _Setting) -> Gray:
+def _smooth_picture(s: _PatternRequest) -> Gray:
     """A picture whose light starts with a quadratic phase, as behind a lens: smooth, and spread over the
     pupil.
     """
     edge = (0.35, 0.1)[s.turn % 2]  # inside the band, with room for the picture's own
-    return s.gray(_hologram(s, _picture(s.shape, 2 * s.turn), _bent(s, edge)))
+    return s.gray(_hologram(s, _picture(s.shape, 2 * s.turn), _quadratic(s, edge)))
 
 
-def _rough_picture(s: _Setting) -> Gray:
+def _rough_picture(s: _PatternRequest) -> Gray:
     """A picture whose light starts with a random phase: a diffuse object that fills the pupil."""
     return s.gray(_hologram(s, _picture(s.shape, 2 * s.turn + 1), s.rng.uniform(0, 2 * math.pi, s.shape)))
 
 
-def _random(s: _Setting) -> Gray:
-    """Every pixel a gray level of its own."""
+def _random(s: _PatternRequest) -> Gray:
+    """A random gray level in every pixel."""
     return s.rng.integers(0, 256, s.shape).astype(np.uint8)
 
 
-def _grains(s: _Setting) -> Gray:
-    """Smooth noise; grains of 4, 2.5 and 8 pixels by turns, wide in phase, so that all gray levels have
+def _grains(s: _PatternRequest) -> Gray:
+    """Smooth noise; grains of 4, 2.5 and 8 pixels in turn, wide in phase, so that all gray levels have
     neighbours.
     """
     grain = (4.0, 2.5, 8.0)[s.turn % 3]
@@ -134,12 +179,12 @@ def _grains(s: _Setting) -> Gray:
     return s.gray(smooth / smooth.std() * 2.5)
 
 
-def _ramps(s: _Setting) -> Gray:
+def _ramps(s: _PatternRequest) -> Gray:
     """Tiles of blazed ramps, each to its own place in the pupil and with its own part of the gray levels."""
     return _tiles(s, lambda y, x, fy, fx, low, high: low + (high - low) * np.mod(fy * y + fx * x, 1))
 
 
-def _gratings(s: _Setting) -> Gray:
+def _gratings(s: _PatternRequest) -> Gray:
     """Tiles of sinusoidal gratings of several periods, rows and columns, and depths."""
 
     def grating(y: Array, x: Array, fy: float, fx: float, low: float, high: float) -> Array:
@@ -149,7 +194,7 @@ def _gratings(s: _Setting) -> Gray:
     return _tiles(s, grating)
 
 
-def _checkers(s: _Setting) -> Gray:
+def _checkers(s: _PatternRequest) -> Gray:
     """Tiles of checkerboards of two gray levels, squares of 1 to 8 pixels."""
 
     def checker(y: Array, x: Array, fy: float, fx: float, low: float, high: float) -> Array:
@@ -159,7 +204,7 @@ def _checkers(s: _Setting) -> Gray:
     return _tiles(s, checker)
 
 
-def _flat(s: _Setting) -> Gray:
+def _flat(s: _PatternRequest) -> Gray:
     """One gray level everywhere."""
     return np.full(s.shape, (0, 128, 64, 192)[s.turn % 4], np.uint8)
 
@@ -172,7 +217,7 @@ _ORDER = (  # the middle one of every line is held out, and others of its kind a
     "checkers", "grains", "flat",
 )
 # fmt: on
-_KINDS: dict[str, Callable[[_Setting], Gray]] = {
+_KINDS: dict[str, Callable[[_PatternRequest], Gray]] = {
     "smooth_picture": _smooth_picture,
     "rough_picture": _rough_picture,
     "random": _random,
@@ -184,7 +229,7 @@ _KINDS: dict[str, Callable[[_Setting], Gray]] = {
 }
 
 
-def _tiles(s: _Setting, draw: Callable[[Array, Array, float, float, float, float], Array]) -> Gray:
+def _tiles(s: _PatternRequest, draw: Callable[[Array, Array, float, float, float, float], Array]) -> Gray:
     """A mosaic: `draw(y, x, fy, fx, low, high)` for each tile, frequencies in cycles a pixel, gray levels."""
     height, width = s.shape
     rows, columns = max(1, min(6, height // 24)), max(1, min(8, width // 24))
@@ -203,10 +248,14 @@ def _spans(length: int, count: int) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in pairwise(edges)]
 
 
-def _hologram(s: _Setting, picture: Array, start: Array) -> Array:
+def _hologram(s: _PatternRequest, picture: Array, start: Array) -> Array:
     """Phase on the panel that shows a picture in the ideal image plane, from a starting phase in the image.
 
-    Gerchberg and Saxton 1972 between panel and image plane; light outside the picture is left alone.
+    Iterations between panel and image plane; light outside the picture is not constrained.
+
+    References
+    ----------
+    Gerchberg and Saxton 1972.
     """
     panel = s.bench.panel
     half_width = min(s.bench.iris.half_width, 1.0)
@@ -234,8 +283,8 @@ def _hologram(s: _Setting, picture: Array, start: Array) -> Array:
     for iteration in range(ITERATIONS):
         if iteration:
             field = scipy.fft.ifft2(scipy.fft.fft2(field) * transfer)
-            seen = field[window]
-            field[window] = amplitude * seen / np.maximum(np.abs(seen), 1e-6)
+            arriving = field[window]
+            field[window] = amplitude * arriving / np.maximum(np.abs(arriving), 1e-6)
         back = scipy.fft.ifft2(scipy.fft.fft2(field) * np.conj(transfer))[window]
         phase = np.angle(back)
         field = np.zeros(grid.padded, np.complex64)

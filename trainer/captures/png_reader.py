@@ -15,7 +15,13 @@ PNG_END = b"\0\0\0\0IEND\xae\x42\x60\x82"
 
 
 class PictureError(InputError):
-    """A picture that cannot be used; kind is one of missing_file, unreadable, bit_depth, wrong_size."""
+    """A picture that cannot be used.
+
+    Attributes
+    ----------
+    kind : str
+        missing_file, unreadable, bit_depth or wrong_size.
+    """
 
     def __init__(self, kind: str, message: str) -> None:
         super().__init__(message)
@@ -25,10 +31,24 @@ class PictureError(InputError):
 def read_picture(path: Path, shape: tuple[int, int], bits: int, what: str) -> np.ndarray:
     """A gray PNG, whole or not at all.
 
-    path : file; shape : (height, width) that it must have; bits : 8, 16, or 0 where either will do
-    what : how messages name it
-    Returns uint8 [height, width] when bits is 8, otherwise uint16.
-    Raises PictureError if it is missing, truncated or damaged, not gray of that depth, or of another size.
+    Parameters
+    ----------
+    path : Path
+    shape : (int, int), pixels
+        The height and width that it must have.
+    bits : int
+        8, 16, or 0 where both are allowed.
+    what : str
+        How messages name it.
+
+    Returns
+    -------
+    uint8 array [height, width] when bits is 8, otherwise uint16
+
+    Raises
+    ------
+    PictureError
+        If it is missing, truncated or damaged, not gray of that depth, or of another size.
     """
     try:
         data = path.read_bytes()
@@ -55,7 +75,7 @@ def read_picture(path: Path, shape: tuple[int, int], bits: int, what: str) -> np
         raise PictureError(
             "unreadable", f"{what} is not a whole PNG at {path} ({reason(error)}): write the file again"
         ) from None
-    if PNG_END not in data:  # which Pillow does not miss
+    if PNG_END not in data:  # Pillow reads such a file without complaint
         raise PictureError("unreadable", f"{what} is cut off at its end at {path}: write the file again")
     depth = {"L": 8, "I;16": 16, "I;16B": 16, "I": 16}.get(mode)
     if depth is None or (bits and depth != bits):

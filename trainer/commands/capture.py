@@ -50,10 +50,10 @@ def options(parser: ArgumentParser) -> None:
 
 def run(args: Namespace, screen: Screen) -> Result:
     """Patterns shown on a bench and captured."""
-    from trainer.captures.acquire import capture_from
+    from trainer.captures.acquire import acquire_from
 
     with screen.progress("capturing") as progress:
-        taken = capture_from(
+        taken = acquire_from(
             args.bench, args.out, args.patterns, args.planes, args.channels, args.seed, progress, args.known
         )
     return taken.as_json()

@@ -17,13 +17,16 @@ def run(args: Namespace, screen: Screen) -> Result:
     """Everything that is wrong with a capture set."""
     from trainer.captures.capture_set import read_bench, scan_rows
     from trainer.captures.check_set import check_captures
+    from trainer.model.model_stages import ideal_irradiance
 
     folder: Path = args.captures
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder: name a capture set, with bench.toml and captures.csv")
     use_every_core()
     with screen.progress("checking the captures") as progress:
-        problems = check_captures(folder, lambda done, count: progress(done / max(1, count)))
+        problems = check_captures(
+            folder, ideal_irradiance, lambda done, count: progress(done / max(1, count))
+        )
     try:
         rows, _ = scan_rows(folder, read_bench(folder / "bench.toml"))
     except InputError:

@@ -85,9 +85,11 @@ def refuse_misread(folder: Path, screen: Screen) -> None:
     InputError
         Where the captures are misread, so that every number would be wrong.
     """
-    from trainer.captures.check_set import MISREAD, check_captures
+    from trainer.captures.check_set import check_captures
+    from trainer.captures.problems import MISREAD
+    from trainer.model.model_stages import ideal_irradiance
 
-    errors = [p for p in check_captures(folder) if p.severity == "error"]
+    errors = [p for p in check_captures(folder, ideal_irradiance) if p.severity == "error"]
     for problem in errors:
         if problem.kind in MISREAD:
             raise InputError(problem.message)

@@ -61,7 +61,7 @@ def run(args: Namespace, screen: Screen) -> Result:
         write_pattern(args.out, dots_to_show(bench, channel, args.plane or bench.distance_mm, args.spacing))
         return {"pattern": str(args.out), "spacing_px": args.spacing, "channel": channel}
     from runtime.camera.registration import dots_of, find_homography
-    from trainer.captures.capture_set import read_picture
+    from trainer.captures.png_reader import read_picture
 
     depth = 16 if bench.camera.bit_depth > 8 else 8
     image = read_picture(args.image, bench.camera.shape, depth, f"the dot picture {args.image}")

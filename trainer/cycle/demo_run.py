@@ -85,7 +85,7 @@ def run_demo(
     InputError
         Where the folder is not empty or cannot be made.
     """
-    from trainer.captures.acquire import capture_set
+    from trainer.captures.acquire import acquire_captures
     from trainer.captures.capture_set import read_captures
     from trainer.diagnosis.compare import compare
     from trainer.diagnosis.explain import explain
@@ -99,7 +99,7 @@ def run_demo(
     headset = open_headset(spec, seed=1)
     bench = nominal_bench(headset)
     captures_folder, model_path, report_path = (folder / n for n in ("captures", "model.toml", "report.html"))
-    capture_set(
+    acquire_captures(
         headset, bench, captures_folder, patterns=9 if quick else None,
         progress=lambda done, what: say(0.1 * done, f"capturing: {what}"),
     )  # fmt: skip

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from firmware_iface.errors import InputError
 from firmware_iface.virtual import VirtualHeadset, open_headset
-from trainer.captures.acquire import capture_set
+from trainer.captures.acquire import acquire_captures
 from trainer.captures.bench_file import Bench
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.open_bench import nominal_bench
@@ -146,7 +146,7 @@ class EvaluationBench:
         folder = self.folder / name
         if not folder.exists():
             if pictures is None:
-                capture_set(self.headset, self.bench, folder, seed=self.seed)
+                acquire_captures(self.headset, self.bench, folder, seed=self.seed)
             else:
                 patterns = {
                     v.name: retrieve(self.ideal, v, "wirtinger", None, self.sizes.iterations)

@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from firmware_iface.errors import InputError
-from trainer.captures.acquire import capture_set
+from trainer.captures.acquire import acquire_captures
 from trainer.captures.bench_file import Bench
-from trainer.captures.capture_set import Capture, CaptureSet, read_captures
+from trainer.captures.capture_set import CaptureSet, read_captures
+from trainer.captures.capture_table import Capture
 from trainer.captures.patterns import Pattern
 from trainer.cycle.phase_retrieval import CARRIER, OPENING
 from trainer.cycle.target_pictures import TargetVolume
@@ -59,14 +60,14 @@ class BenchDisplay:
         Raises
         ------
         InputError
-            As from `capture_set`.
+            As from `acquire_captures`.
         """
         names = [c.name for c in self.bench.channels]
 
         def choose(channel: str, plane_mm: float) -> list[Pattern]:
             return [Pattern(name, gray[names.index(channel)]) for name, gray in patterns.items()]
 
-        capture_set(self.headset, self.bench, folder, None, planes_mm, choose=choose)
+        acquire_captures(self.headset, self.bench, folder, None, planes_mm, choose=choose)
         return read_captures(folder)
 
 

@@ -17,7 +17,8 @@ from firmware_iface.errors import InputError
 from runtime.excess import PredictionErrors, joined
 from trainer.captures.batches import load_batch
 from trainer.captures.camera_noise import compare_repeats
-from trainer.captures.capture_set import Capture, CaptureSet
+from trainer.captures.capture_set import CaptureSet
+from trainer.captures.capture_table import Capture
 from trainer.captures.held_out import capture_roles, split
 from trainer.diagnosis.error_budget import ErrorBudget
 from trainer.diagnosis.localise import BrightnessSums, CaptureResidual, FieldSums, FrequencySums

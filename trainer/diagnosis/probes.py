@@ -20,7 +20,8 @@ from runtime.excess import PredictionErrors, RemovedExcess, joined, removed_exce
 from runtime.lightpath.legendre import legendre_count, legendre_curve, legendre_surface
 from runtime.lightpath.light_path import mode_irradiance, panel_phase, panel_spectrum
 from trainer.captures.batches import Batch, load, load_batch
-from trainer.captures.capture_set import Capture, chosen, opened
+from trainer.captures.capture_set import chosen, opened
+from trainer.captures.capture_table import Capture
 from trainer.captures.held_out import scenes
 from trainer.fitting.free_form_maps import FreeFormBatch, FreeFormStage, Picture, Tensors, descend
 from trainer.model.model import Model

@@ -1,7 +1,7 @@
 """What an effect is: a name, the stage it belongs to, its physical parameters, and one function.
 
-The function takes the stage as it is without the effect and the parameters as tensors, and returns the stage with
-the effect. That is all that screening, fitting, the report, export and the headset need.
+The function takes the stage without the effect and the parameters as tensors, and returns the stage with the effect.
+Screening, fitting, the report, export and the headset need nothing more.
 """
 
 from __future__ import annotations
@@ -25,16 +25,30 @@ ACTS_ON = ("display", "camera")
 class Parameter:
     """One physical parameter of an effect.
 
-    name : without a unit
-    unit : as printed; "1" for a pure number
-    scale : a change of this size is small but visible; fits step in units of it
-    absent : value at which the effect is not there; a number, or a function of the bench
-    low, high : physical range, inclusive
-    count : 0 for a single number; otherwise how many numbers, or a function of the effect's order
-    per_channel : one value (or row of values) a colour
-    blocks : equal parts that the numbers fall into, each with its terms lowest first (2 for a field of displacements)
-    even : the effect depends on the square of this parameter, so its derivative at absent is zero
-    starts : values to start a fit from, where the derivative at absent does not reach far; () for absent alone
+    Attributes
+    ----------
+    name : str
+        Without a unit.
+    unit : str
+        As printed; "1" for a pure number.
+    scale : float
+        A change of this size is small but visible; fits step in units of it.
+    absent : float or callable
+        Value at which the effect is not there: a number, or a function of the bench.
+    low, high : float
+        Physical range, inclusive.
+    count : int or callable
+        0 for a single number; otherwise how many numbers, or a function of the effect's order.
+    per_channel : bool
+        One value (or row of values) for each colour.
+    even : bool
+        The effect depends on the square of this parameter, so its derivative at `absent` is zero.
+    starts : tuple of float
+        Values from which fits start, where the derivative at `absent` does not reach far; () for `absent` alone.
+    about : str
+        What it is, in a few words.
+    blocks : int
+        Equal parts of the numbers, each with its lowest terms first (2 for a field of displacements).
     """
 
     name: str
@@ -68,14 +82,34 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Effect:
-    """A named physical effect; `apply` is `(stage, **parameters) -> stage`.
+    """A named physical effect.
 
-    orders : the orders a map or curve is raised through, lowest first; (0,) where there is nothing to raise
-    starts : optional `(evidence) -> list of {parameter: value}`: starting points read off the data
-    touches_iris : the effect may open the iris beyond what the bench says
-    rugged : derivatives do not reach far anywhere, so a pattern search comes before a fit
-    measure : optional `(evidence) -> {parameter: value}`: values read off the captures once all else is fitted
-    takes_order : `apply` is given the effect's order as the keyword `order`
+    Attributes
+    ----------
+    name : str
+    stage : str
+        One of STAGES.
+    acts_on : str
+        "display" where the eye sees it too, "camera" where only the camera does.
+    about : str
+        One line.
+    parameters : tuple of Parameter
+    apply : callable
+        `(stage, **parameters) -> stage`.
+    orders : tuple of int
+        Orders of a map or curve that fits try, lowest first; (0,) where there is only one.
+    starts : callable, optional
+        `(evidence) -> list of {parameter: value}`: starting points estimated from the captures.
+    touches_iris : bool
+        The effect may open the iris beyond what the bench states.
+    rugged : bool
+        Derivatives do not reach far anywhere, so a pattern search comes before a fit.
+    measure : callable, optional
+        `(evidence) -> {parameter: value}`: values measured on the captures after all else is fitted.
+    source : str
+        "built in", or the file that defines it.
+    takes_order : bool
+        `apply` takes the effect's order as the keyword `order`.
     """
 
     name: str
@@ -111,18 +145,34 @@ def effect(
 ) -> Callable[[Callable[..., Any]], Effect]:
     """Make an effect of a function: its name is the function's, its description the docstring's first line.
 
-    The function takes the stage, then its parameters in their order; a keyword-only argument `order` is given the
-    effect's order. `told_to` is the former name of `acts_on`. Raises InputError where stage, what is acted on or
-    parameters do not fit the function.
+    The function takes the stage, then its parameters in their order. A keyword-only argument `order` receives the
+    effect's order.
+
+    Parameters
+    ----------
+    stage, acts_on, parameters, orders, starts, touches_iris, rugged, measure
+        As in `Effect`.
+    told_to : str, optional
+        The former name of `acts_on`.
+
+    Returns
+    -------
+    callable
+        A decorator that makes an `Effect` of a function.
+
+    Raises
+    ------
+    InputError
+        Where `stage` or `acts_on` is unknown, or the parameters do not fit the function.
     """
-    audience = acts_on or told_to
+    acted_on = acts_on or told_to
 
     def make(function: Callable[..., Any]) -> Effect:
         name = getattr(function, "__name__", "effect")
         if stage not in STAGES:
             raise InputError(f"effect '{name}': stage '{stage}' is not one of {', '.join(STAGES)}")
-        if audience not in ACTS_ON:
-            raise InputError(f"effect '{name}': acts_on '{audience}' is not one of {', '.join(ACTS_ON)}")
+        if acted_on not in ACTS_ON:
+            raise InputError(f"effect '{name}': acts_on '{acted_on}' is not one of {', '.join(ACTS_ON)}")
         if not parameters:
             raise InputError(f"effect '{name}': give it at least one Parameter")
         arguments = list(inspect.signature(function).parameters.values())[1:]
@@ -140,7 +190,7 @@ def effect(
         return Effect(
             name,
             stage,
-            audience,
+            acted_on,
             about,
             tuple(parameters),
             function,

@@ -1,4 +1,4 @@
-"""Effects of the drive: what the panel makes of a gray level, and of its neighbours'."""
+"""Effects of the drive: from a pixel's gray level and its neighbours' to its phase."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from runtime.lightpath.legendre import legendre_count, legendre_curve, legendre_
 from trainer.effects.definition import Parameter, effect
 from trainer.prediction.stages import Drive
 
-SUB_PIXELS = 4  # of a pixel an axis; 3 leave an excess of 9e-4, 5 gain nothing that a camera sees
-REACH = 2  # neighbours on either side that a pixel hears
+SUB_PIXELS = 4  # of a pixel along each axis; 3 leave an excess of 9e-4, 5 gain nothing visible to a camera
+REACH = 2  # neighbours on either side that act on a pixel
 
 
 @effect(
@@ -45,7 +45,7 @@ REACH = 2  # neighbours on either side that a pixel hears
     ],
 )
 def phase_response(drive: Drive, gain: Tensor, curvature: Tensor) -> Drive:
-    """Gray to phase is not the straight line that the bench file says."""
+    """Gray to phase is not the straight line that the bench file states."""
     t = drive.level
     bend = t * (1 - t) * 4 * (curvature @ legendre_curve(2 * t - 1, curvature.shape[0]))
     return replace(drive, response=drive.response * gain + drive.sign * bend)
@@ -90,10 +90,21 @@ def crosstalk(
 
 
 def _taps(width: Tensor, asymmetry: Tensor) -> Tensor:
-    """Share that each pixel has in the phase of each sub-pixel: [SUB_PIXELS, 2 REACH + 1].
+    """Share that each pixel has in the phase of each sub-pixel.
 
-    The kernel is a two-sided exponential, as fringing fields decay; `width` (pixels) is its rms for equal sides,
-    `asymmetry` lengthens one side and shortens the other. The share of a pixel is the kernel's integral over it.
+    The kernel is a two-sided exponential, as fringing fields decay. The share of a pixel is the kernel's integral over
+    it.
+
+    Parameters
+    ----------
+    width : Tensor, pixels
+        The kernel's rms for equal sides.
+    asymmetry : Tensor
+        Lengthens one side and shortens the other, -1 to 1.
+
+    Returns
+    -------
+    Tensor [SUB_PIXELS, 2 REACH + 1]
     """
     side = torch.clamp(width, min=1e-3) / math.sqrt(2)
     right, left = side * (1 + 0.999 * asymmetry), side * (1 - 0.999 * asymmetry)

@@ -49,9 +49,7 @@ FORMER_MODULES = {
 
 Catalogue = dict[str, Effect]
 
-_files: dict[
-    str, Catalogue
-] = {}  # effect files that this process has read for effects that came from another one
+_files: dict[str, Catalogue] = {}  # effect files, read for effects that came from another process
 
 
 def _named(name: str, source: str) -> Effect:
@@ -68,14 +66,26 @@ copyreg.pickle(Effect, lambda one: (_named, (one.name, one.source)))
 
 
 def forget_effect_files() -> None:
-    """Drop the effect files that an earlier run has left in this process: they may have changed since."""
+    """Drop the effect files that an earlier run has read in this process: they may have changed since then."""
     _files.clear()
 
 
 def catalogue(files: Iterable[Path] = ()) -> Catalogue:
-    """Every known effect by name, in the order that light meets them; users' own after the built-in ones.
+    """Every known effect by name, in the order in which light meets them; users' own after the built-in ones.
 
-    Raises InputError when a file cannot be loaded, holds no effect, or names one that is taken.
+    Parameters
+    ----------
+    files : iterable of Path
+        Python files that define further effects.
+
+    Returns
+    -------
+    dict of str to Effect
+
+    Raises
+    ------
+    InputError
+        When a file cannot be loaded, defines no effect, or defines one whose name is used already.
     """
     known: Catalogue = {e.name: e for e in BUILT_IN}
     for point in entry_points(group=ENTRY_POINTS):
@@ -86,7 +96,13 @@ def catalogue(files: Iterable[Path] = ()) -> Catalogue:
 
 
 def find_effect(known: Catalogue, name: str) -> Effect:
-    """The effect of that name. Raises InputError that suggests the nearest."""
+    """The effect of that name.
+
+    Raises
+    ------
+    InputError
+        For an unknown name, with the nearest known one.
+    """
     if name in known:
         return known[name]
     near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
@@ -117,7 +133,13 @@ def _defined_in(module: ModuleType) -> list[Effect]:
 
 
 def load_effects(path: Path) -> list[Effect]:
-    """The effects that a Python file defines. Raises InputError, with the line, when it cannot be run."""
+    """The effects that a Python file defines.
+
+    Raises
+    ------
+    InputError
+        When it cannot be run (with the line), or defines no effect.
+    """
     if not path.is_file():
         raise InputError(f"effects file {path} is not there: give the path of a Python file")
     name = "hololoop_effects_" + hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]

@@ -1,4 +1,4 @@
-"""What an effect sees of the captures when it looks for its starting values."""
+"""What an effect is given of the captures to find its starting values."""
 
 from __future__ import annotations
 
@@ -12,7 +12,15 @@ from trainer.prediction.scene import Scene
 
 @dataclass(frozen=True)
 class Evidence:
-    """One colour and plane: its scene, the captures, and what the model predicts for them [B, h, w], counts."""
+    """Captures of one colour and plane, and the model's prediction for them.
+
+    Attributes
+    ----------
+    scene : Scene
+    batch : Batch
+        The captures.
+    prediction : Tensor [B, h, w], counts above black
+    """
 
     scene: Scene
     batch: Batch

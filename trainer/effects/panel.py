@@ -1,4 +1,4 @@
-"""Effects of the panel: a fixed complex field, multiplied on or added to what it shows."""
+"""Effects of the panel: a fixed complex field that multiplies what it shows, or is added to it."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Which way the data pull a map or a curve of one stage: starting points for effects that a person writes.
+"""In which direction the captures pull a map or a curve of one stage: starting points for users' own effects.
 
-The misfit's derivative with respect to every number of a map costs one pass forward and one back. A stripe, a
-ripple or a fringe stands out in it, so a fit can start near it instead of trying every period.
+The misfit's derivative with respect to every number of a map costs one forward and one backward pass. A stripe, a
+ripple or a fringe is clearly visible in it, so a fit can start near it and need not try every period.
 """
 
 from __future__ import annotations
@@ -20,18 +20,31 @@ from trainer.prediction.predict import light_on_camera, trace
 from trainer.prediction.scene import bare_stages
 
 MOST_CAPTURES = 3
-FINER = 8  # samples of the spectrum a whole cycle over the map: a peak is placed to a fraction of a cycle
+FINER = 8  # samples of the spectrum for one cycle over the map: a peak is located to a fraction of a cycle
 
 
 def pull(
     evidence: Sequence[Evidence], stage: str, change: Callable[[Any, Tensor], Any], shape: tuple[int, ...]
 ) -> NDArray[np.float64]:
-    """How strongly the residual asks for each number of a map, float64 [*shape], from the first captures.
+    """How strongly the residual of the first captures pulls each number of a map.
 
-    stage : whose map it is
-    change : `(stage, map) -> stage`; at a map of zeros the stage is as it was
-    Where the result is positive, a positive number would lessen the misfit. Effects that are in the model
-    already are in the residual, but not in how light reacts to the map.
+    Effects that are in the model already are in the residual, but not in the light's response to the map.
+
+    Parameters
+    ----------
+    evidence : sequence of Evidence
+        Only the first one is used.
+    stage : str
+        The stage that the map belongs to.
+    change : callable
+        `(stage, map) -> stage`; a map of zeros leaves the stage as it is.
+    shape : tuple of int
+        The map's.
+
+    Returns
+    -------
+    float64 array [*shape]
+        Where it is positive, a positive number would reduce the misfit.
     """
     one = evidence[0]
     total = np.zeros(shape)
@@ -45,8 +58,8 @@ def pull(
             )[0]
             if stages.sensor.gain is not None:
                 light = light * stages.sensor.gain
-            seen = light.detach()
-            gain = (seen * one.prediction[k]).sum() / (seen**2).sum()
+            fixed = light.detach()
+            gain = (fixed * one.prediction[k]).sum() / (fixed**2).sum()
             residual = (one.batch.signal[k] - one.prediction[k]) * one.batch.mask[k]
             (slope,) = torch.autograd.grad((residual * light * gain).sum(), surface)
             total += slope.double().numpy()
@@ -55,11 +68,16 @@ def pull(
 
 @dataclass(frozen=True)
 class Wave:
-    """A sinusoid that a map holds: cycles a sample along each axis (from 0 on along the last), and its
-    cosine's and sine's share, of 1.
+    """A sinusoid in a map: `cosine * cos(a) + sine * sin(a)` with `a = 2 pi sum(frequency * place)`.
 
-    Its angle is zero at the map's centre: `cosine * cos(a) + sine * sin(a)` with `a = 2 pi sum(frequency *
-    place)` and places counted in samples from the centre.
+    Places are counted in samples from the map's centre.
+
+    Attributes
+    ----------
+    frequency : tuple of float, cycles/sample
+        Along each axis; not negative along the last.
+    cosine, sine : float
+        Their squares add up to 1.
     """
 
     frequency: tuple[float, ...]
@@ -68,8 +86,20 @@ class Wave:
 
 
 def waves(array: NDArray[np.float64], most: int = 3, slowest: float = 1.5) -> list[Wave]:
-    """The strongest sinusoids of a curve or a map, strongest first; `slowest` is in cycles over the whole of
-    it.
+    """The strongest sinusoids of a curve or a map.
+
+    Parameters
+    ----------
+    array : float64 array
+        A curve or a map, such as `pull` returns.
+    most : int
+    slowest : float
+        Cycles over the whole array; slower ones are left out.
+
+    Returns
+    -------
+    list of Wave
+        Strongest first.
     """
     sizes = [FINER * n for n in array.shape]
     if array.ndim > 1:

@@ -13,7 +13,7 @@ from trainer.effects.definition import Parameter, effect
 from trainer.effects.zernike import zernike_count, zernike_maps
 from trainer.prediction.stages import Pupil
 
-LINES = 5  # nodes of the Gauss-Hermite rule that stands for a laser line
+LINES = 5  # nodes of the Gauss-Hermite rule that represents a laser line
 FWHM = 2 * math.sqrt(2 * math.log(2))
 
 
@@ -33,7 +33,7 @@ FWHM = 2 * math.sqrt(2 * math.log(2))
     ],
 )
 def distance(pupil: Pupil, offset: Tensor) -> Pupil:
-    """The image plane is not where it is said to be."""
+    """The image plane is not where the captures state it."""
     return replace(pupil, distance=pupil.distance + 1e-3 * offset)
 
 
@@ -54,7 +54,7 @@ def distance(pupil: Pupil, offset: Tensor) -> Pupil:
     ],
 )
 def pupil_aberration(pupil: Pupil, zernike: Tensor, *, order: int) -> Pupil:
-    """The relay aberrates (without piston, tilt or defocus, which other effects hold)."""
+    """The relay aberrates (without piston, tilt or defocus, which other effects describe)."""
     maps = zernike_maps(pupil.v, pupil.u, order, without_defocus=True)
     return pupil.delayed(torch.tensordot(zernike, maps, dims=1) * pupil.reference_wavelength)
 
@@ -79,7 +79,7 @@ def pupil_aberration(pupil: Pupil, zernike: Tensor, *, order: int) -> Pupil:
     ],
 )
 def iris(pupil: Pupil, half_width: Tensor, centre_y: Tensor, centre_x: Tensor) -> Pupil:
-    """The filter in the Fourier plane has another size or place than said."""
+    """The filter in the Fourier plane has another size or place than stated."""
     centre = (pupil.centre[0] + centre_y, pupil.centre[1] + centre_x)
     return replace(pupil, half_width=half_width, centre=centre)
 
@@ -135,7 +135,7 @@ def spatial_coherence(
     pupil: Pupil, extent_y: Tensor, extent_x: Tensor, kurtosis: Tensor, halo: Tensor, halo_extent: Tensor
 ) -> Pupil:
     """The source has an extent: each of its points tilts the light and displaces the picture by distance x angle."""
-    # Exact but for the iris's edge, and hundreds of times cheaper than a propagation a source point.
+    # Exact except at the iris's edge, and hundreds of times cheaper than one propagation for each source point.
     reach = 1e-3 * torch.abs(pupil.distance)
     widths = (reach * extent_y, reach * extent_x, reach * halo_extent)
     return pupil.filtered(kernel_transfer(pupil.iy, pupil.ix, widths, kurtosis, halo))
@@ -144,11 +144,24 @@ def spatial_coherence(
 def kernel_transfer(
     iy: Tensor, ix: Tensor, widths: tuple[Tensor, Tensor, Tensor], kurtosis: Tensor, halo: Tensor
 ) -> Tensor:
-    """Transfer function of a kernel of rms `widths` (rows, columns; its halo's), shape `kurtosis`, and a halo.
+    """Transfer function of a blur kernel with a core and a halo.
 
-    The core is the first two even cumulants of a kernel, exp(-w^2/2 + kurtosis w^4/24), w = 2 pi width f, with the
-    quartic held to half of the quadratic, where the expansion ends; the halo is a round Gaussian with a share
-    `halo` of the light.
+    The core is the first two even cumulants of a kernel, exp(-w^2/2 + kurtosis w^4/24), w = 2 pi width f. The quartic
+    term is limited to half of the quadratic one, where the expansion ends. The halo is a round Gaussian.
+
+    Parameters
+    ----------
+    iy, ix : Tensor
+        Image frequencies, in cycles per unit of `widths`.
+    widths : (Tensor, Tensor, Tensor)
+        rms along rows and columns, and of the halo.
+    kurtosis : Tensor
+    halo : Tensor
+        Its share of the light.
+
+    Returns
+    -------
+    Tensor [n, m]
     """
     w2 = (2 * math.pi) ** 2 * ((widths[0] * iy) ** 2 + (widths[1] * ix) ** 2)
     core = torch.exp(w2 * (torch.clamp(kurtosis * w2 / 24, -0.25, 0.25) - 0.5))

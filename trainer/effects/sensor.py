@@ -65,7 +65,7 @@ def sensor_blur(
             high=30,
             count=lambda order: 2 * (legendre_count(order, 1) - 1),
             blocks=2,
-            about="Legendre terms of the displacement that shift, rotation and size do not hold; rows, then columns",
+            about="Legendre terms of the displacement that shift, rotation and size leave; rows, then columns",
         ),
     ],
 )
@@ -77,13 +77,13 @@ def misregistration(
     magnification: Tensor,
     distortion: Tensor,
 ) -> Sensor:
-    """Camera pixels are not where the registration says: shift, rotation, scale, distortion."""
+    """Camera pixels are not where the registration states: shift, rotation, scale, distortion."""
     half_height, half_width = (n / 2 for n in sensor.y.shape)
     y, x = sensor.y * half_height, sensor.x * half_width
     angle, size = 1e-3 * rotation, 1e-2 * magnification
     dy, dx = shift_y + size * y + angle * x, shift_x + size * x - angle * y
-    # What an affine map does is held above, but for one share of it: stretch of rows against columns. So the first
-    # term, P1(y), is left out.
+    # The parameters above describe an affine map, except one part of it: stretch of rows against columns. So the
+    # first term, P1(y), is left out.
     rows, columns = (
         legendre_surface(torch.cat((torch.zeros_like(part[:1]), part)), sensor.y, sensor.x)
         for part in distortion.reshape(2, -1)
@@ -153,7 +153,7 @@ def sensor_response(sensor: Sensor, bend: Tensor) -> Sensor:
     """Counts are not proportional to light."""
 
     def curve(share: Tensor) -> Tensor:
-        # The polynomial is fitted from darkness to full scale; beyond it the curve goes on as a straight line.
+        # The polynomial is fitted from darkness to full scale; beyond that the curve continues as a straight line.
         inside = torch.clamp(share, -0.05, 1.0)
         return share + inside * (1 - inside) * torch.tensordot(
             bend, legendre_curve(2 * inside - 1, bend.shape[0]), dims=1

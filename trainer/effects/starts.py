@@ -1,7 +1,7 @@
-"""Starting points read off the data, for effects that a derivative at "absent" does not reach.
+"""Starting points estimated from the captures, for effects that a derivative at "absent" does not reach.
 
-Displacement between prediction and picture is found tile by tile from the peak of their cross-correlation; a second,
-displaced picture from the cross-correlation of the residual with the prediction.
+The displacement between prediction and picture is found tile by tile, from the peak of their cross-correlation. A
+second, displaced picture is found from the cross-correlation of the residual with the prediction.
 """
 
 from __future__ import annotations
@@ -21,20 +21,27 @@ TILE = 64
 
 
 def displacements(evidence: Evidence) -> tuple[NDArray, NDArray, NDArray]:
-    """How far the picture lies from the prediction, tile by tile: centres [n, 2] and shifts [n, 2] (camera pixels),
-    weights [n]. Rows first; centres from the picture's; a positive shift moves the picture's content down or right.
+    """How far the picture lies from the prediction, tile by tile.
+
+    Returns
+    -------
+    centres : float array [n, 2], camera pixels
+        Of the tiles (row, column), from the picture's centre.
+    shifts : float array [n, 2], camera pixels
+        (row, column); a positive shift moves the picture's content down or right.
+    weights : float array [n]
     """
     batch = evidence.batch
-    seen = (batch.signal * batch.mask).double().numpy()
+    observed = (batch.signal * batch.mask).double().numpy()
     expected = (evidence.prediction * batch.mask).double().numpy()
-    height, width = seen.shape[-2:]
+    height, width = observed.shape[-2:]
     size = min(TILE, height // 2, width // 2)
     taper = np.outer(np.hanning(size + 2)[1:-1], np.hanning(size + 2)[1:-1])
     centres, shifts, weights = [], [], []
     for top in _tops(height, size):
         for left in _tops(width, size):
             place = (slice(None), slice(top, top + size), slice(left, left + size))
-            peak = _peak(_correlation(seen[place], expected[place], taper))
+            peak = _peak(_correlation(observed[place], expected[place], taper))
             centres.append((top + (size - height) / 2, left + (size - width) / 2))
             shifts.append(peak[:2])
             weights.append(max(peak[2], 0.0) ** 2)
@@ -46,7 +53,7 @@ def registration_starts(evidence: Sequence[Evidence]) -> Starts:
     centres, shifts, weights = displacements(evidence[0])
     y, x = centres.T
     zero, one = np.zeros_like(y), np.ones_like(y)
-    # A camera pixel sees a place that much further on: the opposite of where the content went.
+    # A camera pixel receives light from a place that much farther on: opposite to the content's shift.
     rows = np.concatenate([np.stack([one, zero, x, y], 1), np.stack([zero, one, -y, x], 1)])
     solution = _robust(rows, np.concatenate([-shifts[:, 0], -shifts[:, 1]]), np.tile(weights, 2))
     shift = np.median(-shifts[weights > np.median(weights) / 2], axis=0)
@@ -62,7 +69,7 @@ def registration_starts(evidence: Sequence[Evidence]) -> Starts:
 
 
 def wavefront_starts(evidence: Sequence[Evidence]) -> Starts:
-    """Legendre terms (second order) of the wavefront whose slope displaces the picture as it is displaced.
+    """Legendre terms (second order) of the wavefront whose slope causes the picture's displacement.
 
     A phase slope k (rad/m) at the panel moves light by lambda z k / (2 pi).
     """
@@ -108,8 +115,8 @@ def gain_spread(evidence: Sequence[Evidence]) -> dict[str, Any]:
     """Standard deviation (%) of the gain from capture to capture, about each colour's mean."""
     own: dict[str, list[float]] = {}
     for one in evidence:
-        seen, expected, weight = (t.double() for t in (one.batch.signal, one.prediction, one.batch.mask))
-        gains = (weight * seen * expected).sum((-2, -1)) / (weight * expected**2).sum((-2, -1))
+        observed, expected, weight = (t.double() for t in (one.batch.signal, one.prediction, one.batch.mask))
+        gains = (weight * observed * expected).sum((-2, -1)) / (weight * expected**2).sum((-2, -1))
         own.setdefault(one.batch.channel, []).extend(gains.tolist())
     deviations = np.concatenate([np.array(g) / np.mean(g) - 1 for g in own.values()])
     return {"spread": max(0.01, 100 * float(np.std(deviations)))}
@@ -131,10 +138,11 @@ def _tops(length: int, size: int) -> list[int]:
     return [round(k * (length - size) / (count - 1)) for k in range(count)]
 
 
-def _correlation(seen: NDArray, expected: NDArray, taper: NDArray, whiten: bool = True) -> NDArray:
+def _correlation(observed: NDArray, expected: NDArray, taper: NDArray, whiten: bool = True) -> NDArray:
     """Circular cross-correlation over the captures, normalised so that 1 is a perfect match; peak at the shift."""
     a, b = (
-        np.fft.fft2((t - t.mean((-2, -1), keepdims=True)) * taper, axes=(-2, -1)) for t in (seen, expected)
+        np.fft.fft2((t - t.mean((-2, -1), keepdims=True)) * taper, axes=(-2, -1))
+        for t in (observed, expected)
     )
     cross = (a * np.conj(b)).sum(0)
     if whiten:
@@ -159,7 +167,7 @@ def _peak(correlation: NDArray) -> tuple[float, float, float]:
 
 
 def _robust(rows: NDArray, values: NDArray, weights: NDArray) -> NDArray:
-    """Weighted least squares that lets go of outliers (Huber, a few rounds)."""
+    """Weighted least squares that gives outliers less weight (Huber, a few rounds)."""
     weights = weights + 1e-12
     solution = np.zeros(rows.shape[1])
     factor = np.ones_like(values)

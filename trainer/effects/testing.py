@@ -1,6 +1,4 @@
-"""Help for the test of an effect: a small bench without noise of its own kind, and captures that hold the
-effect.
-"""
+"""For the test of an effect: a small ideal bench, and captures of it with the effect hidden in it."""
 
 from __future__ import annotations
 
@@ -11,6 +9,7 @@ import numpy as np
 import torch
 
 from trainer.captures.bench_file import Bench, Camera, Channel, Iris, Panel
+from trainer.captures.camera_noise import noise_variance
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.capture_writer import CaptureWriter
 from trainer.captures.patterns import choose_patterns
@@ -21,7 +20,7 @@ from trainer.prediction.predict import counts, light_on_camera, trace
 
 BRIGHTNESS = 0.13  # mean signal, share of full scale
 
-Given = Mapping[str, float | np.ndarray]
+ParameterValues = Mapping[str, float | np.ndarray]
 
 
 def small_bench(rows: int = 72, columns: int = 96) -> Bench:
@@ -30,7 +29,9 @@ def small_bench(rows: int = 72, columns: int = 96) -> Bench:
     return Bench("small", Panel(columns, rows, 8.0), (Channel("green", 520.0),), 6.0, Iris(), camera)
 
 
-def placed(effect: Effect, bench: Bench, values: Given, order: int | None = None) -> EffectInstance:
+def instance_with(
+    effect: Effect, bench: Bench, values: ParameterValues, order: int | None = None
+) -> EffectInstance:
     """The effect with these values, at its lowest order or a stated one; parameters not named stay absent."""
     base = absent(effect, bench, order)
     given = {
@@ -48,10 +49,10 @@ def change_when_absent(effect: Effect) -> float:
     return float((with_it - without).abs().max() / without.max())
 
 
-def slopes(effect: Effect, values: Given) -> dict[str, float]:
+def slopes(effect: Effect, values: ParameterValues) -> dict[str, float]:
     """Size of a prediction's derivative by each parameter at these values, by automatic differentiation."""
     bench = small_bench()
-    model = Model(bench).having(placed(effect, bench, values))
+    model = Model(bench).having(instance_with(effect, bench, values))
     tensors = {
         n: torch.tensor(v, dtype=torch.float32, requires_grad=True)
         for n, v in model.present[0].values.items()
@@ -67,20 +68,37 @@ def slopes(effect: Effect, values: Given) -> dict[str, float]:
 def captures_with(
     folder: Path,
     effect: Effect,
-    values: Given,
+    values: ParameterValues,
     patterns: int = 6,
     seed: int = 0,
     order: int | None = None,
 ) -> CaptureSet:
-    """Writes and reads a capture set of the small bench with the effect hidden in it and camera noise."""
+    """Write and read a capture set of the small bench, with the effect hidden in it and camera noise.
+
+    Parameters
+    ----------
+    folder : Path
+        Where the set is written; new or empty.
+    effect : Effect
+    values : mapping of str to float or array
+        Of the effect's parameters; those that are not named stay absent.
+    patterns : int
+    seed : int
+        Of the patterns and the noise.
+    order : int, optional
+        The effect's; by default its lowest.
+
+    Returns
+    -------
+    CaptureSet
+    """
     bench = small_bench()
-    model = Model(bench).having(placed(effect, bench, values, order))
+    model = Model(bench).having(instance_with(effect, bench, values, order))
     rng = np.random.default_rng(seed)
-    blank = CaptureSet(folder, bench, ())
     with CaptureWriter(folder, bench) as writer, torch.no_grad():
         for number, pattern in enumerate(choose_patterns(bench, "green", bench.distance_mm, patterns, seed)):
             signal = _predict(model, model.present, gray=pattern.gray)[0].double().numpy()
-            noisy = signal + np.sqrt(blank.noise_variance(signal)) * rng.standard_normal(signal.shape)
+            noisy = signal + np.sqrt(noise_variance(signal, bench.camera)) * rng.standard_normal(signal.shape)
             raw = np.clip(np.rint(noisy + bench.camera.black_level), 0, bench.camera.saturation)
             writer.add(pattern.gray, raw.astype(np.uint16), "green", pattern=f"{number:03d}")
     return read_captures(folder)

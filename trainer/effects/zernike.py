@@ -20,9 +20,25 @@ def zernike_count(order: int, without_defocus: bool = False) -> int:
 
 
 def zernike_maps(y: Tensor, x: Tensor, order: int, without_defocus: bool = False) -> Tensor:
-    """Zernike polynomials over coordinates in units of the pupil's radius, rms 1 on the disc: [count, ...].
+    """Zernike polynomials over coordinates, rms 1 on the disc.
 
-    Noll's normalisation (J. Opt. Soc. Am. 66, 207, 1976), ordered by n then m; sine terms have negative m.
+    Noll's normalisation, ordered by n, then m; sine terms have negative m.
+
+    Parameters
+    ----------
+    y, x : Tensor, pupil radii
+    order : int
+        Highest n.
+    without_defocus : bool
+        Leave out tilt and defocus.
+
+    Returns
+    -------
+    Tensor [count, ...]
+
+    References
+    ----------
+    Noll 1976.
     """
     y, x = torch.broadcast_tensors(y, x)
     radius2 = y**2 + x**2

@@ -7,7 +7,8 @@ from dataclasses import replace
 from typing import Any
 
 from trainer.captures.batches import load, load_batch
-from trainer.captures.capture_set import Capture, CaptureSet
+from trainer.captures.capture_set import CaptureSet
+from trainer.captures.capture_table import Capture
 from trainer.fitting.gauss_newton import fit
 from trainer.fitting.least_squares_gain import with_gain
 from trainer.fitting.predictor import Predictor

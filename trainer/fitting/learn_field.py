@@ -15,7 +15,8 @@ import numpy as np
 
 from runtime.excess import PredictionErrors
 from trainer.captures.batches import Batch, load
-from trainer.captures.capture_set import Capture, CaptureSet
+from trainer.captures.capture_set import CaptureSet
+from trainer.captures.capture_table import Capture
 from trainer.captures.held_out import FIT_CAPTURES, sample, split
 from trainer.fitting.free_form_maps import FreeFormBatch, FreeFormStage, Tensors, descend
 from trainer.fitting.gains import with_gains

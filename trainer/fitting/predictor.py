@@ -9,7 +9,8 @@ from torch import Tensor
 
 from runtime.excess import PredictionErrors, joined
 from trainer.captures.batches import Batch, load_batch
-from trainer.captures.capture_set import Capture, CaptureSet
+from trainer.captures.capture_set import CaptureSet
+from trainer.captures.capture_table import Capture
 from trainer.model.model import Model
 from trainer.model.model_stages import scene_for, stages_of
 from trainer.prediction.predict import Trace, counts, light_on_camera, trace

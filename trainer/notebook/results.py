@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from trainer.captures.capture_set import CaptureSet
-from trainer.captures.check_set import Problem
+from trainer.captures.problems import Problem
 from trainer.diagnosis.compare import Comparison
 from trainer.diagnosis.compare import compare as compare_model
 from trainer.diagnosis.diagnose import Diagnosis

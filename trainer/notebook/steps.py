@@ -14,7 +14,8 @@ from typing import Any
 from firmware_iface.errors import InputError
 from runtime.program.progress import Progress
 from trainer.captures.capture_set import CaptureSet, read_captures
-from trainer.captures.check_set import MISREAD, check_captures
+from trainer.captures.check_set import check_captures
+from trainer.captures.problems import MISREAD
 from trainer.commands.inputs import origin
 from trainer.diagnosis.compare import compare as compare_model
 from trainer.diagnosis.diagnose import diagnose as diagnose_model
@@ -25,6 +26,7 @@ from trainer.fitting.pool import open_pool
 from trainer.model import model_file
 from trainer.model.export import export_bundle
 from trainer.model.model import Model
+from trainer.model.model_stages import ideal_irradiance
 from trainer.notebook.results import CheckResult, ComparisonResult, DiagnosisResult, ExplanationResult
 
 File = str | os.PathLike[str]
@@ -45,7 +47,7 @@ def check(captures: CaptureSet | File) -> CheckResult:
     folder = captures.folder if isinstance(captures, CaptureSet) else Path(captures)
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder: name a capture set, with bench.toml and captures.csv")
-    return CheckResult(folder, tuple(check_captures(folder)))
+    return CheckResult(folder, tuple(check_captures(folder, ideal_irradiance)))
 
 
 def compare(
@@ -252,6 +254,6 @@ def _inputs(
 
 def _refuse_misread(captures: CaptureSet) -> None:
     """Raise InputError where the captures are not what bench.toml says: every number would be wrong."""
-    for problem in check_captures(captures.folder):
+    for problem in check_captures(captures.folder, ideal_irradiance):
         if problem.severity == "error" and problem.kind in MISREAD:
             raise InputError(problem.message)

@@ -1,1 +1,1 @@
-"""What the camera would count: the four stages of light, scenes of one colour and plane, and the light path."""
+"""Predicted camera counts: the four stages of light, scenes of one colour and plane, and the light path."""

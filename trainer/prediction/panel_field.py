@@ -1,9 +1,9 @@
-"""The panel's learned field: what acts on the wave at the panel and has no name.
+"""The panel's learned field: what acts on the wave at the panel and is no named effect.
 
-A free complex map multiplies what leaves the panel, and another is added to it that no pattern modulates. Both are
-learned from captures through the physical model (`trainer.fitting.learn_field`); absent, they change nothing,
-exactly. A stripe, a speck of dust or a scratch is corrected there as a wave, which no network on irradiance can do, and
-the headset needs nothing new for it: the maps end in its source and leak.
+One free complex map multiplies what leaves the panel. Another is added to it, which no pattern modulates. Both are
+learned from captures through the physical model (`trainer.fitting.learn_field`). Absent, they change nothing at all. A
+stripe, a speck of dust or a scratch is corrected there as a wave; a network on irradiance cannot do that. The headset
+needs nothing new for it, because the maps become part of its source and leak.
 """
 
 from __future__ import annotations
@@ -21,11 +21,19 @@ NAME = "panel_field"
 
 
 def with_field(panel: Panel, maps: Mapping[str, Tensor]) -> Panel:
-    """The panel with a field, maps [m, n] of UNITS; coarser ones than the panel are interpolated.
+    """The panel with a learned field.
 
-    log_amplitude and phase are of the factor on all light, modulated or not; phase is at the first channel's
-    wavelength, one path difference for all colours. added_real and added_imaginary are shares of the ideal modulated
-    amplitude.
+    Parameters
+    ----------
+    panel : Panel
+    maps : mapping of str to Tensor [m, n]
+        One for each of UNITS; maps coarser than the panel are interpolated. `log_amplitude` and `phase` (rad) are
+        those of the factor on all light, modulated or not; `phase` is at the first channel's wavelength, one path
+        difference for all colours. `added_real` and `added_imaginary` are shares of the ideal modulated amplitude.
+
+    Returns
+    -------
+    Panel
     """
     shape = (panel.source.shape[-2], panel.source.shape[-1])
     log, phase, real, imaginary = (resized(maps[name], shape) for name in UNITS)
@@ -36,7 +44,17 @@ def with_field(panel: Panel, maps: Mapping[str, Tensor]) -> Panel:
 
 
 def combined(first: Mapping[str, np.ndarray], then: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The field that does what two do one after the other, at the first channel's wavelength."""
+    """The field that equals two fields, one after the other, at the first channel's wavelength.
+
+    Parameters
+    ----------
+    first, then : mapping of str to float array [m, n]
+        Maps as in `with_field`.
+
+    Returns
+    -------
+    dict of str to float array [m, n]
+    """
     factor = np.exp(then["log_amplitude"] + 1j * then["phase"])
     added = factor * (first["added_real"] + 1j * first["added_imaginary"])
     return {
@@ -48,7 +66,7 @@ def combined(first: Mapping[str, np.ndarray], then: Mapping[str, np.ndarray]) ->
 
 
 def resized(nodes: Tensor, shape: tuple[int, int]) -> Tensor:
-    """A map given by nodes [m, n], straight lines between them, on a grid of `shape` whose corners are nodes."""
+    """A map given by nodes [m, n], linearly interpolated on a grid of `shape` whose corners are nodes."""
     if tuple(nodes.shape) == shape:
         return nodes
     whole = torch.nn.functional.interpolate(nodes[None, None], shape, mode="bilinear", align_corners=True)

@@ -1,7 +1,7 @@
-"""What the camera would have counted, for a model and a set of patterns: the trainer's use of the light path.
+"""Predicted camera counts for a scene's stages and a set of patterns: the trainer's use of the light path.
 
-A prediction runs through three points at which it can be picked up again when only a later stage has changed: the
-panel's spectrum, irradiance, counts.
+A prediction has three results that can be used again when only a later stage has changed: the panel's spectrum,
+irradiance, counts.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from runtime.lightpath.propagation import (
 from trainer.prediction.scene import Scene, Stages, bare_stages
 from trainer.prediction.stages import Pupil, Sensor
 
-FINER = 2  # times as many samples for splines to pass through: exact up to half of the band that they hold
+FINER = 2  # times as many samples for the splines: exact up to half of the band that they hold
 
 
 def light_path(scene: Scene, stages: Stages) -> LightPath:
-    """The arrays that stand for drive, panel and pupil, ready for `runtime.lightpath.light_path`."""
+    """Drive, panel and pupil as arrays, ready for `runtime.lightpath.light_path`."""
     transfers, weights = pupil_modes(scene, stages.pupil)
     return LightPath(
         grid=scene.grid,
@@ -47,7 +47,10 @@ def light_path(scene: Scene, stages: Stages) -> LightPath:
 
 
 def _far_field(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
-    """Matrices from the band to the fine image grid, about the panel's axis. A laser's line is its centre here."""
+    """Matrices, rows and columns, from the band to the fine image grid, about the panel's axis.
+
+    A laser line is represented by its centre here.
+    """
     grid = scene.grid
     matrices = []
     for axis in (0, 1):
@@ -64,7 +67,7 @@ def _far_field(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
 
 
 def display_filter(stages: Stages) -> Tensor | None:
-    """The irradiance filter that the eye sees too: source extent and ghosts."""
+    """The irradiance filter that applies to the eye too: source extent and ghosts."""
     parts = [f for f in (stages.pupil.irradiance_filter, stages.sensor.irradiance_filter) if f is not None]
     if not parts:
         return None
@@ -77,7 +80,14 @@ def _bare_modes(scene: Scene) -> tuple[Tensor, Tensor]:
 
 
 def pupil_modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
-    """Transfer functions [M, n, m] and weights [M] of the pupil's modes; kept where no effect touches the pupil."""
+    """The pupil's modes; cached where no effect changes the pupil.
+
+    Returns
+    -------
+    transfers : complex Tensor [M, n, m]
+        Transfer functions.
+    weights : Tensor [M]
+    """
     return _bare_modes(scene) if pupil is bare_stages(scene).pupil else _modes(scene, pupil)
 
 
@@ -107,11 +117,16 @@ def _modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
 
 
 def iris_opening(scene: Scene, pupil: Pupil) -> Tensor:
-    """What the iris passes of each frequency, 0 .. 1.
+    """What the iris passes of each frequency.
 
-    A frequency sample passes by the share of its width that lies inside, so the iris's size and place have gradients
+    A frequency sample passes by the share of its width that lies inside. So the iris's size and place have gradients,
     and the result does not depend on the padding. The edge lies half a frequency sample of the doubled panel,
     1 / (4 N pitch), beyond the nominal one: a frequency on the edge passes.
+
+    Returns
+    -------
+    Tensor [n, m]
+        0 to 1.
     """
     panel = scene.bench.panel.shape
     beyond = [1 / (2 * n) for n in panel]  # share of the band
@@ -128,7 +143,15 @@ def iris_opening(scene: Scene, pupil: Pupil) -> Tensor:
 
 @dataclass(frozen=True)
 class Trace:
-    """Points of a prediction at which it can be picked up: the panel's spectrum, and irradiance before filters."""
+    """Results of a prediction that can be used again.
+
+    Attributes
+    ----------
+    spectrum : complex Tensor
+        The panel's.
+    image : Tensor
+        Irradiance before filters.
+    """
 
     spectrum: Tensor
     image: Tensor
@@ -137,7 +160,23 @@ class Trace:
 def trace(
     scene: Scene, stages: Stages, gray: Tensor, start: str = "drive", before: Trace | None = None
 ) -> Trace:
-    """Spectrum and irradiance of patterns [B, H, W], recomputed from stage `start` on; earlier ones from `before`."""
+    """Spectrum and irradiance of patterns.
+
+    Parameters
+    ----------
+    scene : Scene
+    stages : Stages
+    gray : int Tensor [B, H, W]
+        Gray levels of the patterns.
+    start : str
+        The first stage that has changed since `before`.
+    before : Trace, optional
+        What earlier stages gave.
+
+    Returns
+    -------
+    Trace
+    """
     if before is not None and start == "sensor":
         return before
     path = light_path(scene, stages)
@@ -149,7 +188,19 @@ def trace(
 
 
 def light_on_camera(scene: Scene, stages: Stages, image: Tensor) -> Tensor:
-    """Irradiance that camera pixels integrate [B, h, w], before gain, offset and response."""
+    """Irradiance that the camera's pixels integrate, before gain, offset and response.
+
+    Parameters
+    ----------
+    scene : Scene
+    stages : Stages
+    image : Tensor
+        Irradiance on the fine image grid, as in `Trace`.
+
+    Returns
+    -------
+    Tensor [B, h, w]
+    """
     grid, camera = scene.grid, scene.bench.camera
     sensor = stages.sensor
     transfer = _pixel_area(scene, sensor)
@@ -172,19 +223,32 @@ def light_on_camera(scene: Scene, stages: Stages, image: Tensor) -> Tensor:
 def counts(
     scene: Scene, stages: Stages, light: Tensor, gain: Tensor, measured: tuple[Tensor, Tensor] | None
 ) -> Tensor:
-    """Counts above black [B, h, w] for light on the camera; `gain` [B, 1, 1] is counts a unit of light.
+    """Counts above black for light on the camera.
 
-    `measured` (signal, weight) is what each capture's own gain is taken from where laser power drifts.
+    Parameters
+    ----------
+    scene : Scene
+    stages : Stages
+    light : Tensor [B, h, w]
+        As from `light_on_camera`.
+    gain : Tensor [B, 1, 1]
+        Counts for one unit of light.
+    measured : (Tensor, Tensor) or None
+        Signal and weight [B, h, w], from which each capture's own gain is computed where laser power drifts.
+
+    Returns
+    -------
+    Tensor [B, h, w], counts above black
     """
     sensor = stages.sensor
     signal = light * gain
     if sensor.gain is not None:
         signal = signal * sensor.gain
     if sensor.free_capture_gain and measured is not None:
-        seen, weight = measured
+        observed, weight = measured
         if sensor.offset is not None:
-            seen = seen - sensor.offset
-        own = (seen * signal * weight).sum((-2, -1)) / (signal**2 * weight).sum((-2, -1))
+            observed = observed - sensor.offset
+        own = (observed * signal * weight).sum((-2, -1)) / (signal**2 * weight).sum((-2, -1))
         signal = signal * own[:, None, None]
     if sensor.offset is not None:
         signal = signal + sensor.offset
@@ -195,7 +259,12 @@ def counts(
 
 @lru_cache(maxsize=32)
 def camera_positions(scene: Scene) -> tuple[Tensor, Tensor]:
-    """Where each camera pixel's centre looks, in panel pixels: (y, x), each [h, w]."""
+    """Where each camera pixel's centre looks.
+
+    Returns
+    -------
+    y, x : Tensor [h, w], panel pixels
+    """
     y, x = scene.bench.camera.looks_at()
     return torch.as_tensor(y, dtype=scene.dtype), torch.as_tensor(x, dtype=scene.dtype)
 

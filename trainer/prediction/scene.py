@@ -1,7 +1,7 @@
 """Scenes: one colour and one plane of a bench, and its four stages as the bench file has them.
 
 A `Scene` holds what is fixed for one colour and one plane; `Stages` are its drive, panel, pupil and sensor as effects
-see them. `trainer.model.model_stages` applies the effects of a model to them.
+receive them. `trainer.model.model_stages` applies the effects of a model to them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,20 @@ from trainer.prediction.stages import Drive, Panel, Pupil, Sensor
 
 @dataclass(frozen=True)
 class Scene:
-    """One colour and one plane of a bench: sizes, and coordinates as tensors of one precision."""
+    """One colour and one plane of a bench.
+
+    Attributes
+    ----------
+    bench : Bench
+    channel : str
+    plane_mm : float, mm
+        Panel to image plane.
+    method : str
+        Of propagation.
+    grid : Grid
+    dtype : torch.dtype
+        Of all real tensors of the scene.
+    """
 
     bench: Bench
     channel: str
@@ -49,7 +62,7 @@ def scene_at(
     Parameters
     ----------
     opened : float
-        Room for effects that open or move the iris, in units of what the bench says.
+        Room for effects that open or move the iris, as a factor on what the bench states.
 
     Raises
     ------

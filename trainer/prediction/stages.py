@@ -1,8 +1,8 @@
-"""The four stages that light meets, as the effects see them, before they are baked into a light path.
+"""The four stages of light, as effects change them, before they become a light path.
 
 Each stage is a small record of tensors for one colour and one plane. An effect replaces some of them
-(`dataclasses.replace`) or uses the stage's own short verbs. Lengths are metres inside; `y` and `x` run over
--1 .. 1 across the panel or the camera's picture, rows first.
+(`dataclasses.replace`) or uses the stage's own methods. Lengths are in metres here; `y` and `x` run over -1 .. 1 across
+the panel or the camera's picture, rows first.
 """
 
 from __future__ import annotations
@@ -16,10 +16,25 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Drive:
-    """What the panel makes of a gray level.
+    """From gray level to phase.
 
-    level [levels]: gray / levels, 0 .. 1. response [levels]: phase, rad. gain [H, W]: factor on the phase.
-    crosstalk: None, or (rows, columns) tap tables [sub-pixels, taps]. sign: +1, or -1 where more gray is less phase.
+    Attributes
+    ----------
+    channel : str
+    wavelength, reference_wavelength : float, m
+        The channel's, and the first channel's.
+    sign : int
+        1, or -1 where more gray means less phase.
+    y, x : Tensor [H, W]
+        -1 to 1 over the panel.
+    level : Tensor [levels]
+        gray / levels, 0 to 1.
+    response : Tensor [levels], rad
+        The phase of each level.
+    gain : Tensor [H, W] or None
+        Factor on the phase.
+    crosstalk : (Tensor, Tensor) or None
+        Tap tables of rows and columns, each [sub-pixels, taps].
     """
 
     channel: str
@@ -34,7 +49,7 @@ class Drive:
     crosstalk: tuple[Tensor, Tensor] | None = None
 
     def scaled(self, factor: Tensor) -> Drive:
-        """With the phase's gain multiplied by a map [H, W]."""
+        """The drive with the phase's gain multiplied by a map [H, W]."""
         return replace(self, gain=factor if self.gain is None else self.gain * factor)
 
 
@@ -42,8 +57,20 @@ class Drive:
 class Panel:
     """The field at the panel: what lights it, and what leaves it unmodulated.
 
-    source [H, W] complex. leak [H, W] complex or None. aperture: side of the active area, share of the pitch.
-    pitch: m.
+    Attributes
+    ----------
+    channel : str
+    wavelength, reference_wavelength : float, m
+        The channel's, and the first channel's.
+    pitch : float, m
+    y, x : Tensor [H, W]
+        -1 to 1 over the panel.
+    source : complex Tensor [H, W]
+        The field that lights the panel.
+    leak : complex Tensor [H, W] or None
+        The field that no pattern modulates.
+    aperture : Tensor [2]
+        Sides of a pixel's active area, share of the pitch.
     """
 
     channel: str
@@ -57,12 +84,12 @@ class Panel:
     aperture: Tensor
 
     def multiplied(self, factor: Tensor) -> Panel:
-        """With the modulated and the unmodulated light multiplied by a map [H, W], real or complex."""
+        """The panel with the modulated and the unmodulated light multiplied by a map [H, W], real or complex."""
         leak = None if self.leak is None else self.leak * factor
         return replace(self, source=self.source * factor, leak=leak)
 
     def leaking(self, field: Tensor) -> Panel:
-        """With a field [H, W] added that the pattern does not modulate."""
+        """The panel with a field [H, W] added that the pattern does not modulate."""
         return replace(self, leak=field if self.leak is None else self.leak + field)
 
 
@@ -70,10 +97,33 @@ class Panel:
 class Pupil:
     """The path from the panel to the image plane, over spatial frequency.
 
-    fy [n, 1], fx [1, m]: cycles/m. v, u: the same in units of the panel's band 1 / (2 pitch).
-    distance: m. half_width, centre (v, u): the iris, share of the band. path_difference [n, m]: m, the same for
-    every colour. transmission [n, m] complex. lines: offsets of the laser's lines (m) and their weights.
-    irradiance_filter: None, or a transfer function of irradiance over image frequencies (iy, ix), cycles/m.
+    Attributes
+    ----------
+    channel : str
+    wavelength, reference_wavelength : float, m
+        The channel's, and the first channel's.
+    pitch : float, m
+        The panel's.
+    fy, fx : Tensor [n, 1] and [1, m], cycles/m
+    v, u : Tensor [n, 1] and [1, m]
+        fy and fx in units of the panel's band 1 / (2 pitch).
+    iy, ix : Tensor, cycles/m
+        Frequencies of the image's irradiance, as a column and a row.
+    distance : Tensor, m
+        Panel to image plane.
+    half_width : Tensor
+        Of the iris, share of the band.
+    centre : (Tensor, Tensor)
+        Of the iris (v, u), share of the band.
+    shape : str
+        Of the iris, "square" or "circle".
+    path_difference : Tensor [n, m] or None, m
+        The same for every colour.
+    transmission : complex Tensor [n, m] or None
+    lines : (Tensor, Tensor) or None
+        Offsets of the laser's lines, m, and their weights.
+    irradiance_filter : Tensor or None
+        Transfer function of irradiance over (iy, ix).
     """
 
     channel: str
@@ -96,12 +146,12 @@ class Pupil:
     irradiance_filter: Tensor | None = None
 
     def delayed(self, path_difference: Tensor) -> Pupil:
-        """With a path difference [n, m] (m) added over the pupil."""
+        """The pupil with a path difference [n, m], m, added."""
         before = self.path_difference
         return replace(self, path_difference=path_difference if before is None else before + path_difference)
 
     def filtered(self, transfer: Tensor) -> Pupil:
-        """With irradiance filtered by a transfer function over (iy, ix)."""
+        """The pupil with irradiance filtered by a transfer function over (iy, ix)."""
         before = self.irradiance_filter
         return replace(self, irradiance_filter=transfer if before is None else before * transfer)
 
@@ -110,11 +160,26 @@ class Pupil:
 class Sensor:
     """From irradiance in the image plane to camera counts.
 
-    y, x [h, w]: -1 .. 1 over the picture. iy [n, 1], ix [1, m]: image frequencies, cycles/pixel of the panel.
-    irradiance_filter: transfer function of irradiance that the eye sees too (ghost). blur: the camera's own.
-    displacement: None, or (dy, dx) [h, w], camera pixels. gain, offset [h, w]: offset in counts.
-    response: None, or a function of the signal as a share of full scale. full_scale: counts.
-    free_capture_gain: each capture has its own gain.
+    Attributes
+    ----------
+    channel : str
+    full_scale : float, counts
+    y, x : Tensor [h, w]
+        -1 to 1 over the picture.
+    iy, ix : Tensor [n, 1] and [1, m], cycles/panel pixel
+        Image frequencies.
+    irradiance_filter : Tensor or None
+        Transfer function of irradiance that applies to the eye too (ghost).
+    blur : Tensor or None
+        Transfer function of the camera alone.
+    displacement : (Tensor, Tensor) or None, camera pixels
+        dy and dx, each [h, w].
+    gain : Tensor [h, w] or None
+    offset : Tensor [h, w] or None, counts
+    response : callable or None
+        A function of the signal as a share of full scale.
+    free_capture_gain : bool
+        Each capture has its own gain.
     """
 
     channel: str
@@ -132,29 +197,29 @@ class Sensor:
     free_capture_gain: bool = False
 
     def blurred(self, transfer: Tensor) -> Sensor:
-        """With the camera's picture filtered by a transfer function over (iy, ix)."""
+        """The sensor with the camera's picture filtered by a transfer function over (iy, ix)."""
         return replace(self, blur=transfer if self.blur is None else self.blur * transfer)
 
     def filtered(self, transfer: Tensor) -> Sensor:
-        """With irradiance itself filtered, for the camera and the eye."""
+        """The sensor with irradiance itself filtered, for the camera and the eye."""
         before = self.irradiance_filter
         return replace(self, irradiance_filter=transfer if before is None else before * transfer)
 
     def displaced(self, dy: Tensor, dx: Tensor) -> Sensor:
-        """With each camera pixel seeing what one (dy, dx) camera pixels further on should see."""
+        """The sensor with each pixel receiving the light of a place (dy, dx) camera pixels farther on."""
         if self.displacement is not None:
             dy, dx = dy + self.displacement[0], dx + self.displacement[1]
         return replace(self, displacement=torch.broadcast_tensors(dy, dx))
 
     def multiplied(self, factor: Tensor) -> Sensor:
-        """With the sensitivity multiplied by a map [h, w]."""
+        """The sensor with the sensitivity multiplied by a map [h, w]."""
         return replace(self, gain=factor if self.gain is None else self.gain * factor)
 
     def brightened(self, counts: Tensor) -> Sensor:
-        """With counts [h, w] added."""
+        """The sensor with counts [h, w] added."""
         return replace(self, offset=counts if self.offset is None else self.offset + counts)
 
     def responding(self, curve: Callable[[Tensor], Tensor]) -> Sensor:
-        """With a further response curve, of the signal as a share of full scale."""
+        """The sensor with a further response curve, of the signal as a share of full scale."""
         before = self.response
         return replace(self, response=curve if before is None else lambda share: curve(before(share)))

@@ -21,7 +21,8 @@ from firmware_iface.errors import InputError
 from runtime.lightpath.light_path import irradiance, panel_phase, pixel_irradiance
 from runtime.program.progress import Progress
 from trainer.captures.batches import Batch, load_batch
-from trainer.captures.capture_set import Capture, CaptureSet
+from trainer.captures.capture_set import CaptureSet
+from trainer.captures.capture_table import Capture
 from trainer.fitting.predictor import Predictor
 from trainer.model.export import acting_on_display
 from trainer.model.model import Model

@@ -1,6 +1,6 @@
 """Writes a file with a working effect to edit, and its test, for each of the four stages.
 
-The files beside this one are what is written, with `my_effect` in the place of the new name.
+The template files next to this one are what is written, with the new name in place of `my_effect`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ EXAMPLES: dict[str, dict[str, float]] = {
     "sensor": {"cosine": 0.12, "sine": -0.1, "period": 13.7, "angle": 33.0},
 }
 
-_USED = (
+_USED = (  # names that the files use themselves
     "annotations",
     "effect",
     "math",
@@ -33,15 +33,31 @@ _USED = (
     "replace",
     "torch",
     "waves",
-)  # names the files use themselves
+)
 
 
 def write_new_effect(name: str, stage: str, folder: Path, taken: Iterable[str] = ()) -> list[Path]:
-    """Writes NAME.py and test_NAME.py into a folder and returns their paths.
+    """Write NAME.py and test_NAME.py into a folder.
 
-    taken : names of effects that there are already
-    Raises InputError for a name that cannot be a function's or is taken, an unknown stage, or a file that is
-    there.
+    Parameters
+    ----------
+    name : str
+        Of the effect and its function.
+    stage : str
+        One of STAGES.
+    folder : Path
+    taken : iterable of str
+        Names of effects that exist already.
+
+    Returns
+    -------
+    list of Path
+        The two files.
+
+    Raises
+    ------
+    InputError
+        For a name that cannot be a function's or is taken, an unknown stage, or a file that exists already.
     """
     _check_name(name, list(taken))
     if stage not in STAGES:

@@ -1,6 +1,6 @@
-"""my_effect, an effect of the drive: what the panel makes of a gray level. It works as it is; edit it.
+"""my_effect, an effect of the drive: from gray level to phase. It works as it is; edit it.
 
-See it among the others:  hololoop-trainer effects --effects my_effect.py
+List it with the others:  hololoop-trainer effects --effects my_effect.py
 Look for it in captures:  hololoop-trainer diagnose CAPTURES --effects my_effect.py
 """
 
@@ -18,20 +18,20 @@ from trainer.effects import Drive, Parameter, effect, pull, waves
 
 
 def _starts(evidence: Sequence[Any]) -> list[dict[str, float]]:
-    """Where fits start: the ripples of the response that the residual asks for most."""
-    asked = pull(
+    """Where fits start: the ripples of the response to which the residual pulls most."""
+    pulled = pull(
         evidence, "drive", lambda drive, curve: replace(drive, response=drive.response + curve), (256,)
     )
     levels = float(evidence[0].scene.bench.panel.levels)
     return [
         {"cosine": 0.1 * w.cosine, "sine": 0.1 * w.sine, "cycles": w.frequency[0] * levels}
-        for w in waves(asked)
+        for w in waves(pulled)
     ]
 
 
 @effect(
     stage="drive",
-    # "display": the eye sees it too, so the headset makes up for it; "camera": only the camera does.
+    # "display": the eye sees it too, so the headset corrects for it; "camera": only the camera does.
     acts_on="display",
     # One Parameter for each argument, in the same order. `scale` is a small but visible change.
     parameters=[
@@ -50,7 +50,7 @@ def _starts(evidence: Sequence[Any]) -> list[dict[str, float]]:
             "cycles", "1", scale=0.1, absent=8, low=0.5, high=64, about="ripples in one wave of gray levels"
         ),
     ],
-    starts=_starts,  # leave it out where a fit from "absent" finds the way by itself
+    starts=_starts,  # leave it out where a fit from "absent" converges by itself
 )
 def my_effect(drive: Drive, cosine: Tensor, sine: Tensor, cycles: Tensor) -> Drive:
     """The display's look-up table is off by a ripple."""

@@ -1,4 +1,4 @@
-"""my_effect does what its file says. Run it with: pytest test_my_effect.py"""
+"""Tests of my_effect. Run them with: pytest test_my_effect.py"""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from trainer.model.model import Model
 
 EFFECT = load_effects(Path(__file__).with_name("my_effect.py"))[0]
 
-# What is hidden in a simulated bench: values at which the effect is easy to see. Edit them with the effect.
+# What is hidden in a simulated bench: values at which the effect is clearly visible. Edit them with the effect.
 HIDDEN = {"my_values": 0.0}
 
 

@@ -1,6 +1,6 @@
-"""my_effect, an effect of the panel: a fixed field, multiplied on or added. It works as it is; edit it.
+"""my_effect, an effect of the panel: a fixed field, a factor on the light or added to it. It works as it is; edit it.
 
-See it among the others:  hololoop-trainer effects --effects my_effect.py
+List it with the others:  hololoop-trainer effects --effects my_effect.py
 Look for it in captures:  hololoop-trainer diagnose CAPTURES --effects my_effect.py
 """
 
@@ -17,17 +17,18 @@ from trainer.effects import Panel, Parameter, effect, pull, waves
 
 
 def _starts(evidence: Sequence[Any]) -> list[dict[str, float]]:
-    """Where fits start: the stripes that the residual asks for most."""
+    """Where fits start: the stripes to which the residual pulls most."""
     columns = evidence[0].scene.bench.panel.width
-    asked = pull(evidence, "panel", lambda panel, row: panel.multiplied(1 + row[None, :]), (columns,))
+    pulled = pull(evidence, "panel", lambda panel, row: panel.multiplied(1 + row[None, :]), (columns,))
     return [
-        {"cosine": 0.05 * w.cosine, "sine": 0.05 * w.sine, "period": 1 / w.frequency[0]} for w in waves(asked)
+        {"cosine": 0.05 * w.cosine, "sine": 0.05 * w.sine, "period": 1 / w.frequency[0]}
+        for w in waves(pulled)
     ]
 
 
 @effect(
     stage="panel",
-    # "display": the eye sees it too, so the headset makes up for it; "camera": only the camera does.
+    # "display": the eye sees it too, so the headset corrects for it; "camera": only the camera does.
     acts_on="display",
     # One Parameter for each argument, in the same order. `scale` is a small but visible change.
     parameters=[
@@ -46,7 +47,7 @@ def _starts(evidence: Sequence[Any]) -> list[dict[str, float]]:
             "period", "pixels", scale=0.02, absent=16, low=2, high=2000, about="columns from stripe to stripe"
         ),
     ],
-    starts=_starts,  # leave it out where a fit from "absent" finds the way by itself
+    starts=_starts,  # leave it out where a fit from "absent" converges by itself
 )
 def my_effect(panel: Panel, cosine: Tensor, sine: Tensor, period: Tensor) -> Panel:
     """The panel's columns differ in amplitude by a regular stripe."""

@@ -1,6 +1,6 @@
 """my_effect, an effect of the pupil: what the path passes or delays. It works as it is; edit it.
 
-See it among the others:  hololoop-trainer effects --effects my_effect.py
+List it with the others:  hololoop-trainer effects --effects my_effect.py
 Look for it in captures:  hololoop-trainer diagnose CAPTURES --effects my_effect.py
 """
 
@@ -25,12 +25,12 @@ def _absorbing(pupil: Pupil, transmission: Tensor) -> Pupil:
 
 
 def _starts(evidence: Sequence[Any]) -> list[dict[str, float]]:
-    """Where fits start: the darkest row and the darkest column that the residual asks for."""
+    """Where fits start: the row and the column that the residual would darken most."""
     pupil = bare_stages(evidence[0].scene).pupil
     v, u = pupil.v.reshape(-1).numpy(), pupil.u.reshape(-1).numpy()
-    asked = pull(evidence, "pupil", lambda p, m: _absorbing(p, 1 + m), (v.size, u.size))
+    pulled = pull(evidence, "pupil", lambda p, m: _absorbing(p, 1 + m), (v.size, u.size))
     found = []
-    for profile, place, angle in ((asked.sum(1), v, 0.0), (asked.sum(0), u, 90.0)):
+    for profile, place, angle in ((pulled.sum(1), v, 0.0), (pulled.sum(0), u, 90.0)):
         reach = max(1, round(0.04 * place.size))
         smooth = np.convolve(profile, np.ones(reach), mode="same")
         smooth[np.abs(place) > 0.95] = 0
@@ -40,7 +40,7 @@ def _starts(evidence: Sequence[Any]) -> list[dict[str, float]]:
 
 @effect(
     stage="pupil",
-    # "display": the eye sees it too, so the headset makes up for it; "camera": only the camera does.
+    # "display": the eye sees it too, so the headset corrects for it; "camera": only the camera does.
     acts_on="display",
     # One Parameter for each argument, in the same order. `scale` is a small but visible change.
     parameters=[
@@ -57,7 +57,7 @@ def _starts(evidence: Sequence[Any]) -> list[dict[str, float]]:
             "width", "share of band", scale=0.01, absent=0.05, low=0.005, high=0.5, about="half width at 1/e"
         ),
     ],
-    starts=_starts,  # leave it out where a fit from "absent" finds the way by itself
+    starts=_starts,  # leave it out where a fit from "absent" converges by itself
 )
 def my_effect(pupil: Pupil, depth: Tensor, position: Tensor, angle: Tensor, width: Tensor) -> Pupil:
     """A thread across the pupil absorbs light."""

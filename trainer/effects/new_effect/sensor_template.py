@@ -1,6 +1,6 @@
 """my_effect, an effect of the sensor: from irradiance to counts. It works as it is; edit it.
 
-See it among the others:  hololoop-trainer effects --effects my_effect.py
+List it with the others:  hololoop-trainer effects --effects my_effect.py
 Look for it in captures:  hololoop-trainer diagnose CAPTURES --effects my_effect.py
 """
 
@@ -17,11 +17,11 @@ from trainer.effects import Parameter, Sensor, effect, pull, waves
 
 
 def _starts(evidence: Sequence[Any]) -> list[dict[str, float]]:
-    """Where fits start: the fringes that the residual asks for most."""
+    """Where fits start: the fringes to which the residual pulls most."""
     shape = evidence[0].scene.bench.camera.shape
-    asked = pull(evidence, "sensor", lambda sensor, gain: sensor.multiplied(1 + gain), shape)
+    pulled = pull(evidence, "sensor", lambda sensor, gain: sensor.multiplied(1 + gain), shape)
     found = []
-    for wave in waves(asked):
+    for wave in waves(pulled):
         fy, fx = wave.frequency
         period, angle = 1 / math.hypot(fy, fx), math.degrees(math.atan2(fy, fx))
         found.append(
@@ -32,7 +32,7 @@ def _starts(evidence: Sequence[Any]) -> list[dict[str, float]]:
 
 @effect(
     stage="sensor",
-    # "display": the eye sees it too, so the headset makes up for it; "camera": only the camera does.
+    # "display": the eye sees it too, so the headset corrects for it; "camera": only the camera does.
     acts_on="camera",
     # One Parameter for each argument, in the same order. `scale` is a small but visible change.
     parameters=[
@@ -57,7 +57,7 @@ def _starts(evidence: Sequence[Any]) -> list[dict[str, float]]:
             about="direction across the fringes; 0: along a row",
         ),
     ],
-    starts=_starts,  # leave it out where a fit from "absent" finds the way by itself
+    starts=_starts,  # leave it out where a fit from "absent" converges by itself
 )
 def my_effect(sensor: Sensor, cosine: Tensor, sine: Tensor, period: Tensor, angle: Tensor) -> Sensor:
     """Fringes lie over the picture, as from the camera's cover glass."""

@@ -1,0 +1,233 @@
+"""captures.csv, the table of a capture set: one row for each capture, read with everything that is wrong with it."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from pathlib import Path, PurePosixPath
+
+from trainer.captures.bench_file import Bench
+from trainer.captures.png_reader import reason
+
+REQUIRED = ("capture", "channel", "phase", "image")
+KNOWN = (*REQUIRED, "plane_mm", "pattern", "exposure_ms", "time_s")
+
+
+@dataclass(frozen=True)
+class Capture:
+    """One row of captures.csv.
+
+    Attributes
+    ----------
+    capture : str
+        Its id.
+    channel : str
+        Name of the bench's channel.
+    plane_mm : float, mm
+        Panel to image plane, as set on the bench.
+    pattern : str
+        Rows of one pattern show the same gray levels.
+    phase, image : Path
+        The panel's pattern and the camera's picture, absolute.
+    exposure_ms : float, ms
+    time_s : float, s
+        From the first capture; the row's number where the set does not give it.
+    extra : dict
+        The columns that this reader does not know, as text.
+    """
+
+    capture: str
+    channel: str
+    plane_mm: float
+    pattern: str
+    phase: Path
+    image: Path
+    exposure_ms: float = 1.0
+    time_s: float = 0.0
+    extra: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class RowFault:
+    """One thing that is wrong with captures.csv.
+
+    Attributes
+    ----------
+    kind : str
+        As in `trainer.captures.problems.Problem`.
+    capture : str
+        The capture's id; "" for the whole file.
+    message : str
+        One sentence.
+    """
+
+    kind: str
+    capture: str
+    message: str
+
+
+def scan_rows(folder: Path, bench: Bench) -> tuple[list[Capture], list[RowFault]]:
+    """All usable rows of a folder's captures.csv, and everything that is wrong with the file; never raises.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the capture set.
+    bench : Bench
+        Its channels and distance.
+
+    Returns
+    -------
+    list of Capture
+        The rows that can be used.
+    list of RowFault
+        A row with a fault that leaves no doubt about what was captured (a duplicate id) is in both lists.
+    """
+    path = folder / "captures.csv"
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        table = list(csv.reader(io.StringIO(text, newline=""), strict=True))
+    except OSError as error:
+        return [], [
+            RowFault(
+                "unreadable",
+                "",
+                f"{path} cannot be read ({error.strerror}): "
+                "a capture set needs a captures.csv with one row for each capture",
+            )
+        ]
+    except (UnicodeDecodeError, csv.Error) as error:
+        return [], [
+            RowFault(
+                "unreadable",
+                "",
+                f"{path} is not a comma-separated UTF-8 table ({reason(error)}): save it again as CSV, UTF-8",
+            )
+        ]
+    numbered = [(n, row) for n, row in enumerate(table, 1) if any(cell.strip() for cell in row)]
+    header = [cell.strip() for cell in numbered[0][1]] if numbered else []
+    fault = _header_fault(path, header, len(numbered))
+    if fault:
+        return [], [fault]
+    captures: list[Capture] = []
+    faults: list[RowFault] = []
+    ids: set[str] = set()
+    for number, row in numbered[1:]:
+        cells = dict(zip(header, (cell.strip() for cell in row), strict=False))
+        name = cells.get("capture", "")
+        where = f"captures.csv row {number} (capture {name})" if name else f"captures.csv row {number}"
+        if len(row) != len(header):
+            faults.append(
+                RowFault(
+                    "unreadable",
+                    name,
+                    f"{where} has {len(row)} cells, but the header has "
+                    f"{len(header)}: correct the row, with quotes around text with commas",
+                )
+            )
+            continue
+        capture, wrong = _row(folder, bench, cells, where, len(captures))
+        if name in ids:
+            wrong.insert(
+                0,
+                RowFault(
+                    "duplicate",
+                    name,
+                    f"{where} repeats the id of an earlier row: give every capture its own id",
+                ),
+            )
+        ids.add(name)
+        faults += wrong
+        if capture:
+            captures.append(capture)
+    return captures, faults
+
+
+def _header_fault(path: Path, header: list[str], rows: int) -> RowFault | None:
+    if not header:
+        return RowFault("unreadable", "", f"{path} is empty: give it the columns {', '.join(REQUIRED)}")
+    for column in REQUIRED:
+        if column not in header:
+            near = get_close_matches(column, header, 1)
+            hint = f"rename the column {near[0]!r}" if near else "add it"
+            if len(header) == 1 and (";" in header[0] or "\t" in header[0]):
+                hint = "separate the columns with commas"
+            return RowFault("unreadable", "", f"{path} has no column {column!r}: {hint}")
+    twice = [column for column in dict.fromkeys(header) if header.count(column) > 1]
+    if twice:
+        return RowFault("unreadable", "", f"{path} has two columns {twice[0]!r}: keep one")
+    if rows < 2:
+        return RowFault("too_few", "", f"{path} has no captures: add one row for each capture")
+    return None
+
+
+def _row(
+    folder: Path, bench: Bench, cells: dict[str, str], where: str, index: int
+) -> tuple[Capture | None, list[RowFault]]:
+    """The capture that a row of cells describes (None where it cannot be known), and the row's faults."""
+    faults: list[RowFault] = []
+    name = cells["capture"]
+
+    def fault(kind: str, message: str) -> None:
+        faults.append(RowFault(kind, name, f"{where}: {message}"))
+
+    def number(column: str, default: float, low: float, high: float, allowed: str) -> float:
+        text = cells.get(column, "")
+        if not text:
+            return default
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:
+            fault("not_a_number", f"{column} is {text[:40]!r}; write {allowed}")
+            return default
+        return value
+
+    for column in REQUIRED:
+        if not cells[column]:
+            fault("unreadable", f"{column} is empty; fill it in")
+    names = [c.name for c in bench.channels]
+    if cells["channel"] and cells["channel"] not in names:
+        near = get_close_matches(cells["channel"], names, 1)
+        fault(
+            "unknown_channel",
+            f"channel {cells['channel'][:40]!r} is not in bench.toml; "
+            + (
+                f"did you mean {near[0]!r}?"
+                if near
+                else f"use one of {', '.join(names)}, or add a [[channel]]"
+            ),
+        )
+    plane = number("plane_mm", bench.distance_mm, -1e4, 1e4, "a distance in mm, from -10000 to 10000")
+    exposure = number("exposure_ms", 1.0, 1e-6, 1e7, "an exposure in ms, above 0")
+    time = number("time_s", float(index), -1e9, 1e9, "a time in seconds")
+    files: list[Path] = []
+    for column in ("phase", "image"):
+        relative = PurePosixPath(cells[column].replace("\\", "/"))
+        if relative.is_absolute() or ".." in relative.parts or ":" in str(relative) or "\0" in str(relative):
+            fault(
+                "missing_file",
+                f"{column} {str(relative)[:80]!r} is not inside the set; "
+                "copy the file into the folder and give its path from there",
+            )
+            continue
+        files.append(folder / relative)
+        try:
+            there = files[-1].is_file()
+        except OSError:
+            there = False
+        if cells[column] and not there:
+            fault(
+                "missing_file",
+                f"{column} {str(relative)[:80]!r} is not there; put the file back or remove the row",
+            )
+    if faults:
+        return None, faults
+    extra = {column: text for column, text in cells.items() if column not in KNOWN}
+    return Capture(
+        name, cells["channel"], plane, cells.get("pattern") or name, files[0], files[1], exposure, time, extra
+    ), faults
