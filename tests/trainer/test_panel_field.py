@@ -29,7 +29,7 @@ from trainer.cycle.show_on_bench import BenchDisplay
 from trainer.cycle.target_pictures import photographs
 from trainer.diagnosis.error_budget import error_budget
 from trainer.effects.effect_catalogue import catalogue
-from trainer.fitting.learn_field import learn_field
+from trainer.fitting.learned_field import learn_field
 from trainer.model.export import export_bundle
 from trainer.model.model import Model, absent
 from trainer.model.model_file import read_model, write_model

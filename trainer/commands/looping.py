@@ -139,7 +139,7 @@ def show_loop(result: Result, args: Namespace, screen: Screen) -> None:
         names = ("psnr_db", "ssim", "one_minus_lpips")
         screen.table(("round", *names), [(one["round"], *(one["mean"][n] for n in names)) for one in rounds])
     else:
-        screen.say("LearnedField from recorded captures; nothing was shown.", style="bold")
+        screen.say("Learned from recorded captures; nothing was shown.", style="bold")
     for sentence in result["left_out"]:
         screen.say(f"\nLeft out: {sentence}.", style="yellow")
     screen.say(f"\nPatterns, captures and networks of each round are in {result['folder']}.")

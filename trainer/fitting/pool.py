@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-TASKS = "trainer.diagnosis.candidates"  # what workers run
+TASKS = "trainer.diagnosis.candidate_fits"  # what workers run
 ANSWER_S = 5.0  # a Dask scheduler that has not answered by then is not there
 LOST = (
     "a process that was fitting has removed, as when memory runs out: "

@@ -1,7 +1,7 @@
 """The panel's learned field: what acts on the wave at the panel and has no name.
 
 A free complex map multiplies what leaves the panel, and another is added to it that no pattern modulates. Both are
-learned from captures through the physical model (`trainer.fitting.learn_field`); absent, they change nothing,
+learned from captures through the physical model (`trainer.fitting.learned_field`); absent, they change nothing,
 exactly. A stripe, a speck of dust or a scratch is corrected there as a wave, which no network on irradiance can do, and
 the headset needs nothing new for it: the maps end in its source and leak.
 """
