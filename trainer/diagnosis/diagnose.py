@@ -1,4 +1,4 @@
-"""Which stage, which effect: what is missing from a model, ranked by what it explains on held-out captures."""
+"""The diagnosis of a model: which stage and which effect it lacks, judged on held-out captures."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ FITTED_FIRST = 5  # candidates fitted after the screen; all of them when none of
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What is missing from a model, how sure that is, and which captures would tell more.
+    """What is missing from a model, how sure that is, and which captures would say more.
 
     Attributes
     ----------
@@ -233,7 +233,7 @@ def probe_all(
 
 
 def suggest(roles: CaptureRoles, verdict: str, ranking: Sequence[RankedEffect]) -> list[str]:
-    """Captures that would tell more, most telling first."""
+    """Captures that would say more, the best first, as sentences."""
     suggestions: list[str] = []
     if verdict == "missing" and ranking[0].indistinguishable_from:
         alike = {r.effect.name: r.model for r in ranking}
@@ -244,6 +244,6 @@ def suggest(roles: CaptureRoles, verdict: str, ranking: Sequence[RankedEffect]) 
     patterns = [c.pattern for c in roles.captures.captures]
     if len(set(patterns)) == len(patterns):
         suggestions.append(
-            "one pattern captured twice: without a repeat the camera's noise is taken on trust"
+            "one pattern captured twice: without a repeat the camera's noise cannot be checked"
         )
     return list(dict.fromkeys(suggestions))

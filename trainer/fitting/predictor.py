@@ -54,13 +54,13 @@ class Predictor:
 
 
 def evaluate(model: Model, batches: Sequence[Batch]) -> PredictionErrors:
-    """PredictionErrors of a model, with the gains it has, on batches."""
+    """Errors of a model, with the gains it has, on batches."""
     with torch.no_grad():
         return joined([b.errors(Predictor(model, b).predict(model)) for b in batches])
 
 
 def evaluate_captures(captures: CaptureSet, rows: Sequence[Capture], model: Model) -> PredictionErrors:
-    """PredictionErrors of a model on captures, one in memory at a time."""
+    """Errors of a model on captures, one in memory at a time."""
     with torch.no_grad():
         parts = []
         for row in rows:
