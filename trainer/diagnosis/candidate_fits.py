@@ -15,7 +15,17 @@ from trainer.model.model import EffectInstance, Model
 
 @dataclass(frozen=True)
 class CandidateFit:
-    """A fitted candidate: the model with it, and its held-out errors."""
+    """A fitted candidate.
+
+    Attributes
+    ----------
+    effect : str
+        Name of the candidate.
+    model : Model
+        With the candidate in it.
+    held_out : PredictionErrors
+        Errors of `model` on the held-out captures.
+    """
 
     effect: str
     model: Model

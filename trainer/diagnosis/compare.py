@@ -32,7 +32,7 @@ Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
-class Picture:
+class CapturePicture:
     """One held-out capture, measured and predicted.
 
     Attributes
@@ -81,7 +81,7 @@ class Comparison:
     noise_from_repeats : float or None
         Measured noise variance over the expected one, from captures of the same pattern; None where no pattern is
         repeated.
-    pictures : tuple of Picture
+    pictures : tuple of CapturePicture
         A few of the captures, for the report.
     budget : ErrorBudget or None
         Where the ideal model's error goes; None where it was not computed, or there is no contrast.
@@ -97,7 +97,7 @@ class Comparison:
     frequency: list[dict[str, float]]
     brightness: list[dict[str, Any]]
     noise_from_repeats: float | None
-    pictures: tuple[Picture, ...] = ()
+    pictures: tuple[CapturePicture, ...] = ()
     budget: ErrorBudget | None = None
 
     def by_capture(self) -> list[dict[str, Any]]:
@@ -213,7 +213,7 @@ class _Sums:
         self.errors: list[PredictionErrors] = []
         self.gains: list[float | None] = []
         self.used: list[Capture] = []
-        self.pictures: list[Picture] = []
+        self.pictures: list[CapturePicture] = []
 
     def add(self, capture: Capture, model: Model) -> None:
         """Compare one capture; one without an unsaturated pixel is left out."""
@@ -234,7 +234,7 @@ class _Sums:
         if capture.capture in self.kept:
             numbers = summary(errors)
             self.pictures.append(
-                Picture(
+                CapturePicture(
                     capture.capture,
                     capture.channel,
                     capture.plane_mm,

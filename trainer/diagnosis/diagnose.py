@@ -81,11 +81,7 @@ class Diagnosis:
         if self.verdict == "complete":
             return f"Nothing is missing: what remains above the camera's noise is {left} of the signal's variance."
         if self.best is None:
-            where = (
-                f" The {self.stage} stage is where it sits."
-                if self.stage
-                else " No stage's probe shows where."
-            )
+            where = f" It is at the {self.stage} stage." if self.stage else " No stage's probe shows where."
             return f"Something is missing that the catalogue does not name (excess {left}).{where}"
         best = self.best
         size = describe(best.model.instance(best.effect.name), best.model.bench)

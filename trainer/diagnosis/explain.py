@@ -30,7 +30,17 @@ MOST_EFFECTS = 8  # an explanation longer than this explains nothing
 
 @dataclass(frozen=True)
 class Addition:
-    """A model before and after an effect was added, judged on held-out captures."""
+    """An effect that was added to a model.
+
+    Attributes
+    ----------
+    effect : str
+        Name of the effect.
+    model : Model
+        With the effect, and everything refitted.
+    before, after : PredictionErrors
+        On the held-out captures, without and with the effect.
+    """
 
     effect: str
     model: Model
@@ -124,7 +134,13 @@ def add(
     known: Catalogue | None = None,
     progress: Progress | None = None,
 ) -> Addition:
-    """Add one effect to a model and refit all that is in it; an effect that is already there is refitted."""
+    """Add one effect to a model and refit all of its effects; an effect that is already there is refitted.
+
+    Parameters
+    ----------
+    progress : callable, optional
+        Called with the share that is done and what is being done.
+    """
     report = progress or (lambda done, what: None)
     roles = capture_roles(captures)
     model = with_gains(captures, model, roles.fitted)

@@ -143,6 +143,11 @@ class BrightnessSums:
 
     Against the measured brightness even a perfect model would seem biased: pixels measured as bright are so
     partly by noise.
+
+    Attributes
+    ----------
+    full_scale : float, counts
+        Of the camera, above black.
     """
 
     full_scale: float

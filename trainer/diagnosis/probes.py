@@ -22,7 +22,7 @@ from runtime.lightpath.light_path import mode_irradiance, panel_phase, panel_spe
 from trainer.captures.batches import Batch, load, load_batch
 from trainer.captures.capture_set import Capture, chosen, opened
 from trainer.captures.held_out import scenes
-from trainer.fitting.free_form_maps import FreeFormBatch, FreeFormStage, Picture, Tensors, descend
+from trainer.fitting.free_form_maps import FreeFormBatch, FreeFormStage, MapPicture, Tensors, descend
 from trainer.model.model import Model
 from trainer.prediction.panel_field import UNITS, resized, with_field
 from trainer.prediction.predict import light_path
@@ -41,21 +41,38 @@ TAPS = 9  # of the sensor's free kernel, half a pixel apart
 
 @dataclass(frozen=True)
 class ProbeFit:
-    """A fitted probe: held-out errors with it, and its maps as pictures."""
+    """A fitted probe.
+
+    Attributes
+    ----------
+    stage : str
+    held_out : PredictionErrors
+        Errors with the probe on the held-out captures.
+    pictures : tuple of MapPicture
+        Its maps.
+    """
 
     stage: str
     held_out: PredictionErrors
-    pictures: tuple[Picture, ...]
+    pictures: tuple[MapPicture, ...]
 
 
 @dataclass(frozen=True)
 class ProbeResult:
-    """A probe judged against the model without it."""
+    """A probe judged against the model without it.
+
+    Attributes
+    ----------
+    removed : RemovedExcess
+        Held-out excess that the probe removes.
+    excess_after : float
+        Held-out excess with the probe.
+    """
 
     stage: str
     removed: RemovedExcess
     excess_after: float
-    pictures: tuple[Picture, ...]
+    pictures: tuple[MapPicture, ...]
 
     @classmethod
     def judged(cls, found: ProbeFit, before: PredictionErrors) -> ProbeResult:
@@ -76,7 +93,17 @@ class ProbeResult:
 def probe(
     folder: Path, ids: tuple[str, ...], held_ids: tuple[str, ...], model: Model, stage: str
 ) -> ProbeFit:
-    """Fit one stage's probe on some captures and judge it on others."""
+    """Fit one stage's probe on some captures and judge it on others.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the capture set.
+    ids, held_ids : tuple of str
+        Captures to fit, and captures to judge by.
+    model : Model
+        With fitted gains.
+    """
     captures = opened(folder)
     rows = chosen(captures, ids)
     last = {(c.channel, c.plane_mm): c for c in rows}.values()
@@ -116,7 +143,7 @@ def _drive(model: Model, batch: Batch) -> FreeFormStage:
             moved = replace(moved, crosstalk=(taps + t["rows"], taps + t["columns"]))
         return replace(stages, drive=moved)
 
-    def pictures(t: Tensors) -> list[Picture]:
+    def pictures(t: Tensors) -> list[MapPicture]:
         gain = legendre_surface(t["gain"], y, x)
         return [
             *((f"response, deviation ({c})", _array(t["table"][k]), "rad") for k, c in enumerate(channels)),
@@ -150,7 +177,7 @@ def _panel(model: Model, batch: Batch) -> FreeFormStage:
     def apply(stages: Stages, t: Tensors) -> Stages:
         return replace(stages, panel=with_field(stages.panel, t))
 
-    def pictures(t: Tensors) -> list[Picture]:
+    def pictures(t: Tensors) -> list[MapPicture]:
         added = torch.hypot(t["added_real"], t["added_imaginary"])
         return [
             ("amplitude multiplied", _array(torch.exp(t["log_amplitude"])), "relative"),
@@ -176,7 +203,7 @@ def _pupil(model: Model, batch: Batch) -> FreeFormStage:
         blur = torch.exp(-0.5 * reach * (rows * pupil.iy**2 + columns * pupil.ix**2))
         return replace(stages, pupil=moved.filtered(blur))
 
-    def pictures(t: Tensors) -> list[Picture]:
+    def pictures(t: Tensors) -> list[MapPicture]:
         return [
             ("amplitude passed, over spatial frequency", _array(torch.exp(t["log"])), "relative"),
             ("phase, over spatial frequency", _array(t["phase"]), "rad"),
@@ -219,7 +246,7 @@ def _sensor(model: Model, batch: Batch) -> FreeFormStage:
 
         return replace(stages, sensor=moved.responding(curve))
 
-    def pictures(t: Tensors) -> list[Picture]:
+    def pictures(t: Tensors) -> list[MapPicture]:
         shift = [legendre_surface(t["shift"][k], y, x, 0) for k in (0, 1)]
         share = torch.linspace(0, 1, 101)
         bend = share * (1 - share) * (t["bend"] @ legendre_curve(2 * share - 1, t["bend"].shape[0]))

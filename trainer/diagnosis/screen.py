@@ -56,7 +56,17 @@ class ScreenResult:
 def screen(
     folder: Path, ids: tuple[str, ...], model: Model, effects: tuple[Effect, ...]
 ) -> list[ScreenResult]:
-    """Screen effects on some captures, for a model with fitted gains."""
+    """Screen effects on some captures.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the capture set.
+    ids : tuple of str
+        Captures to screen on.
+    model : Model
+        With fitted gains.
+    """
     captures = opened(folder)
     batches = load(captures, chosen(captures, ids))
     with torch.no_grad():

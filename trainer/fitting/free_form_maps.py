@@ -21,7 +21,7 @@ from trainer.model.model import Model
 from trainer.prediction.predict import Trace, counts, light_on_camera, trace
 from trainer.prediction.scene import Scene, Stages
 
-Picture = tuple[str, np.ndarray, str]
+MapPicture = tuple[str, np.ndarray, str]  # title, values, unit
 Tensors = dict[str, Tensor]
 
 HISTORY = 10  # steps that L-BFGS keeps
@@ -52,7 +52,7 @@ class FreeFormStage:
     stage: str
     shapes: dict[str, tuple[tuple[int, ...], float]]
     apply: Callable[[Stages, Tensors], Stages]
-    pictures: Callable[[Tensors], list[Picture]]
+    pictures: Callable[[Tensors], list[MapPicture]]
     prior: Mapping[str, float] = field(default_factory=dict)
     irradiance: Callable[[Scene, Stages, Tensor, Tensors], Tensor] | None = None
 
