@@ -48,7 +48,7 @@ class Addition:
     after: PredictionErrors
 
     def as_json(self) -> dict[str, Any]:
-        """The object that `add --json` prints, less the model's path: keys `before`, `after` and `parameters`."""
+        """The object that `add --json` prints: keys `before`, `after` and `parameters`."""
         present = self.model.instance(self.effect)
         return {
             "before": self.before.as_json(),
@@ -58,7 +58,7 @@ class Addition:
 
 
 @dataclass(frozen=True)
-class Step:
+class ExplanationStep:
     """One step of an explanation.
 
     Attributes
@@ -106,7 +106,7 @@ class Explanation:
         One before each step, the last included.
     """
 
-    steps: tuple[Step, ...]
+    steps: tuple[ExplanationStep, ...]
     model: Model
     diagnosis: Diagnosis
     diagnoses: tuple[Diagnosis, ...] = field(default=())
@@ -197,7 +197,7 @@ def explain(
     model = recorded(model, None, errors)
     if save:
         save(model)
-    steps = [Step(None, errors)]
+    steps = [ExplanationStep(None, errors)]
     diagnoses: list[Diagnosis] = []
     while True:
         done = len(steps) - 1
@@ -217,14 +217,14 @@ def explain(
             break
         errors = after
         model = recorded(candidate, best.effect.name, errors)
-        steps.append(Step(best.effect.name, errors, best.indistinguishable_from))
+        steps.append(ExplanationStep(best.effect.name, errors, best.indistinguishable_from))
         if save:
             save(model)
         smaller = _without_unnecessary(roles, model, errors, best.effect.name, thresholds, ideal.excess)
         while smaller is not None:
             dropped, model, errors = smaller
             model = recorded(model, None, errors, dropped)
-            steps.append(Step(None, errors, removed=dropped))
+            steps.append(ExplanationStep(None, errors, removed=dropped))
             if save:
                 save(model)
             smaller = _without_unnecessary(roles, model, errors, best.effect.name, thresholds, ideal.excess)
