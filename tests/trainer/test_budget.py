@@ -1,4 +1,4 @@
-"""The error budget: its parts add up, and each defect is booked where it belongs."""
+"""The error budget: its parts add up, and each defect is counted where it belongs."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> CaptureSet:
     return captured(tmp_path_factory.mktemp("budget") / "captures")
 
 
-def test_what_has_no_name_is_booked_on_the_network(captures: CaptureSet) -> None:
+def test_what_has_no_name_is_counted_for_the_network(captures: CaptureSet) -> None:
     model = Model(captures.bench)
     heldout = compare(captures, model).as_json()["heldout"]
     alone = error_budget(captures, model)

@@ -59,10 +59,10 @@ def light(gray: np.ndarray, wavelength: float) -> np.ndarray:
     wide = np.zeros((2 * rows, 2 * columns), complex)
     place = np.ix_(np.rint(fy[:, 0] * rows).astype(int), np.rint(fx[0] * columns).astype(int))
     wide[place] = band
-    seen = np.abs(np.fft.ifft2(wide) * 4) ** 2
+    image = np.abs(np.fft.ifft2(wide) * 4) ** 2
     gy, gx = 2 * np.fft.fftfreq(2 * rows)[:, None], 2 * np.fft.fftfreq(2 * columns)[None]
-    seen = np.fft.ifft2(np.fft.fft2(seen) * np.sinc(gy) * np.sinc(gx)).real[::2, ::2]
-    return seen[HEIGHT // 2 : -HEIGHT // 2, WIDTH // 2 : -WIDTH // 2]
+    image = np.fft.ifft2(np.fft.fft2(image) * np.sinc(gy) * np.sinc(gx)).real[::2, ::2]
+    return image[HEIGHT // 2 : -HEIGHT // 2, WIDTH // 2 : -WIDTH // 2]
 
 
 Change = Callable[[np.ndarray, int], np.ndarray]
@@ -84,9 +84,9 @@ def make_set(
             irradiance = light(gray, WAVELENGTH[channel])
             for _ in range(2 if p < 2 else 1):
                 k = len(rows)
-                seen = change(irradiance, k) if change else irradiance
-                electrons = seen * COUNTS * WELL / (TOP - BLACK)
-                electrons = rng.poisson(np.maximum(electrons, 0)) + rng.normal(0, READ, seen.shape)
+                image = change(irradiance, k) if change else irradiance
+                electrons = image * COUNTS * WELL / (TOP - BLACK)
+                electrons = rng.poisson(np.maximum(electrons, 0)) + rng.normal(0, READ, image.shape)
                 counts = np.clip(np.rint(BLACK + electrons * (TOP - BLACK) / WELL), 0, TOP)
                 counts = finish(counts, k) if finish else counts
                 row = {"gray": gray, "counts": counts.astype(np.uint16), "channel": channel}
@@ -115,7 +115,7 @@ def test_a_right_model_ends_at_the_cameras_noise(result: Comparison) -> None:
     assert result.model.gain["green"] == pytest.approx(COUNTS / 10, rel=0.01)
 
 
-def test_json_has_the_contracts_keys_and_no_nan(result: Comparison) -> None:
+def test_json_has_its_documented_keys_and_no_nan(result: Comparison) -> None:
     found = result.as_json()
     json.dumps(found, allow_nan=False)
     assert {"heldout", "psnr_db", "by_channel", "by_capture", "where"} <= set(found)
@@ -131,9 +131,9 @@ def test_the_noise_floor_is_what_repeats_show(ideal: CaptureSet, result: Compari
     assert result.noise_from_repeats == pytest.approx(1, abs=0.03)
     pairs = [c for c in ideal.captures if c.pattern == "green-1"]
     first, second = (ideal.signal(c)[0].astype(float) for c in pairs)
-    seen = np.sqrt(np.var(first - second) / 2 / np.var(first))
+    measured = np.sqrt(np.var(first - second) / 2 / np.var(first))
     row = next(r for r in result.by_capture() if r["capture"] == pairs[0].capture)
-    assert row["noise_nrmse"] == pytest.approx(seen, rel=0.03)
+    assert row["noise_nrmse"] == pytest.approx(measured, rel=0.03)
 
 
 def test_psnr_is_against_the_cameras_full_scale(result: Comparison) -> None:
@@ -149,10 +149,10 @@ def test_spectra_of_noise_are_flat_and_agree_with_the_residual(result: Compariso
 
 
 def test_a_brighter_corner_shows_at_its_place_in_the_field(tmp_path: Path) -> None:
-    def corner(seen: np.ndarray, k: int) -> np.ndarray:
-        seen = seen.copy()
-        seen[-24:, :32] *= 1.5
-        return seen
+    def corner(image: np.ndarray, k: int) -> np.ndarray:
+        image = image.copy()
+        image[-24:, :32] *= 1.5
+        return image
 
     captures = make_set(tmp_path / "corner", change=corner)
     field = np.array(compare(captures, Model(captures.bench)).as_json()["where"]["field"])
@@ -163,13 +163,13 @@ def test_a_brighter_corner_shows_at_its_place_in_the_field(tmp_path: Path) -> No
 
 
 def test_the_mean_of_the_field_is_the_excess(tmp_path: Path) -> None:
-    captures = make_set(tmp_path / "gradient", change=lambda seen, k: seen * np.linspace(0.8, 1.2, WIDTH))
+    captures = make_set(tmp_path / "gradient", change=lambda image, k: image * np.linspace(0.8, 1.2, WIDTH))
     found = compare(captures, Model(captures.bench)).as_json()
     assert np.mean(found["where"]["field"]) == pytest.approx(found["heldout"]["excess"], rel=0.01)
 
 
 def test_a_drift_shows_over_time(tmp_path: Path) -> None:
-    captures = make_set(tmp_path / "drift", patterns=9, change=lambda seen, k: seen * (1 + 0.03 * k))
+    captures = make_set(tmp_path / "drift", patterns=9, change=lambda image, k: image * (1 + 0.03 * k))
     rows = compare(captures, Model(captures.bench)).as_json()["where"]["time"]
     gains, times = np.array([r["gain"] for r in rows]), np.array([r["time_s"] for r in rows])
     assert np.all(np.diff(times) > 0)
@@ -178,7 +178,7 @@ def test_a_drift_shows_over_time(tmp_path: Path) -> None:
 
 
 def test_missing_light_shows_as_a_bias_of_dark_pixels(tmp_path: Path) -> None:
-    captures = make_set(tmp_path / "veil", change=lambda seen, k: seen + 0.2)
+    captures = make_set(tmp_path / "veil", change=lambda image, k: image + 0.2)
     rows = compare(captures, Model(captures.bench)).as_json()["where"]["brightness"]
     assert rows[0]["bias"] == pytest.approx(0.2 * COUNTS, rel=0.2)
     assert np.all(np.diff([r["counts"] for r in rows]) > 0)
@@ -238,17 +238,17 @@ def test_the_gain_of_a_curved_response_is_fitted(ideal: CaptureSet) -> None:
 
 def test_one_capture_is_in_memory_at_a_time(ideal: CaptureSet, monkeypatch: pytest.MonkeyPatch) -> None:
     read = module.load_batch
-    asked: list[int] = []
+    sizes: list[int] = []
 
     def counting(captures: CaptureSet, rows: list) -> object:
-        asked.append(len(rows))
+        sizes.append(len(rows))
         return read(captures, rows)
 
     monkeypatch.setattr(module, "load_batch", counting)
-    told: list[float] = []
-    compare(ideal, Model(ideal.bench), progress=told.append)
-    assert set(asked) == {1} and len(asked) > 4
-    assert told == sorted(told) and told[-1] == 1
+    shares: list[float] = []
+    compare(ideal, Model(ideal.bench), progress=shares.append)
+    assert set(sizes) == {1} and len(sizes) > 4
+    assert shares == sorted(shares) and shares[-1] == 1
 
 
 def test_pictures_show_every_colour_first(result: Comparison) -> None:

@@ -44,11 +44,11 @@ def every_effect(colours: bool = False) -> tuple[EffectInstance, ...]:
 
 
 def trained_irradiance(model: Model, channel: str, plane: float) -> np.ndarray:
-    """What the trainer computes for the patterns, with the display effects that the model has."""
-    shown = replace(model, present=tuple(p for p in model.present if p.effect.acts_on == "display"))
-    scene = scene_for(shown, channel, plane)
+    """What the trainer computes for the patterns, with the model's effects that act on the display."""
+    exported = replace(model, present=tuple(p for p in model.present if p.effect.acts_on == "display"))
+    scene = scene_for(exported, channel, plane)
     with torch.no_grad():
-        path = light_path(scene, stages_for(scene, shown.present))
+        path = light_path(scene, stages_for(scene, exported.present))
         return irradiance(path, panel_phase(path, gray())).numpy()
 
 
@@ -71,11 +71,11 @@ def test_the_headset_computes_what_the_trainer_does(tmp_path: Path) -> None:
 
 def test_camera_effects_stay_out(tmp_path: Path) -> None:
     full = Model(bench(), every_effect())
-    told = export_bundle(full, None, tmp_path / "full")
-    shown = tuple(p for p in full.present if p.effect.name not in CAMERA)
-    export_bundle(replace(full, present=shown), None, tmp_path / "display")
-    assert told["effects_left_out"] == list(CAMERA)
-    assert told["effects"] == [p.effect.name for p in shown]
+    summary = export_bundle(full, None, tmp_path / "full")
+    exported = tuple(p for p in full.present if p.effect.name not in CAMERA)
+    export_bundle(replace(full, present=exported), None, tmp_path / "display")
+    assert summary["effects_left_out"] == list(CAMERA)
+    assert summary["effects"] == [p.effect.name for p in exported]
     names = ("full", "display")
     arrays = [read_bundle(tmp_path / n).arrays for n in names]
     assert arrays[0].keys() == arrays[1].keys()
@@ -117,10 +117,10 @@ def test_planes_come_from_the_captures_and_share_their_arrays(tmp_path: Path) ->
         (present("illumination", log_amplitude=0.1), present("zero_order", leak_real=0.1, fill_factor=0.9)),
         history=({"added": "", "nrmse": 0.5}, {"added": "zero_order", **errors}),
     )
-    told = export_bundle(model, captures, tmp_path / "b")
+    summary = export_bundle(model, captures, tmp_path / "b")
     bundle = read_bundle(tmp_path / "b")
-    assert told["planes_mm"] == bundle.description["planes_mm"] == [4.0, 6.0, 8.0]
-    assert told["heldout"] == bundle.provenance["heldout"] == errors
+    assert summary["planes_mm"] == bundle.description["planes_mm"] == [4.0, 6.0, 8.0]
+    assert summary["heldout"] == bundle.provenance["heldout"] == errors
     assert bundle.provenance["captures_sha256"] == captures.content_hash()
     kinds = [name.split(".")[0] for name in bundle.arrays]
     assert kinds.count("source") == kinds.count("leak") == kinds.count("response") == 1

@@ -101,8 +101,8 @@ def test_what_the_catalogue_does_not_name_is_placed_and_then_explained_by_a_user
     assert better["steps"][-1]["excess"] < 3e-4
 
 
-def test_a_ghost_beside_a_blur_is_found_by_fitting_both_together(tmp_path, capsys):
-    # Fitted alone, each takes up a part of the other, and then stands in its way.
+def test_a_ghost_with_a_blur_is_found_by_fitting_both_together(tmp_path, capsys):
+    # Fitted alone, each takes up a part of the other, and then hides it.
     blur = 'kind = "sensor_blur"\nsigma_x_px = 0.5'
     ghost = 'kind = "ghost"\nshare = 0.1\nshift_x_px = 6.5\nshift_y_px = -3'
     found = explained(capsys, captured(capsys, tmp_path, ghost, blur), tmp_path)
@@ -126,7 +126,7 @@ def test_specks_sit_on_the_panel(tmp_path, capsys):
     assert (found["verdict"], found["stage"]) == ("outside_catalogue", "panel")
 
 
-def test_source_and_blur_look_alike_at_one_plane_and_part_at_three(tmp_path, capsys):
+def test_source_and_blur_look_alike_at_one_plane_and_not_at_three(tmp_path, capsys):
     source = 'kind = "spatial_coherence"\nradius_mrad = 0.5'
     captures = captured(capsys, tmp_path, source)
     found = ran(capsys, "diagnose", captures, "--workers", 1)

@@ -1,4 +1,4 @@
-"""Model files: an exact round trip, strict reading, and nothing but InputError for whatever is in a file."""
+"""Model files: an exact round trip, strict reading, and nothing but InputError for anything else in a file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from trainer.model.model_file import read_model, write_model
 
 
 def curve(drive: Any, gain: Any, curvature: Any) -> Any:
-    """Stands for an effect; nothing here applies it."""
+    """Takes the place of an effect; nothing here applies it."""
     return drive
 
 
@@ -143,7 +143,7 @@ def long_effect(count: int = 200, per_channel: bool = False) -> Effect:
 
 
 @pytest.mark.parametrize("per_channel", [False, True])
-def test_long_arrays_lie_beside_the_file_under_a_hash(tmp_path: Path, per_channel: bool) -> None:
+def test_long_arrays_lie_next_to_the_file_under_a_hash(tmp_path: Path, per_channel: bool) -> None:
     on, effect = bench("red", "green"), long_effect(per_channel=per_channel)
     known = {**KNOWN, effect.name: effect}
     rng = np.random.default_rng(3)

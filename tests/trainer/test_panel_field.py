@@ -1,4 +1,4 @@
-"""The panel's learned field: absent at first, true to what is hidden there, and carried all the way to the headset."""
+"""The panel's learned field: without effect when absent, equal to what is hidden, and exported to the headset."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from runtime.lightpath.light_path import irradiance, panel_phase
 from tests.trainer.fringed_bench import SHAPE
 from tests.trainer.hidden import ran
 from trainer.captures.acquire import acquire_captures
+from trainer.captures.batches import load_batch
 from trainer.captures.bench_file import Bench
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.open_bench import nominal_bench
@@ -28,8 +29,9 @@ from trainer.cycle.phase_retrieval import retrieve
 from trainer.cycle.show_on_bench import BenchDisplay
 from trainer.cycle.target_pictures import photographs
 from trainer.diagnosis.error_budget import error_budget
+from trainer.diagnosis.separate import _difference
 from trainer.effects.effect_catalogue import catalogue
-from trainer.fitting.learn_field import learn_field
+from trainer.fitting.learned_field import learn_field
 from trainer.model.export import export_bundle
 from trainer.model.model import Model, absent
 from trainer.model.model_file import read_model, write_model
@@ -44,7 +46,7 @@ def headset(*kinds: str) -> VirtualHeadset:
     return VirtualHeadset(BenchDescription("panel", defects=defects).resized(*SHAPE, 6.0), seed=4)
 
 
-def taken(folder: Path, *kinds: str, patterns: int = 18) -> CaptureSet:
+def captured(folder: Path, *kinds: str, patterns: int = 18) -> CaptureSet:
     there = headset(*kinds)
     acquire_captures(there, nominal_bench(there), folder, patterns=patterns)
     return read_captures(folder)
@@ -58,10 +60,10 @@ def bumpy(bench: Bench, size: float = 0.1, seed: int = 0) -> dict[str, np.ndarra
 
 @pytest.fixture(scope="module")
 def striped(tmp_path_factory: pytest.TempPathFactory) -> CaptureSet:
-    return taken(tmp_path_factory.mktemp("striped") / "captures", "stripes")
+    return captured(tmp_path_factory.mktemp("striped") / "captures", "stripes")
 
 
-def seen(model: Model, gray: np.ndarray) -> torch.Tensor:
+def image_of(model: Model, gray: np.ndarray) -> torch.Tensor:
     scene = scene_for(model, "green", model.bench.distance_mm, torch.float64)
     return trace(scene, stages_of(scene, model), torch.as_tensor(gray.astype(np.int64))[None]).image[0]
 
@@ -71,7 +73,7 @@ def test_an_absent_field_changes_nothing_at_all() -> None:
     gray = np.random.default_rng(0).integers(0, 256, SHAPE)
     zero = {name: np.zeros(SHAPE, np.float32) for name in UNITS}
     plain = Model(bench)
-    assert torch.equal(seen(plain, gray), seen(replace(plain, panel_field=zero), gray))
+    assert torch.equal(image_of(plain, gray), image_of(replace(plain, panel_field=zero), gray))
 
 
 def test_light_has_the_slope_over_every_map_that_the_gradient_says() -> None:
@@ -83,7 +85,7 @@ def test_light_has_the_slope_over_every_map_that_the_gradient_says() -> None:
     gray = torch.as_tensor(rng.integers(0, 256, (1, *SHAPE)))
     weight = torch.as_tensor(rng.standard_normal(scene.grid.image_shape))
     maps = {n: torch.as_tensor(m, dtype=torch.float64) for n, m in bumpy(bench).items()}
-    way = {n: torch.as_tensor(m, dtype=torch.float64) for n, m in bumpy(bench, 1.0, 2).items()}
+    direction = {n: torch.as_tensor(m, dtype=torch.float64) for n, m in bumpy(bench, 1.0, 2).items()}
 
     def loss(at: dict[str, torch.Tensor]) -> torch.Tensor:
         moved = replace(stages, panel=with_field(stages.panel, at))
@@ -93,8 +95,8 @@ def test_light_has_the_slope_over_every_map_that_the_gradient_says() -> None:
         free = {n: m.clone().requires_grad_(n == name) for n, m in maps.items()}
         (gradient,) = torch.autograd.grad(loss(free), [free[name]])
         step = 1e-6
-        rise = [float(loss({**maps, name: maps[name] + s * step * way[name]})) for s in (1, -1)]
-        assert float((gradient * way[name]).sum()) == pytest.approx(
+        rise = [float(loss({**maps, name: maps[name] + s * step * direction[name]})) for s in (1, -1)]
+        assert float((gradient * direction[name]).sum()) == pytest.approx(
             (rise[0] - rise[1]) / (2 * step), rel=1e-5
         )
 
@@ -117,7 +119,7 @@ def test_what_is_hidden_on_the_panel_is_found(
     kind: str, error: float, striped: CaptureSet, tmp_path: Path
 ) -> None:
     """The learned factor against the bench's own, a number a pixel, up to one complex number."""
-    captures = striped if kind == "stripes" else taken(tmp_path / "captures", kind)
+    captures = striped if kind == "stripes" else captured(tmp_path / "captures", kind)
     found = learn_field(captures, Model(captures.bench))
     assert found.after.excess < 0.05 * found.before.excess
     field = found.model.panel_field
@@ -133,16 +135,26 @@ def test_what_is_hidden_on_the_panel_is_found(
 
 
 def test_where_nothing_is_hidden_nothing_gets_worse(tmp_path: Path) -> None:
-    captures = taken(tmp_path / "captures", patterns=9)
+    captures = captured(tmp_path / "captures", patterns=9)
     found = learn_field(captures, Model(captures.bench))
     assert found.after.excess < found.before.excess + 1e-4
 
 
-def test_the_budget_books_the_field_as_learned(striped: CaptureSet) -> None:
+def test_the_budget_counts_the_field_as_learned(striped: CaptureSet) -> None:
     model = learn_field(striped, Model(striped.bench)).model
     budget = error_budget(striped, model)
     assert budget.named_physics == pytest.approx(0, abs=1e-6)
     assert budget.network > 0.9 * (budget.ideal - budget.noise)
+
+
+def test_suggested_captures_take_account_of_the_field(striped: CaptureSet) -> None:
+    """Two models that differ in nothing but the field predict different captures; equal fields, equal ones."""
+    batch = load_batch(striped, striped.captures[:1])
+    plain = Model(striped.bench, gain={batch.channel: 1.0})
+    one, other = (replace(plain, panel_field=bumpy(striped.bench, seed=k)) for k in (6, 7))
+    assert _difference(one, one, batch) < 1e-9
+    assert _difference(plain, one, batch) > 1e-3
+    assert _difference(one, other, batch) > 1e-3
 
 
 def test_the_headset_gets_the_field_and_shows_better(striped: CaptureSet, tmp_path: Path) -> None:
@@ -150,17 +162,17 @@ def test_the_headset_gets_the_field_and_shows_better(striped: CaptureSet, tmp_pa
     from runtime.solver import quality
 
     model = learn_field(striped, Model(striped.bench)).model
-    told = export_bundle(model, striped, tmp_path / "bundle")
-    assert told["panel_field"] is True
+    summary = export_bundle(model, striped, tmp_path / "bundle")
+    assert summary["panel_field"] is True
     path = load_light_path(read_bundle(tmp_path / "bundle"))
     gray = np.random.default_rng(5).integers(0, 256, SHAPE)
-    theirs, ours = irradiance(path, panel_phase(path, gray)), seen(model, gray).numpy()
+    theirs, ours = irradiance(path, panel_phase(path, gray)), image_of(model, gray).numpy()
     assert np.abs(theirs - ours).max() < 2e-5 * ours.max()
-    wanted, shown = photographs(("astronaut",), striped.bench)[0], []
+    target, shown = photographs(("astronaut",), striped.bench)[0], []
     for one in (Model(striped.bench), model):
-        pattern = retrieve(one, wanted, "wirtinger", None, 100)[0]
+        pattern = retrieve(one, target, "wirtinger", None, 100)[0]
         light = headset("stripes").true_irradiance(pattern, "green", striped.bench.distance_mm)
-        shown.append(quality(light, wanted.irradiance[0, 0].astype(float)).psnr_db)
+        shown.append(quality(light, target.irradiance[0, 0].astype(float)).psnr_db)
     assert shown[1] > shown[0] + 3
 
 
@@ -170,8 +182,8 @@ def test_online_each_picture_has_its_own_field(striped: CaptureSet, tmp_path: Pa
     model = learn_field(striped, Model(striped.bench)).model
     display = BenchDisplay(there, striped.bench, Model(striped.bench))
     settings = CycleSettings(2, RECIPES["compact"], 0, iterations=60, good=2.0, online=True)
-    wanted = photographs(("astronaut",), striped.bench)
-    cycle = run_cycle(model, wanted, settings, tmp_path / "loop", display)
+    target = photographs(("astronaut",), striped.bench)
+    cycle = run_cycle(model, target, settings, tmp_path / "loop", display)
     psnr = [one["astronaut"].psnr_db for one in cycle.history]
     assert psnr[2] > psnr[0] + 0.5
     assert cycle.network is None and not cycle.own
@@ -187,11 +199,11 @@ def test_the_command_writes_a_model_that_others_take(
     striped: CaptureSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     model, run = tmp_path / "learned.toml", tmp_path / "run"
-    told = ran(capsys, "field", striped.folder, "--out", model)
-    assert told["after"]["excess"] < 0.1 * told["before"]["excess"]
-    assert set(told["maps"]) == {"log_amplitude", "phase_rad", "added_real", "added_imaginary"}
+    summary = ran(capsys, "field", striped.folder, "--out", model)
+    assert summary["after"]["excess"] < 0.1 * summary["before"]["excess"]
+    assert set(summary["maps"]) == {"log_amplitude", "phase_rad", "added_real", "added_imaginary"}
     compared = ran(capsys, "compare", striped.folder, "--model", model)
-    assert compared["heldout"]["excess"] == pytest.approx(told["after"]["excess"], abs=1e-6)
+    assert compared["heldout"]["excess"] == pytest.approx(summary["after"]["excess"], abs=1e-6)
     ran(capsys, "train", striped.folder, "--model", model, "--out", run, "--filters", 2, "--steps", 5)
     network = run / "network.safetensors"
     ran(capsys, "export", "--model", model, "--network", network, "--out", tmp_path / "bundle")

@@ -66,13 +66,13 @@ def few(known: Catalogue, own: Path) -> Catalogue:
 def test_one_process_and_two_give_the_same_numbers(captures: CaptureSet, own: Path) -> None:
     known = few(catalogue([own]), own)
     assert len(known) == 4
-    told: list[float] = []
+    shares: list[float] = []
     found = []
     for workers in (1, 2):
         with open_pool(workers) as running:
             assert running.workers == workers
             one = diagnose(
-                captures, Model(captures.bench), known, running, progress=lambda s, _: told.append(s)
+                captures, Model(captures.bench), known, running, progress=lambda s, _: shares.append(s)
             )
             found.append(one)
     assert found[0].best is not None
@@ -80,8 +80,8 @@ def test_one_process_and_two_give_the_same_numbers(captures: CaptureSet, own: Pa
     alone, together = (numbers(f.as_json()) for f in found)
     assert list(alone) == list(together)
     assert list(alone.values()) == pytest.approx(list(together.values()), rel=1e-3, abs=1e-7)
-    assert told[-1] == 1
-    assert all(0 <= share <= 1 for share in told)
+    assert shares[-1] == 1
+    assert all(0 <= share <= 1 for share in shares)
 
 
 def numbers(found: Any, where: str = "") -> dict[str, float]:
@@ -97,10 +97,10 @@ def numbers(found: Any, where: str = "") -> dict[str, float]:
 
 
 def test_results_come_in_the_order_of_the_tasks_and_errors_come_out() -> None:
-    told: list[int] = []
+    counts: list[int] = []
     with open_pool(1) as running:
-        assert running.map(pow, [(2, k) for k in range(5)], told.append) == [1, 2, 4, 8, 16]
-        assert told == [1, 2, 3, 4, 5]
+        assert running.map(pow, [(2, k) for k in range(5)], counts.append) == [1, 2, 4, 8, 16]
+        assert counts == [1, 2, 3, 4, 5]
         assert running.map(pow, []) == []
         with pytest.raises(ZeroDivisionError):
             running.map(divmod, [(1, 1), (1, 0)])
@@ -139,7 +139,7 @@ if __name__ == "__main__":
         ("ready", 0.5, "SIGKILL"),
     ],
 )
-def test_workers_stop_at_once_and_without_a_word(when: str, delay: float, which: str, tmp_path: Path) -> None:
+def test_workers_stop_at_once_and_silently(when: str, delay: float, which: str, tmp_path: Path) -> None:
     psutil = pytest.importorskip("psutil")
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)

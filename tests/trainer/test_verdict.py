@@ -20,7 +20,7 @@ Draw = Callable[[np.random.Generator, tuple[int, int]], np.ndarray]
 
 
 def errors(squared: np.ndarray, variance: float = 1.0) -> PredictionErrors:
-    """PredictionErrors of captures [K, tiles] whose signal has this variance, a capture, and no noise."""
+    """Errors of captures [K, tiles] whose signal has this variance, a capture, and no noise."""
     count = np.full(len(squared), float(squared.shape[1]))
     ids = tuple(f"{k:03d}" for k in range(len(squared)))
     return PredictionErrors(ids, np.asarray(squared, np.float64), 0 * count, 0 * count + variance, count)
@@ -44,8 +44,8 @@ def test_the_interval_of_a_difference_holds_its_mean_as_often_as_it_says(mean: f
     held = 0
     for _ in range(runs):
         after = rng.gamma(4.0, 1.0, shape)
-        gone = removed_excess(errors(after + draw(rng, shape), variance), errors(after, variance))
-        low, high = gone.interval()
+        removed = removed_excess(errors(after + draw(rng, shape), variance), errors(after, variance))
+        low, high = removed.interval()
         held += low <= true <= high
     assert 0.93 < held / runs < 0.97
 
@@ -53,20 +53,20 @@ def test_the_interval_of_a_difference_holds_its_mean_as_often_as_it_says(mean: f
 def test_a_difference_is_that_of_the_excesses_and_errors_shrink_with_captures() -> None:
     rng = np.random.default_rng(0)
     one, other = rng.gamma(4, 1, (3, 50)), rng.gamma(3, 1, (3, 50))
-    gone = removed_excess(errors(one, 9), errors(other, 9))
-    assert gone.value == pytest.approx(errors(one, 9).excess - errors(other, 9).excess)
-    assert removed_excess(errors(other, 9), errors(one, 9)).value == pytest.approx(-gone.value)
+    removed = removed_excess(errors(one, 9), errors(other, 9))
+    assert removed.value == pytest.approx(errors(one, 9).excess - errors(other, 9).excess)
+    assert removed_excess(errors(other, 9), errors(one, 9)).value == pytest.approx(-removed.value)
     assert removed_excess(errors(one), errors(one)).interval() == (0, 0)
     more = removed_excess(joined([errors(one, 9)] * 4), joined([errors(other, 9)] * 4))
-    assert more.value == pytest.approx(gone.value)
-    assert more.error == pytest.approx(gone.error / 2, rel=0.02)
+    assert more.value == pytest.approx(removed.value)
+    assert more.error == pytest.approx(removed.error / 2, rel=0.02)
 
 
 def test_intervals_widen_with_confidence_and_candidates() -> None:
-    gone = RemovedExcess(1.0, 0.1)
-    assert gone.interval() == pytest.approx((1 - 0.196, 1 + 0.196), abs=1e-4)
-    assert gone.interval(0.95, 20) == pytest.approx(gone.interval(1 - 0.05 / 20))
-    lows = [gone.interval(c, k)[0] for c, k in ((0.9, 1), (0.95, 1), (0.95, 2), (0.95, 18), (0.999, 18))]
+    removed = RemovedExcess(1.0, 0.1)
+    assert removed.interval() == pytest.approx((1 - 0.196, 1 + 0.196), abs=1e-4)
+    assert removed.interval(0.95, 20) == pytest.approx(removed.interval(1 - 0.05 / 20))
+    lows = [removed.interval(c, k)[0] for c, k in ((0.9, 1), (0.95, 1), (0.95, 2), (0.95, 18), (0.999, 18))]
     assert lows == sorted(lows, reverse=True)
 
 
@@ -86,7 +86,7 @@ CAPTURES = 5
 
 
 def noisy(rng: np.random.Generator, prediction: np.ndarray) -> Batch:
-    """Captures of a camera that sees just what is predicted [K, h, w], with shot and read noise."""
+    """Captures of a camera that measures exactly what is predicted [K, h, w], with shot and read noise."""
     variance = 0.4 * prediction + 4.0
     signal = rng.poisson(prediction / 0.4) * 0.4 + rng.normal(0, 2.0, prediction.shape)
     kinds = [torch.as_tensor(a, dtype=torch.float32) for a in (signal, np.ones_like(signal), variance)]
@@ -97,39 +97,41 @@ def noisy(rng: np.random.Generator, prediction: np.ndarray) -> Batch:
 
 
 def columns(rng: np.random.Generator, speckle: np.ndarray) -> list[np.ndarray]:
-    """What candidates would change in the pictures: smooth maps, the picture itself displaced, and chance."""
+    """What candidates would change in the pictures: smooth maps, the picture itself displaced, and noise."""
     y, x = np.mgrid[-1 : 1 : SHAPE[0] * 1j, -1 : 1 : SHAPE[1] * 1j]
     smooth = [speckle * m for m in (y, x, y * x, y**2, x**2, y**3)]
     displaced = [
         np.roll(speckle, s, (1, 2)) - speckle for s in ((0, 1), (1, 0), (0, 9), (5, 0), (3, 3), (9, -4))
     ]
-    chance = [rng.normal(size=speckle.shape) * speckle for _ in range(CANDIDATES - 12)]
-    return [*smooth, *displaced, *chance]
+    noise_maps = [rng.normal(size=speckle.shape) * speckle for _ in range(CANDIDATES - 12)]
+    return [*smooth, *displaced, *noise_maps]
 
 
-@pytest.mark.parametrize("fitted", [True, False], ids=["fitted to other captures", "a hair's breadth of it"])
+@pytest.mark.parametrize(
+    "fitted", [True, False], ids=["fitted to other captures", "a very small share of it"]
+)
 def test_noise_alone_is_not_worth_adding(fitted: bool) -> None:
     rng = np.random.default_rng(5)
     speckle = rng.gamma(2.0, 150.0, (CAPTURES, *SHAPE))
     prediction = torch.as_tensor(speckle, dtype=torch.float32)
-    tried = [torch.as_tensor(c, dtype=torch.float32) for c in columns(rng, speckle)]
-    assert len(tried) == CANDIDATES
+    candidates = [torch.as_tensor(c, dtype=torch.float32) for c in columns(rng, speckle)]
+    assert len(candidates) == CANDIDATES
     runs, found, matters = 250, 0, 0
     for _ in range(runs):
-        seen, held = noisy(rng, speckle), noisy(rng, speckle)
+        fitted_to, held = noisy(rng, speckle), noisy(rng, speckle)
         before = held.errors(prediction)
         assert abs(before.excess) < 1e-3
         real = []
-        for column in tried:
+        for column in candidates:
             if fitted:
-                size = float((column * (seen.signal - prediction)).sum() / (column**2).sum())
-            else:  # too small to do harm, so that only chance decides: the hardest case
+                size = float((column * (fitted_to.signal - prediction)).sum() / (column**2).sum())
+            else:  # too small to do harm, so that only noise_maps decides: the hardest case
                 size = 1e-4 * float(rng.choice([-1, 1]))
-            gone = removed_excess(before, held.errors(prediction + size * column))
-            real.append(REAL.worth_adding(gone, 0.0, CANDIDATES))
-            matters += Thresholds().worth_adding(gone, 1.0, CANDIDATES)
+            removed = removed_excess(before, held.errors(prediction + size * column))
+            real.append(REAL.worth_adding(removed, 0.0, CANDIDATES))
+            matters += Thresholds().worth_adding(removed, 1.0, CANDIDATES)
         found += any(real)
-    # At most half of the level, says the test's own account; three standard deviations of the count above it.
+    # At most half of the level, as `trainer.diagnosis.verdict` says; three standard deviations of the count above it.
     half = REAL.level / 2
     assert found / runs < half + 3 * math.sqrt(half / runs)
     assert matters == 0
@@ -187,7 +189,7 @@ def test_explanations_are_inseparable_where_their_difference_may_be_none() -> No
     assert t.inseparable(RemovedExcess(0.99e-4, 1e-9), 0.0)  # sure, but too little to choose by
     assert not t.inseparable(RemovedExcess(1e-4, 1e-9), 0.0)
     assert t.inseparable(RemovedExcess(-0.1, 0.001), 0.0)
-    # The level is one comparison's: 1.97 standard errors part two explanations, 1.95 do not.
+    # The level is that of one comparison: 1.97 standard errors separate two explanations, 1.95 do not.
     assert not t.inseparable(RemovedExcess(0.0197, 0.01), 0.0)
     assert t.inseparable(RemovedExcess(0.0195, 0.01), 0.0)
     # A fifth of what the better one leaves may be its own wrong shape.
@@ -196,9 +198,8 @@ def test_explanations_are_inseparable_where_their_difference_may_be_none() -> No
     assert not t.inseparable(RemovedExcess(0.01, 0.001), -1e-5)
 
 
-def test_thresholds_are_told_in_full() -> None:
-    told = Thresholds().as_json()
-    assert told == {
+def test_json_has_every_threshold() -> None:
+    assert Thresholds().as_json() == {
         "level": 0.05,
         "share": 0.02,
         "excess": 1e-4,

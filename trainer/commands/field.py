@@ -23,7 +23,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     """A field learned at the panel, in a model."""
     refuse_folder(args.out, "--out")
     captures, _, model = inputs_of(args)
-    from trainer.fitting.learn_field import learn_field
+    from trainer.fitting.learned_field import learn_field
     from trainer.model.model_file import write_model
 
     use_every_core()

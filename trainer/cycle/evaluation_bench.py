@@ -23,7 +23,7 @@ from trainer.cycle.phase_retrieval import retrieve
 from trainer.cycle.show_on_bench import BenchDisplay
 from trainer.cycle.target_pictures import HELD_OUT, LEARNED, TargetVolume, photographs
 from trainer.diagnosis.compare import with_gains
-from trainer.fitting.learn_field import with_learned_field
+from trainer.fitting.learned_field import with_learned_field
 from trainer.model.model import Model
 from trainer.networks.approximator import Approximator, read_approximator
 from trainer.training.pretrained_networks import PretrainedNetworks

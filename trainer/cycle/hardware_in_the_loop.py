@@ -31,7 +31,7 @@ from trainer.cycle.phase_retrieval import retrieve
 from trainer.cycle.show_on_bench import BenchDisplay, display_metrics, pairs_by_pattern, rows_of
 from trainer.cycle.target_pictures import TargetVolume
 from trainer.diagnosis.compare import with_gains
-from trainer.fitting.learn_field import with_refined_field
+from trainer.fitting.learned_field import with_refined_field
 from trainer.model.model import Model
 from trainer.model.model_file import write_model
 from trainer.networks.approximator import Approximator, write_approximator

@@ -1,4 +1,4 @@
-"""How far a model is from the captures that no fit saw, and where: `compare`.
+"""How far a model is from the held-out captures, and where: `compare`.
 
 One capture is in memory at a time. Saturated pixels are left out of every statistic.
 """
@@ -33,11 +33,19 @@ Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
-class Picture:
-    """One held-out capture: measured, predicted and difference (measured less predicted), float32 [h, w].
+class CapturePicture:
+    """One held-out capture, measured and predicted.
 
-    Counts above black; the difference is NaN where the capture is saturated.
-    excess, nrmse : of this capture, None where it has no contrast
+    Attributes
+    ----------
+    capture, channel : str
+        Names of the capture and of its colour.
+    plane_mm : float, mm
+    measured, predicted : float32 array [h, w], counts above black
+    difference : float32 array [h, w], counts
+        Measured less predicted; NaN where the capture is saturated.
+    excess, nrmse : float or None
+        Of this capture; None where it has no contrast.
     """
 
     capture: str
@@ -52,15 +60,32 @@ class Picture:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What `compare` found.
+    """The errors of a model on held-out captures, and where they are.
 
-    model : as it was compared, with its gains; captures : the held-out ones, in the order of `errors`
-    gains : least-squares factor from prediction to measurement, a capture (None where nothing was predicted)
-    psnr_db : 10 log10(peak^2 / mse) over all held-out pixels; the peak is the camera's full scale less black,
-        the mse holds the camera's noise, and there is no scale factor a picture
-    field, frequency, brightness : as in `as_json`; tile_px : side of a tile of `field`, pixels
-    noise_from_repeats : measured noise variance over the expected one, from captures of the same pattern;
-        None where there are none
+    Attributes
+    ----------
+    model : Model
+        As it was compared, with its gains.
+    captures : tuple of Capture
+        The held-out ones, in the order of `errors`.
+    gains : tuple of float or None
+        Least-squares factor from prediction to measurement, one a capture; None where nothing was predicted.
+    psnr_db : float or None, dB
+        10 log10(peak^2 / mse) over all held-out pixels. The peak is the camera's full scale less black, the mse
+        includes the camera's noise, and no picture has a scale factor of its own.
+    field : list of lists
+        Excess of each tile, [row][column]; None for a tile that is saturated in every capture.
+    tile_px : int, pixels
+        Side of a tile of `field`.
+    frequency, brightness : list of dict
+        Rows of `FrequencySums` and of `BrightnessSums`.
+    noise_from_repeats : float or None
+        Measured noise variance over the expected one, from captures of the same pattern; None where no pattern is
+        repeated.
+    pictures : tuple of CapturePicture
+        A few of the captures, for the report.
+    budget : ErrorBudget or None
+        Where the ideal model's error goes; None where it was not computed, or there is no contrast.
     """
 
     model: Model
@@ -73,9 +98,8 @@ class Comparison:
     frequency: list[dict[str, float]]
     brightness: list[dict[str, Any]]
     noise_from_repeats: float | None
-    pictures: tuple[Picture, ...] = ()
+    pictures: tuple[CapturePicture, ...] = ()
     budget: ErrorBudget | None = None
-    """Where the ideal model's error goes; None where nobody asked, or there is no contrast."""
 
     def by_capture(self) -> list[dict[str, Any]]:
         """One row a held-out capture, in the order of the set."""
@@ -91,7 +115,11 @@ class Comparison:
         ]
 
     def as_json(self) -> dict[str, Any]:
-        """The object that `compare --json` prints; None where there is no such number."""
+        """The object that `compare --json` prints; None where there is no such number.
+
+        Keys `heldout`, `psnr_db`, `by_channel`, `by_plane`, `by_capture`, `budget`, `noise_from_repeats` and `where`,
+        which has `field`, `tile_px`, `frequency`, `brightness` and `time`.
+        """
         rows = self.by_capture()
         order = sorted(range(len(rows)), key=lambda k: self.captures[k].time_s)
         channels = [c.channel for c in self.captures]
@@ -130,7 +158,7 @@ class Comparison:
 
 
 def summary(errors: PredictionErrors) -> dict[str, float | None]:
-    """nrmse, noise_nrmse and excess; None where the captures have no contrast to compare with."""
+    """Keys `nrmse`, `noise_nrmse` and `excess`; None where the captures have no contrast to compare with."""
     if not float(errors.variance.sum()) > 0:
         return {"nrmse": None, "noise_nrmse": None, "excess": None}
     return {**errors.as_json()}
@@ -141,23 +169,31 @@ def compare(captures: CaptureSet, model: Model, progress: Progress | None = None
 
     Effects are taken as they are. A channel without a gain gets one from the captures that `diagnose` fits,
     so that the numbers of both agree.
-    progress : called with the share that is done, 0 .. 1
-    Raises InputError where a picture cannot be read or every held-out picture is saturated.
+
+    Parameters
+    ----------
+    progress : callable, optional
+        Called with the share that is done, 0 .. 1.
+
+    Raises
+    ------
+    InputError
+        Where a picture cannot be read or every held-out picture is saturated.
     """
-    parts = split(captures)
-    wanted = {c.channel for c in parts.held_out} - set(model.gain)
-    for_gain = [c for c in capture_roles(captures).fitted if c.channel in wanted]
-    steps = len(for_gain) + len(parts.held_out)
+    divided = split(captures)
+    without_gain = {c.channel for c in divided.held_out} - set(model.gain)
+    for_gain = [c for c in capture_roles(captures).fitted if c.channel in without_gain]
+    steps = len(for_gain) + len(divided.held_out)
 
     def done(count: int) -> None:
         if progress:
             progress(min(count / steps, 1.0))
 
     with torch.no_grad():
-        if wanted:
+        if without_gain:
             model = with_gains(captures, model, for_gain, done)
-        sums = _Sums(captures, _shown(parts.held_out))
-        for count, capture in enumerate(parts.held_out, len(for_gain) + 1):
+        sums = _Sums(captures, _kept_pictures(divided.held_out))
+        for count, capture in enumerate(divided.held_out, len(for_gain) + 1):
             sums.add(capture, model)
             done(count)
     if not sums.used:
@@ -168,51 +204,51 @@ def compare(captures: CaptureSet, model: Model, progress: Progress | None = None
 
 
 class _Sums:
-    """What is gathered while the held-out captures pass by."""
+    """Sums over the held-out captures, and the pictures that are kept of them."""
 
-    def __init__(self, captures: CaptureSet, shown: set[str]) -> None:
-        self.set, self.shown = captures, shown
+    def __init__(self, captures: CaptureSet, kept: set[str]) -> None:
+        self.set, self.kept = captures, kept
         shape = captures.bench.camera.shape
         self.field, self.frequency = FieldSums(shape), FrequencySums(shape)
         self.brightness = BrightnessSums(captures.bench.camera.full_scale)
         self.errors: list[PredictionErrors] = []
         self.gains: list[float | None] = []
         self.used: list[Capture] = []
-        self.pictures: list[Picture] = []
+        self.pictures: list[CapturePicture] = []
 
     def add(self, capture: Capture, model: Model) -> None:
-        """Compare one capture; one without an unsaturated pixel says nothing and is left out."""
+        """Compare one capture; one without an unsaturated pixel is left out."""
         batch = load_batch(self.set, [capture])
         if not bool(batch.mask.any()):
             return
         prediction = Predictor(model, batch).predict(model)
         errors = batch.errors(prediction)
         tensors = (batch.signal, prediction, batch.noise, batch.mask)
-        seen = CaptureResidual(*(t[0].double().numpy() for t in tensors))
+        residual = CaptureResidual(*(t[0].double().numpy() for t in tensors))
         self.errors.append(errors)
         self.used.append(capture)
-        square = float((seen.weight * seen.predicted**2).sum())
-        product = float((seen.weight * seen.predicted * seen.measured).sum())
+        square = float((residual.mask * residual.predicted**2).sum())
+        product = float((residual.mask * residual.predicted * residual.measured).sum())
         self.gains.append(product / square if square > 0 else None)
         for sums in (self.field, self.frequency, self.brightness):
-            sums.add(seen)
-        if capture.capture in self.shown:
+            sums.add(residual)
+        if capture.capture in self.kept:
             numbers = summary(errors)
             self.pictures.append(
-                Picture(
+                CapturePicture(
                     capture.capture,
                     capture.channel,
                     capture.plane_mm,
-                    seen.measured.astype(np.float32),
-                    seen.predicted.astype(np.float32),
-                    np.where(seen.weight > 0, seen.residual, np.nan).astype(np.float32),
+                    residual.measured.astype(np.float32),
+                    residual.predicted.astype(np.float32),
+                    np.where(residual.mask > 0, residual.residual, np.nan).astype(np.float32),
                     numbers["excess"],
                     numbers["nrmse"],
                 )
             )
 
     def finish(self, captures: CaptureSet, model: Model) -> Comparison:
-        """Everything that was gathered."""
+        """The comparison that the sums give."""
         errors = joined(self.errors)
         pixels = float(errors.pixels.sum())
         mse = float(errors.squared.sum()) / pixels
@@ -232,7 +268,7 @@ class _Sums:
         )
 
 
-def _shown(held_out: Sequence[Capture]) -> set[str]:
+def _kept_pictures(held_out: Sequence[Capture]) -> set[str]:
     """Ids of the captures whose pictures are kept: one a colour, then one a plane, then others."""
     first: dict[str, Capture] = {}
     for c in held_out:

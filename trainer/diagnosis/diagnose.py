@@ -1,18 +1,18 @@
-"""Which stage, which effect: what is missing from a model, ranked by what it explains on held-out captures."""
+"""The diagnosis of a model: which stage and which effect it lacks, judged on held-out captures."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from runtime.excess import PredictionErrors, RemovedExcess, removed_excess
+from runtime.excess import PredictionErrors
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import CaptureRoles, capture_roles
-from trainer.diagnosis.candidates import CandidateFit, try_effect, try_together
 from trainer.diagnosis.probes import ProbeResult, probe
+from trainer.diagnosis.ranking import RankedEffect, rank, try_all, try_together_with_present
 from trainer.diagnosis.screen import ScreenResult, screen
 from trainer.diagnosis.separate import captures_that_separate
 from trainer.diagnosis.verdict import Thresholds, verdict_of
@@ -23,48 +23,34 @@ from trainer.fitting.pool import Pool
 from trainer.fitting.predictor import evaluate_captures
 from trainer.formatting import number
 from trainer.model.model import Model
-from trainer.model.parameters import describe, json_values
+from trainer.model.parameters import describe
 
 Progress = Callable[[float, str], None]
 
-FIRST_TRIED = 5  # candidates fitted after the screen; all of them when none of these explains anything
-TRIED_TOGETHER = 3  # candidates fitted with the present effects free, when none explains anything beside them
-
-
-@dataclass(frozen=True)
-class RankedEffect:
-    """A candidate in the ranking."""
-
-    effect: Effect
-    model: Model
-    held_out: PredictionErrors
-    removed: RemovedExcess
-    worth: bool
-    indistinguishable_from: tuple[str, ...] = ()
-
-    @property
-    def base(self) -> Model:
-        """The model without the candidate; other effects as they are beside it."""
-        return self.model.without(self.effect.name)
-
-    def as_json(self) -> dict[str, Any]:
-        """The contract's keys."""
-        low, high = self.removed.interval()
-        return {
-            "effect": self.effect.name,
-            "stage": self.effect.stage,
-            "excess_after": self.held_out.excess,
-            "excess_removed": self.removed.value,
-            "ci95": [low, high],
-            "worth_adding": self.worth,
-            "parameters": json_values(self.model.instance(self.effect.name), self.model.bench),
-            "indistinguishable_from": list(self.indistinguishable_from),
-        }
+FITTED_FIRST = 5  # candidates fitted after the screen; all of them when none of these explains anything
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What is missing, how sure that is, and what would tell more."""
+    """What is missing from a model, how sure that is, and which captures would say more.
+
+    Attributes
+    ----------
+    model : Model
+        As it was diagnosed, with its gains.
+    held_out : PredictionErrors
+        Its errors on the held-out captures.
+    ideal_excess : float
+        Held-out excess of the bench file's own model.
+    verdict : str
+        "complete", "missing" or "outside_catalogue".
+    stage : str or None
+        Where the missing physics is; None where the model is complete or no probe shows it.
+    ranking : tuple of RankedEffect
+        Fitted candidates, best first.
+    screened : tuple of ScreenResult
+        All candidates by what the screen expects of them, best first.
+    """
 
     model: Model
     held_out: PredictionErrors
@@ -80,7 +66,7 @@ class Diagnosis:
     @property
     def best(self) -> RankedEffect | None:
         """The effect to add, if one is worth adding."""
-        return self.ranking[0] if self.ranking and self.ranking[0].worth else None
+        return self.ranking[0] if self.ranking and self.ranking[0].worth_adding else None
 
     @property
     def probe_pictures(self) -> list[tuple[str, str, np.ndarray, str]]:
@@ -95,11 +81,7 @@ class Diagnosis:
         if self.verdict == "complete":
             return f"Nothing is missing: what remains above the camera's noise is {left} of the signal's variance."
         if self.best is None:
-            where = (
-                f" The {self.stage} stage is where it sits."
-                if self.stage
-                else " No stage's probe shows where."
-            )
+            where = f" It is at the {self.stage} stage." if self.stage else " No stage's probe shows where."
             return f"Something is missing that the catalogue does not name (excess {left}).{where}"
         best = self.best
         size = describe(best.model.instance(best.effect.name), best.model.bench)
@@ -111,7 +93,11 @@ class Diagnosis:
         return f"{best.effect.name} is missing ({size}): {gain}.{also}"
 
     def as_json(self) -> dict[str, Any]:
-        """The contract's keys, and the thresholds and the sentence."""
+        """The object that `diagnose --json` prints.
+
+        Keys `heldout`, `verdict`, `stage`, `stages`, `ranking`, `suggested_captures`, `ideal_excess`, `thresholds`,
+        `screen` and `sentence`.
+        """
         return {
             "heldout": self.held_out.as_json(),
             "verdict": self.verdict,
@@ -126,10 +112,10 @@ class Diagnosis:
         }
 
 
-def ideal_errors(parts: CaptureRoles, model: Model) -> PredictionErrors:
+def ideal_errors(roles: CaptureRoles, model: Model) -> PredictionErrors:
     """Held-out errors of the bench file's own model."""
-    ideal = with_gains(parts.captures, Model(model.bench, method=model.method), parts.fitted)
-    return evaluate_captures(parts.captures, parts.held_out, ideal)
+    ideal = with_gains(roles.captures, Model(model.bench, method=model.method), roles.fitted)
+    return evaluate_captures(roles.captures, roles.held_out, ideal)
 
 
 def diagnose(
@@ -144,46 +130,55 @@ def diagnose(
 ) -> Diagnosis:
     """What is missing from `model` on a capture set.
 
-    `ideal`: the ideal model's held-out errors, if they are known. `with_probes=False` leaves out what the verdict
-    does not need: the stages' free-form probes unless nothing named fits, and all of it for a complete model.
+    Parameters
+    ----------
+    known : Catalogue
+        Effects to try, by name; those in the model are left out.
+    progress : callable, optional
+        Called with the share that is done and what is being done.
+    ideal : PredictionErrors, optional
+        The ideal model's held-out errors, where they are known.
+    with_probes : bool
+        False leaves out what the verdict does not need: the stages' free-form probes unless nothing named fits, and
+        all of it for a complete model.
     """
     thresholds = thresholds or Thresholds()
-    say = progress or (lambda done, what: None)
-    parts = capture_roles(captures)
-    say(0.0, "comparing the model with held-out captures")
-    model = with_gains(captures, model, parts.fitted)
-    before = evaluate_captures(captures, parts.held_out, model)
-    ideal_excess = (ideal or (before if not model.present else ideal_errors(parts, model))).excess
+    report = progress or (lambda done, what: None)
+    roles = capture_roles(captures)
+    report(0.0, "comparing the model with held-out captures")
+    model = with_gains(captures, model, roles.fitted)
+    before = evaluate_captures(captures, roles.held_out, model)
+    ideal_excess = (ideal or (before if not model.present else ideal_errors(roles, model))).excess
     complete = thresholds.complete(before.excess, ideal_excess)
 
     if complete and not with_probes:
         return Diagnosis(model, before, ideal_excess, "complete", None, (), (), (), thresholds)
 
     candidates = [e for e in known.values() if e.name not in model.names]
-    screened = screen_all(parts, model, candidates, pool, say)
+    screened = screen_all(roles, model, candidates, pool, report)
     order = sorted(screened, key=lambda s: -s.removed_excess)
     promising = [
-        s for s in order[:FIRST_TRIED] if s.removed_excess > 0.05 * max(order[0].removed_excess, 1e-12)
+        s for s in order[:FITTED_FIRST] if s.removed_excess > 0.05 * max(order[0].removed_excess, 1e-12)
     ] or order[:1]
     # The screen says little of an effect whose derivatives do not reach, or that shows from capture to capture only.
     blind = [s for s in order if known[s.effect].rugged or known[s.effect].measure]
     first = promising + [s for s in blind if s not in promising]
-    tried = try_all(parts, model, before, first[:2] if complete else first, pool, say, 0.3, 0.6)
-    ranking = rank(before, tried, known, thresholds, ideal_excess, len(candidates))
-    if not complete and not any(r.worth for r in ranking):
-        rest = [s for s in order if s.effect not in {t.effect for t in tried}]
-        tried += try_all(parts, model, before, rest, pool, say, 0.5, 0.7)
-        ranking = rank(before, tried, known, thresholds, ideal_excess, len(candidates))
-        if model.present and not any(r.worth for r in ranking):
-            say(0.7, "fitting candidates and present effects together")
-            settled, together = try_together_with_present(parts, model, tried, pool)
-            jointly = rank(settled, together, known, thresholds, ideal_excess, len(candidates))
-            ranking = jointly + [r for r in ranking if r.effect.name not in {t.effect for t in together}]
-    verdict = verdict_of(complete, bool(ranking) and ranking[0].worth)
+    fits = try_all(roles, model, before, first[:2] if complete else first, pool, report, 0.3, 0.6)
+    ranking = rank(before, fits, known, thresholds, ideal_excess, len(candidates))
+    if not complete and not any(r.worth_adding for r in ranking):
+        rest = [s for s in order if s.effect not in {f.effect for f in fits}]
+        fits += try_all(roles, model, before, rest, pool, report, 0.5, 0.7)
+        ranking = rank(before, fits, known, thresholds, ideal_excess, len(candidates))
+        if model.present and not any(r.worth_adding for r in ranking):
+            report(0.7, "fitting candidates and present effects together")
+            without, together = try_together_with_present(roles, model, fits, pool)
+            jointly = rank(without, together, known, thresholds, ideal_excess, len(candidates))
+            ranking = jointly + [r for r in ranking if r.effect.name not in {f.effect for f in together}]
+    verdict = verdict_of(complete, bool(ranking) and ranking[0].worth_adding)
 
     probes: list[ProbeResult] = []
     if with_probes or verdict == "outside_catalogue":
-        probes = probe_all(parts, model, before, pool, say)
+        probes = probe_all(roles, model, before, pool, report)
     stage = None
     if verdict == "missing":
         stage = ranking[0].effect.stage
@@ -191,8 +186,8 @@ def diagnose(
         # A probe of a few thousand numbers that removes nothing on held-out captures points nowhere.
         telling = [p for p in probes if thresholds.worth_adding(p.removed, ideal_excess, len(probes))]
         stage = max(telling, key=lambda p: p.removed.value).stage if telling else None
-    suggestions = suggest(parts, verdict, ranking)
-    say(1.0, "done")
+    suggestions = suggest(roles, verdict, ranking)
+    report(1.0, "done")
     return Diagnosis(
         model,
         before,
@@ -208,150 +203,43 @@ def diagnose(
 
 
 def screen_all(
-    parts: CaptureRoles, model: Model, effects: Sequence[Effect], pool: Pool, say: Progress
+    roles: CaptureRoles, model: Model, effects: Sequence[Effect], pool: Pool, report: Progress
 ) -> list[ScreenResult]:
-    """Screen every effect, dealt out among the pool's workers."""
-    hands = min(pool.workers, len(effects)) or 1
-    ids = tuple(c.capture for c in parts.screened)
-    tasks = [(parts.folder, ids, model, tuple(effects[k::hands])) for k in range(hands)]
-    say(0.05, f"screening {len(effects)} effects")
-    dealt = pool.map(
-        screen, tasks, lambda n: say(0.05 + 0.25 * n / hands, f"screening {len(effects)} effects")
+    """Screen every effect, shared out among the pool's workers."""
+    shares = min(pool.workers, len(effects)) or 1
+    ids = tuple(c.capture for c in roles.screened)
+    tasks = [(roles.folder, ids, model, tuple(effects[k::shares])) for k in range(shares)]
+    report(0.05, f"screening {len(effects)} effects")
+    results = pool.map(
+        screen, tasks, lambda n: report(0.05 + 0.25 * n / shares, f"screening {len(effects)} effects")
     )
-    return [s for hand in dealt for s in hand]
-
-
-def try_all(
-    parts: CaptureRoles,
-    model: Model,
-    before: PredictionErrors,
-    screened: Sequence[ScreenResult],
-    pool: Pool,
-    say: Progress,
-    start: float,
-    end: float,
-) -> list[CandidateFit]:
-    """Fit candidates at their lowest order, then raise the order of those that do about as well as the best."""
-    ids = tuple(c.capture for c in parts.fitted)
-    held = tuple(c.capture for c in parts.held_out)
-
-    def told(n: int) -> None:
-        say(start + (end - start) * n / max(1, len(screened)), "fitting candidates")
-
-    tasks = [(parts.folder, ids, held, model, s.start, False) for s in screened]
-    tried = pool.map(try_effect, tasks, told)
-    if not tried:
-        return []
-    least, most = min(t.held_out.excess for t in tried), before.excess
-    again = [
-        k
-        for k, t in enumerate(tried)
-        if len(t.model.instance(t.effect).effect.orders) > 1
-        and most - t.held_out.excess > 0.3 * (most - least)
-    ]
-    tasks = [
-        (
-            parts.folder,
-            ids,
-            held,
-            _without_gain_of(tried[k].model, model),
-            tried[k].model.instance(tried[k].effect),
-            True,
-        )
-        for k in again
-    ]
-    for k, better in zip(
-        again, pool.map(try_effect, tasks, lambda n: say(end, "raising orders")), strict=True
-    ):
-        tried[k] = better
-    return tried
-
-
-def try_together_with_present(
-    parts: CaptureRoles, model: Model, tried: Sequence[CandidateFit], pool: Pool
-) -> tuple[PredictionErrors, list[CandidateFit]]:
-    """The candidates that came closest, with the present effects fitted beside them, and the errors without any.
-
-    An effect that was added alone may have taken up a part of one that is still missing, and stands in its way.
-    """
-    ids = tuple(c.capture for c in parts.fitted)
-    held = tuple(c.capture for c in parts.held_out)
-    nearest = sorted(tried, key=lambda t: t.held_out.excess)[:TRIED_TOGETHER]
-    tasks = [(parts.folder, ids, held, model, "")]
-    tasks += [(parts.folder, ids, held, t.model, t.effect) for t in nearest]
-    without, *together = pool.map(try_together, tasks)
-    return without.held_out, together
-
-
-def _without_gain_of(fitted: Model, model: Model) -> Model:
-    """The model before the candidate, with the gains that went with it."""
-    return replace(model, gain=fitted.gain)
-
-
-def rank(
-    before: PredictionErrors,
-    tried: Sequence[CandidateFit],
-    known: Catalogue,
-    thresholds: Thresholds,
-    ideal_excess: float,
-    candidates: int,
-) -> list[RankedEffect]:
-    """Candidates by excess removed, each with those that the captures cannot tell it from."""
-    complete = thresholds.complete(before.excess, ideal_excess)
-    ordered = sorted(tried, key=lambda t: t.held_out.excess)
-    ranked = []
-    for one in ordered:
-        removed = removed_excess(before, one.held_out)
-        worth = not complete and thresholds.worth_adding(removed, ideal_excess, candidates)
-        alike = tuple(
-            other.effect
-            for other in ordered
-            if other is not one
-            and worth
-            and _inseparable(one, other, before, thresholds, ideal_excess, candidates)
-        )
-        ranked.append(RankedEffect(known[one.effect], one.model, one.held_out, removed, worth, alike))
-    return ranked
-
-
-def _inseparable(
-    one: CandidateFit,
-    other: CandidateFit,
-    before: PredictionErrors,
-    thresholds: Thresholds,
-    ideal_excess: float,
-    candidates: int,
-) -> bool:
-    if not thresholds.worth_adding(removed_excess(before, other.held_out), ideal_excess, candidates):
-        return False
-    worse, better = (one, other) if one.held_out.excess > other.held_out.excess else (other, one)
-    return thresholds.inseparable(removed_excess(worse.held_out, better.held_out), better.held_out.excess)
+    return [one for share in results for one in share]
 
 
 def probe_all(
-    parts: CaptureRoles, model: Model, before: PredictionErrors, pool: Pool, say: Progress
+    roles: CaptureRoles, model: Model, before: PredictionErrors, pool: Pool, report: Progress
 ) -> list[ProbeResult]:
     """Fit each stage's free-form probe alone."""
-    ids = tuple(c.capture for c in parts.probed)
-    held = tuple(c.capture for c in parts.held_out)
-    tasks = [(parts.folder, ids, held, model, stage) for stage in STAGES]
-    say(0.7, "probing the stages")
-    found = pool.map(probe, tasks, lambda n: say(0.7 + 0.25 * n / len(tasks), "probing the stages"))
+    ids = tuple(c.capture for c in roles.probed)
+    held = tuple(c.capture for c in roles.held_out)
+    tasks = [(roles.folder, ids, held, model, stage) for stage in STAGES]
+    report(0.7, "probing the stages")
+    found = pool.map(probe, tasks, lambda n: report(0.7 + 0.25 * n / len(tasks), "probing the stages"))
     return [ProbeResult.judged(p, before) for p in found]
 
 
-def suggest(parts: CaptureRoles, verdict: str, ranking: Sequence[RankedEffect]) -> list[str]:
-    """Captures that would tell more, most telling first."""
+def suggest(roles: CaptureRoles, verdict: str, ranking: Sequence[RankedEffect]) -> list[str]:
+    """Captures that would say more, the best first, as sentences."""
     suggestions: list[str] = []
     if verdict == "missing" and ranking[0].indistinguishable_from:
         alike = {r.effect.name: r.model for r in ranking}
         for other in ranking[0].indistinguishable_from:
             suggestions += captures_that_separate(
-                parts, (ranking[0].effect.name, ranking[0].model), (other, alike[other])
+                roles, (ranking[0].effect.name, ranking[0].model), (other, alike[other])
             )
-    patterns = [c.pattern for c in parts.captures.captures]
+    patterns = [c.pattern for c in roles.captures.captures]
     if len(set(patterns)) == len(patterns):
         suggestions.append(
-            "one pattern captured twice: without a repeat the camera's noise is taken on trust"
+            "one pattern captured twice: without a repeat the camera's noise cannot be checked"
         )
     return list(dict.fromkeys(suggestions))

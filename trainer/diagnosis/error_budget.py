@@ -1,8 +1,8 @@
 """Where the error of a prediction goes: named physics, what was learned, the camera's noise, and what is left.
 
 All are shares of the measured signal's variance on held-out captures, and add up to the ideal model's mean squared
-error: what the named effects take from it, what the panel's learned field and the network take after them (both are
-booked as `network`), the noise that nothing can take, and the rest.
+error: what the named effects remove from it, what the panel's learned field and the network remove after them (both
+are counted as `network`), the camera's noise, and the rest.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from torch import Tensor
 
 from firmware_iface.errors import InputError
 from runtime.excess import PredictionErrors, joined
-from trainer.captures.batches import load_batch
+from trainer.captures.batches import Batch, load_batch
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import split
+from trainer.fitting.gains import with_gains
 from trainer.fitting.predictor import Predictor
 from trainer.model.model import Model
 from trainer.networks.approximator import Approximator
@@ -29,7 +30,17 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True)
 class ErrorBudget:
-    """Shares of the signal's variance; `named_physics` and `network` are negative where they make it worse."""
+    """Shares of the signal's variance.
+
+    Attributes
+    ----------
+    named_physics, network : float
+        What effects, and what the learned field and the network remove; negative where they make it worse.
+    noise : float
+        The camera's noise.
+    unexplained : float
+        What is left.
+    """
 
     named_physics: float
     network: float
@@ -38,7 +49,7 @@ class ErrorBudget:
 
     @property
     def ideal(self) -> float:
-        """The ideal model's mean squared error, of which the others are parts."""
+        """The ideal model's mean squared error, of which the others are divided."""
         return self.named_physics + self.network + self.noise + self.unexplained
 
 
@@ -47,20 +58,25 @@ def error_budget(
 ) -> ErrorBudget:
     """The budget on the held-out captures of a set.
 
-    model : of the bench, with its gains. network : trained on what the model leaves; None: none
-    Raises InputError where the network is of another panel or other colours, and where there is no contrast.
-    """
-    from trainer.fitting.gains import with_gains
+    Parameters
+    ----------
+    network : Approximator, optional
+        Trained on what the model leaves.
 
-    parts = split(captures)
+    Raises
+    ------
+    InputError
+        Where the network is of another panel or other colours, and where the captures have no contrast.
+    """
+    divided = split(captures)
     if network is not None:
         _check(network, captures)
-    ideal = with_gains(captures, Model(captures.bench, method=model.method), parts.fitted)
-    model = with_gains(captures, replace(model, gain={}), parts.fitted)
+    ideal = with_gains(captures, Model(captures.bench, method=model.method), divided.fitted)
+    model = with_gains(captures, replace(model, gain={}), divided.fitted)
     named = model
     if model.panel_field is not None:
-        named = with_gains(captures, replace(model, gain={}, panel_field=None), parts.fitted)
-    stacks = stacked(captures, parts.held_out)
+        named = with_gains(captures, replace(model, gain={}, panel_field=None), divided.fitted)
+    stacks = stacked(captures, divided.held_out)
     rows: list[tuple[PredictionErrors, PredictionErrors, PredictionErrors]] = []
     with torch.no_grad():
         for k, stack in enumerate(stacks):
@@ -89,7 +105,7 @@ def error_budget(
     )
 
 
-def _changes(model: Model, network: Approximator | None, batches: list) -> list[Tensor | None]:
+def _changes(model: Model, network: Approximator | None, batches: list[Batch | None]) -> list[Tensor | None]:
     """What the network adds to the irradiance of each colour of a picture, [H, W]; None without a network."""
     if network is None:
         return [None] * len(batches)

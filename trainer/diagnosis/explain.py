@@ -30,7 +30,17 @@ MOST_EFFECTS = 8  # an explanation longer than this explains nothing
 
 @dataclass(frozen=True)
 class Addition:
-    """A model before and after an effect was added, judged on held-out captures."""
+    """An effect that was added to a model.
+
+    Attributes
+    ----------
+    effect : str
+        Name of the effect.
+    model : Model
+        With the effect, and everything refitted.
+    before, after : PredictionErrors
+        On the held-out captures, without and with the effect.
+    """
 
     effect: str
     model: Model
@@ -38,7 +48,7 @@ class Addition:
     after: PredictionErrors
 
     def as_json(self) -> dict[str, Any]:
-        """The contract's keys."""
+        """The object that `add --json` prints: keys `before`, `after` and `parameters`."""
         present = self.model.instance(self.effect)
         return {
             "before": self.before.as_json(),
@@ -48,8 +58,20 @@ class Addition:
 
 
 @dataclass(frozen=True)
-class Step:
-    """A rung of the ladder: what was added (or removed again), and the held-out errors then."""
+class ExplanationStep:
+    """One step of an explanation.
+
+    Attributes
+    ----------
+    added : str or None
+        The effect that was added; None for the first model, and where one was taken out.
+    held_out : PredictionErrors
+        Errors of the model after the step.
+    indistinguishable_from : tuple of str
+        Effects that the captures cannot tell the added one from.
+    removed : str or None
+        The effect that was taken out.
+    """
 
     added: str | None
     held_out: PredictionErrors
@@ -57,7 +79,10 @@ class Step:
     removed: str | None = None
 
     def as_json(self) -> dict[str, Any]:
-        """The contract's keys; `removed` only where an effect turned out not to be needed."""
+        """A row of the key `steps` of `explain --json`.
+
+        Keys `added`, `nrmse`, `excess` and `indistinguishable_from`; `removed` only where an effect was taken out.
+        """
         record: dict[str, Any] = {
             "added": self.added,
             "nrmse": self.held_out.nrmse,
@@ -71,15 +96,26 @@ class Step:
 
 @dataclass(frozen=True)
 class Explanation:
-    """The ladder from the first model to the last, and the verdict on what remains."""
+    """The steps from the first model to the last, and the verdict on what remains.
 
-    steps: tuple[Step, ...]
+    Attributes
+    ----------
+    diagnosis : Diagnosis
+        Of the last model.
+    diagnoses : tuple of Diagnosis
+        One before each step, the last included.
+    """
+
+    steps: tuple[ExplanationStep, ...]
     model: Model
     diagnosis: Diagnosis
     diagnoses: tuple[Diagnosis, ...] = field(default=())
 
     def as_json(self, model_path: Path) -> dict[str, Any]:
-        """The contract's keys."""
+        """The object that `explain --json` prints.
+
+        Keys `steps`, `verdict`, `stage`, `noise_nrmse`, `model`, `sentence` and `suggested_captures`.
+        """
         return {
             "steps": [s.as_json() for s in self.steps],
             "verdict": self.diagnosis.verdict,
@@ -98,28 +134,34 @@ def add(
     known: Catalogue | None = None,
     progress: Progress | None = None,
 ) -> Addition:
-    """Add one effect to a model and refit all that is in it; an effect that is already there is refitted."""
-    say = progress or (lambda done, what: None)
-    parts = capture_roles(captures)
-    model = with_gains(captures, model, parts.fitted)
-    before = evaluate_captures(captures, parts.held_out, model)
-    say(0.1, f"finding where {effect.name} starts")
+    """Add one effect to a model and refit all of its effects; an effect that is already there is refitted.
+
+    Parameters
+    ----------
+    progress : callable, optional
+        Called with the share that is done and what is being done.
+    """
+    report = progress or (lambda done, what: None)
+    roles = capture_roles(captures)
+    model = with_gains(captures, model, roles.fitted)
+    before = evaluate_captures(captures, roles.held_out, model)
+    report(0.1, f"finding where {effect.name} starts")
     if effect.name in model.names:
         start = model.instance(effect.name)
     else:
-        screened: list[ScreenResult] = screen_batches(load(captures, parts.screened), model, (effect,))
+        screened: list[ScreenResult] = screen_batches(load(captures, roles.screened), model, (effect,))
         start = screened[0].start
-    say(0.3, f"fitting {effect.name}")
-    added = add_from(parts, model, start)
-    after = evaluate_captures(captures, parts.held_out, added)
+    report(0.3, f"fitting {effect.name}")
+    added = add_from(roles, model, start)
+    after = evaluate_captures(captures, roles.held_out, added)
     added = recorded(added, effect.name, after)
-    say(1.0, "done")
+    report(1.0, "done")
     return Addition(effect.name, added, before, after)
 
 
-def add_from(parts: CaptureRoles, model: Model, start: EffectInstance) -> Model:
+def add_from(roles: CaptureRoles, model: Model, start: EffectInstance) -> Model:
     """The model with an effect fitted from a start, its order raised, and everything present refitted together."""
-    batches = load(parts.captures, parts.fitted)
+    batches = load(roles.captures, roles.fitted)
     name = start.effect.name
     fitted = fit_from(model, start, batches)
     fitted = raise_order(fitted, name, batches, least_for_order)
@@ -137,70 +179,76 @@ def explain(
 ) -> Explanation:
     """Diagnose and add, again and again, until nothing more is worth adding.
 
-    `save` is called with every model that is better than the one before. Effects that a later one makes needless are
-    taken out again.
+    Effects that a later one makes unnecessary are taken out again.
+
+    Parameters
+    ----------
+    save : callable, optional
+        Called with every model that is better than the one before.
+    progress : callable, optional
+        Called with the share that is done and what is being done.
     """
     thresholds = thresholds or Thresholds()
-    say = progress or (lambda done, what: None)
-    parts = capture_roles(captures)
-    model = with_gains(captures, model, parts.fitted)
-    errors = evaluate_captures(captures, parts.held_out, model)
-    ideal = ideal_errors(parts, model) if model.present else errors
+    report = progress or (lambda done, what: None)
+    roles = capture_roles(captures)
+    model = with_gains(captures, model, roles.fitted)
+    errors = evaluate_captures(captures, roles.held_out, model)
+    ideal = ideal_errors(roles, model) if model.present else errors
     model = recorded(model, None, errors)
     if save:
         save(model)
-    steps = [Step(None, errors)]
+    steps = [ExplanationStep(None, errors)]
     diagnoses: list[Diagnosis] = []
     while True:
         done = len(steps) - 1
 
-        def told(share: float, what: str, done: int = done) -> None:
-            say(1 - 0.6**done * (1 - 0.4 * share), what)
+        def report_share(share: float, what: str, done: int = done) -> None:
+            report(1 - 0.6**done * (1 - 0.4 * share), what)
 
-        found = diagnose(captures, model, known, pool, thresholds, told, ideal, with_probes=False)
+        found = diagnose(captures, model, known, pool, thresholds, report_share, ideal, with_probes=False)
         diagnoses.append(found)
         best = found.best
         if best is None or len(model.names) >= MOST_EFFECTS:
             break
-        told(0.9, f"adding {best.effect.name}")
-        candidate = add_from(parts, best.base, best.model.instance(best.effect.name))
-        after = evaluate_captures(captures, parts.held_out, candidate)
+        report_share(0.9, f"adding {best.effect.name}")
+        candidate = add_from(roles, best.base, best.model.instance(best.effect.name))
+        after = evaluate_captures(captures, roles.held_out, candidate)
         if not thresholds.worth_adding(removed_excess(errors, after), ideal.excess, 1):
             break
         errors = after
         model = recorded(candidate, best.effect.name, errors)
-        steps.append(Step(best.effect.name, errors, best.indistinguishable_from))
+        steps.append(ExplanationStep(best.effect.name, errors, best.indistinguishable_from))
         if save:
             save(model)
-        slimmer = _without_needless(parts, model, errors, best.effect.name, thresholds, ideal.excess)
-        while slimmer is not None:
-            dropped, model, errors = slimmer
+        smaller = _without_unnecessary(roles, model, errors, best.effect.name, thresholds, ideal.excess)
+        while smaller is not None:
+            dropped, model, errors = smaller
             model = recorded(model, None, errors, dropped)
-            steps.append(Step(None, errors, removed=dropped))
+            steps.append(ExplanationStep(None, errors, removed=dropped))
             if save:
                 save(model)
-            slimmer = _without_needless(parts, model, errors, best.effect.name, thresholds, ideal.excess)
-    say(1.0, "done")
+            smaller = _without_unnecessary(roles, model, errors, best.effect.name, thresholds, ideal.excess)
+    report(1.0, "done")
     return Explanation(tuple(steps), model, diagnoses[-1], tuple(diagnoses))
 
 
-def _without_needless(
-    parts: CaptureRoles,
+def _without_unnecessary(
+    roles: CaptureRoles,
     model: Model,
     errors: PredictionErrors,
     newest: str,
     thresholds: Thresholds,
     ideal_excess: float,
 ) -> tuple[str, Model, PredictionErrors] | None:
-    """The model without an earlier effect that the newest has made needless, if there is one."""
+    """The model without an earlier effect that the newest has made unnecessary, if there is one."""
     for name in model.names:
         if name == newest:
             continue
         rest = model.without(name)
-        batches = load(parts.captures, parts.fitted)
+        batches = load(roles.captures, roles.fitted)
         unexplained = not thresholds.complete(errors.excess, ideal_excess)
         fitted = (settled(rest, batches) if unexplained else fit(rest, rest.names, batches)).model
-        without = evaluate_captures(parts.captures, parts.held_out, fitted)
+        without = evaluate_captures(roles.captures, roles.held_out, fitted)
         if not thresholds.worth_adding(removed_excess(without, errors), ideal_excess, 1):
             return name, fitted, without
     return None

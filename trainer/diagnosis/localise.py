@@ -1,7 +1,6 @@
 """Where in a set of captures a model is off: over the field, over spatial frequency, over brightness.
 
-Each class is fed one capture at a time and keeps sums alone. Saturated pixels (weight 0) are left out
-throughout. All arrays are [h, w], counts above black or counts^2.
+Each class takes one capture at a time and keeps only sums. Saturated pixels (mask 0) are left out throughout.
 """
 
 from __future__ import annotations
@@ -19,28 +18,33 @@ CELLS = 16  # tiles along the longer side of the picture
 RINGS = 0.025  # width of a ring of spatial frequencies, cycles/pixel
 STEPS = 20  # most steps of brightness
 FINE = 2048  # steps that sums are kept in before they are merged
-REACH = (-0.1, 1.4)  # predicted brightness that is told apart, share of full scale
+REACH = (-0.1, 1.4)  # predicted brightness that is resolved, share of full scale
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class CaptureResidual:
-    """One capture beside its prediction.
+    """One capture and its prediction.
 
-    measured, predicted : counts above black; noise : expected variance, counts^2
-    weight : 1, or 0 where saturated
+    Attributes
+    ----------
+    measured, predicted : float64 array [h, w], counts above black
+    noise : float64 array [h, w], counts^2
+        Expected variance of the camera's noise.
+    mask : float64 array [h, w]
+        1, or 0 where saturated.
     """
 
     measured: Array
     predicted: Array
     noise: Array
-    weight: Array
+    mask: Array
 
     @property
     def residual(self) -> Array:
         """Measured less predicted, counts; 0 where saturated."""
-        return (self.measured - self.predicted) * self.weight
+        return (self.measured - self.predicted) * self.mask
 
 
 class FieldSums:
@@ -52,10 +56,10 @@ class FieldSums:
         self._above = np.zeros(self.shape)
         self._pixels = np.zeros(self.shape)
 
-    def add(self, seen: CaptureResidual) -> None:
-        """Take one capture in."""
-        self._above += self._sums(seen.residual**2 - seen.noise * seen.weight)
-        self._pixels += self._sums(seen.weight)
+    def add(self, capture: CaptureResidual) -> None:
+        """Add one capture to the sums."""
+        self._above += self._sums(capture.residual**2 - capture.noise * capture.mask)
+        self._pixels += self._sums(capture.mask)
 
     def _sums(self, values: Array) -> Array:
         return tile_sums(values, self.tile)
@@ -63,8 +67,11 @@ class FieldSums:
     def excess(self, variance: float) -> list[list[float | None]]:
         """Excess of each tile, [row][column]; None for a tile that is saturated in every capture.
 
-        variance : of the measured signal over all captures, counts^2 a pixel. It is the same for every tile,
-        so that the mean of the tiles, weighted with their pixels, is the excess of the whole.
+        Parameters
+        ----------
+        variance : float, counts^2 a pixel
+            Of the measured signal over all captures. It is the same for every tile, so that the mean of the tiles,
+            weighted with their pixels, is the excess of the whole.
         """
         if variance <= 0:
             return [[None] * self.shape[1] for _ in range(self.shape[0])]
@@ -86,9 +93,9 @@ class FrequencySums:
         self._norm = float((self._window**2).sum())
         fy, fx = np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])[None, :]
         radius = np.hypot(fy, fx)
-        # The corners of the spectrum hold few frequencies: they go with the last whole ring.
+        # The corners of the spectrum hold few frequencies: they are counted with the last whole ring.
         self._ring = np.minimum(radius / RINGS, math.floor(math.sqrt(0.5) / RINGS) - 1).astype(np.int64)
-        # A half spectrum holds each frequency once but for the first column and, of an even width, the last.
+        # A half spectrum holds each frequency once except in the first column and, of an even width, the last.
         self._twice = np.full(radius.shape, 2.0)
         self._twice[:, 0] = 1.0
         if shape[1] % 2 == 0:
@@ -99,13 +106,13 @@ class FrequencySums:
         self._signal: Array = np.zeros(len(self._count))
         self._noise, self._captures = 0.0, 0
 
-    def add(self, seen: CaptureResidual) -> None:
-        """Take one capture in."""
-        pixels = seen.weight.sum()
-        mean = float((seen.measured * seen.weight).sum() / pixels) if pixels else 0.0
-        self._error = self._error + self._power(seen.residual)
-        self._signal = self._signal + self._power((seen.measured - mean) * seen.weight)
-        self._noise += float((self._window**2 * seen.weight * seen.noise).sum()) / self._norm
+    def add(self, capture: CaptureResidual) -> None:
+        """Add one capture to the sums."""
+        pixels = capture.mask.sum()
+        mean = float((capture.measured * capture.mask).sum() / pixels) if pixels else 0.0
+        self._error = self._error + self._power(capture.residual)
+        self._signal = self._signal + self._power((capture.measured - mean) * capture.mask)
+        self._noise += float((self._window**2 * capture.mask * capture.noise).sum()) / self._norm
         self._captures += 1
 
     def _power(self, values: Array) -> Array:
@@ -113,7 +120,10 @@ class FrequencySums:
         return np.asarray(np.bincount(self._ring.ravel(), power.ravel()), dtype=np.float64)
 
     def rows(self) -> list[dict[str, float]]:
-        """One row a ring: its mean cycles_per_pixel, and error (with the noise), noise, signal, counts^2."""
+        """One row a ring.
+
+        Keys `cycles_per_pixel` (the ring's mean), `error` (noise included), `noise` and `signal`, counts^2.
+        """
         captures = max(self._captures, 1)
         return [
             {
@@ -131,30 +141,35 @@ class FrequencySums:
 class BrightnessSums:
     """Error against the brightness that was predicted.
 
-    Against the measured brightness even a perfect model would seem biased: pixels that measured bright did so
-    in part by noise.
+    Against the measured brightness even a perfect model would seem biased: pixels measured as bright are so
+    partly by noise.
+
+    Attributes
+    ----------
+    full_scale : float, counts
+        Of the camera, above black.
     """
 
     full_scale: float
     _sums: Array = field(default_factory=lambda: np.zeros((5, FINE)))
 
-    def add(self, seen: CaptureResidual) -> None:
-        """Take one capture in."""
-        use = seen.weight > 0
-        predicted, residual = seen.predicted[use], seen.residual[use]
+    def add(self, capture: CaptureResidual) -> None:
+        """Add one capture to the sums."""
+        use = capture.mask > 0
+        predicted, residual = capture.predicted[use], capture.residual[use]
         low, high = REACH
         place = (predicted / self.full_scale - low) / (high - low) * FINE
         index = np.clip(place, 0, FINE - 1).astype(np.int64)
         for row, values in zip(
-            self._sums, (None, predicted, residual, residual**2, seen.noise[use]), strict=True
+            self._sums, (None, predicted, residual, residual**2, capture.noise[use]), strict=True
         ):
             row += np.bincount(index, values, minlength=FINE)
 
     def rows(self) -> list[dict[str, Any]]:
         """Steps of brightness, dark to bright, equal in the root of the counts, merged where pixels are few.
 
-        counts : mean prediction; error : mean squared residual above the noise, counts^2
-        bias : mean residual (measured less predicted), counts; noise : expected variance, counts^2; pixels
+        Keys `counts` (mean prediction), `error` (mean squared residual above the noise, counts^2), `bias` (mean
+        residual, measured less predicted, counts), `noise` (expected variance, counts^2) and `pixels`.
         """
         if not self._sums[0].any():
             return []

@@ -1,7 +1,7 @@
 """Free-form probes: the most general thing each stage could be doing, fitted alone.
 
-The stage whose probe removes most of the held-out excess is where the missing physics sits, also when no named
-effect fits; and a fitted probe is a picture, in which a fringe, a speck or a stripe is recognised at sight.
+The stage whose probe removes most of the held-out excess is where the missing physics is, also when no named
+effect fits. A fitted probe is a picture that shows a fringe, a speck or a stripe.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from trainer.captures.batches import Batch, load, load_batch
 from trainer.captures.capture_set import chosen, opened
 from trainer.captures.capture_table import Capture
 from trainer.captures.held_out import scenes
-from trainer.fitting.free_form_maps import FreeFormBatch, FreeFormStage, Picture, Tensors, descend
+from trainer.fitting.free_form_maps import FreeFormBatch, FreeFormStage, MapPicture, Tensors, descend
 from trainer.model.model import Model
 from trainer.prediction.panel_field import UNITS, resized, with_field
 from trainer.prediction.predict import light_path
 from trainer.prediction.scene import Scene, Stages
 
-ROUND = 2  # iterations between two looks at the capture that says when to stop
+ROUND = 2  # iterations between two checks of the captures that say when to stop
 ROUNDS = {"drive": 7, "panel": 12, "pupil": 10, "sensor": 12}
 CAPTURES = {"drive": 4, "panel": 8, "pupil": 6, "sensor": 8}  # most that the gradient sees
 NODES = {"panel": 80_000, "sensor": 9_000}  # most nodes of a free map; larger pictures get coarser maps
@@ -42,21 +42,38 @@ TAPS = 9  # of the sensor's free kernel, half a pixel apart
 
 @dataclass(frozen=True)
 class ProbeFit:
-    """A fitted probe: held-out errors with it, and what it looks like."""
+    """A fitted probe.
+
+    Attributes
+    ----------
+    stage : str
+    held_out : PredictionErrors
+        Errors with the probe on the held-out captures.
+    pictures : tuple of MapPicture
+        Its maps.
+    """
 
     stage: str
     held_out: PredictionErrors
-    pictures: tuple[Picture, ...]
+    pictures: tuple[MapPicture, ...]
 
 
 @dataclass(frozen=True)
 class ProbeResult:
-    """A probe judged against the model without it."""
+    """A probe judged against the model without it.
+
+    Attributes
+    ----------
+    removed : RemovedExcess
+        Held-out excess that the probe removes.
+    excess_after : float
+        Held-out excess with the probe.
+    """
 
     stage: str
     removed: RemovedExcess
     excess_after: float
-    pictures: tuple[Picture, ...]
+    pictures: tuple[MapPicture, ...]
 
     @classmethod
     def judged(cls, found: ProbeFit, before: PredictionErrors) -> ProbeResult:
@@ -64,7 +81,7 @@ class ProbeResult:
         return cls(found.stage, removed_excess(before, found.held_out), found.held_out.excess, found.pictures)
 
     def as_json(self) -> dict[str, Any]:
-        """The contract's keys, and an interval."""
+        """A row of the key `stages` of `diagnose --json`: `stage`, `excess_removed`, `excess_after` and `ci95`."""
         low, high = self.removed.interval()
         return {
             "stage": self.stage,
@@ -77,27 +94,37 @@ class ProbeResult:
 def probe(
     folder: Path, ids: tuple[str, ...], held_ids: tuple[str, ...], model: Model, stage: str
 ) -> ProbeFit:
-    """Fit one stage's probe on some captures and judge it on others."""
+    """Fit one stage's probe on some captures and judge it on others.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the capture set.
+    ids, held_ids : tuple of str
+        Captures to fit, and captures to judge by.
+    model : Model
+        With fitted gains.
+    """
     captures = opened(folder)
     rows = chosen(captures, ids)
     last = {(c.channel, c.plane_mm): c for c in rows}.values()
     each = max(1, CAPTURES[stage] // len(last))
     batches = load(captures, [c for scene in scenes(rows) for c in _of(scene, rows, last)[:each]])
-    kind = PROBES[stage](model, batches[0])
+    free = PROBES[stage](model, batches[0])
     scale = sum(float(b.errors(torch.zeros_like(b.signal)).variance.sum()) for b in batches)
     # One capture a colour and plane is kept from the gradient and says when to stop.
-    seen, unseen = ([FreeFormBatch(model, b) for b in part] for part in (batches, load(captures, last)))
-    found = descend(kind, seen, unseen, scale, ROUND, ROUNDS[stage])
+    fitted, stopping = ([FreeFormBatch(model, b) for b in part] for part in (batches, load(captures, last)))
+    found = descend(free, fitted, stopping, scale, ROUND, ROUNDS[stage])
     with torch.no_grad():
         parts = []
         for row in chosen(captures, held_ids):
-            working = FreeFormBatch(model, load_batch(captures, [row]))
-            parts.append(working.batch.errors(working.predict(kind, found, 0)))
-        return ProbeFit(stage, joined(parts), tuple(kind.pictures(found)))
+            held = FreeFormBatch(model, load_batch(captures, [row]))
+            parts.append(held.batch.errors(held.predict(free, found, 0)))
+        return ProbeFit(stage, joined(parts), tuple(free.pictures(found)))
 
 
 def _of(scene: tuple[str, float], rows: list[Capture], last: Collection[Capture]) -> list[Capture]:
-    """A scene's captures but for the one that says when to stop, unless it is the only one."""
+    """A scene's captures except the one that says when to stop, unless it is the only one."""
     own = [c for c in rows if (c.channel, c.plane_mm) == scene]
     return [c for c in own if c not in last] or own
 
@@ -117,7 +144,7 @@ def _drive(model: Model, batch: Batch) -> FreeFormStage:
             moved = replace(moved, crosstalk=(taps + t["rows"], taps + t["columns"]))
         return replace(stages, drive=moved)
 
-    def pictures(t: Tensors) -> list[Picture]:
+    def pictures(t: Tensors) -> list[MapPicture]:
         gain = legendre_surface(t["gain"], y, x)
         return [
             *((f"response, deviation ({c})", _array(t["table"][k]), "rad") for k, c in enumerate(channels)),
@@ -136,7 +163,7 @@ def _drive(model: Model, batch: Batch) -> FreeFormStage:
 
 
 def _spread_in_time(scene: Scene, stages: Stages, gray: Tensor, tensors: Tensors) -> Tensor:
-    """Mean irradiance over a phase whose gain swings by +-`spread` while the camera looks."""
+    """Mean irradiance over a phase whose gain swings by +-`spread` during the exposure."""
     path = light_path(scene, stages)
     phase = panel_phase(path, gray)
     swings = [phase * (1 + s * tensors["spread"]) for s in (-1, 1)]
@@ -151,7 +178,7 @@ def _panel(model: Model, batch: Batch) -> FreeFormStage:
     def apply(stages: Stages, t: Tensors) -> Stages:
         return replace(stages, panel=with_field(stages.panel, t))
 
-    def pictures(t: Tensors) -> list[Picture]:
+    def pictures(t: Tensors) -> list[MapPicture]:
         added = torch.hypot(t["added_real"], t["added_imaginary"])
         return [
             ("amplitude multiplied", _array(torch.exp(t["log_amplitude"])), "relative"),
@@ -177,7 +204,7 @@ def _pupil(model: Model, batch: Batch) -> FreeFormStage:
         blur = torch.exp(-0.5 * reach * (rows * pupil.iy**2 + columns * pupil.ix**2))
         return replace(stages, pupil=moved.filtered(blur))
 
-    def pictures(t: Tensors) -> list[Picture]:
+    def pictures(t: Tensors) -> list[MapPicture]:
         return [
             ("amplitude passed, over spatial frequency", _array(torch.exp(t["log"])), "relative"),
             ("phase, over spatial frequency", _array(t["phase"]), "rad"),
@@ -220,7 +247,7 @@ def _sensor(model: Model, batch: Batch) -> FreeFormStage:
 
         return replace(stages, sensor=moved.responding(curve))
 
-    def pictures(t: Tensors) -> list[Picture]:
+    def pictures(t: Tensors) -> list[MapPicture]:
         shift = [legendre_surface(t["shift"][k], y, x, 0) for k in (0, 1)]
         share = torch.linspace(0, 1, 101)
         bend = share * (1 - share) * (t["bend"] @ legendre_curve(2 * share - 1, t["bend"].shape[0]))

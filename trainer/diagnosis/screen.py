@@ -31,7 +31,16 @@ from trainer.prediction.predict import Trace
 
 @dataclass(frozen=True)
 class ScreenResult:
-    """What the screen expects of an effect: the excess that would remain, and where a fit should start."""
+    """What the screen expects of an effect.
+
+    Attributes
+    ----------
+    effect : str
+    start : EffectInstance
+        Where a fit should start.
+    before, after : float
+        Excess on the screened captures, without the effect and as expected with it.
+    """
 
     effect: str
     start: EffectInstance
@@ -40,14 +49,24 @@ class ScreenResult:
 
     @property
     def removed_excess(self) -> float:
-        """Excess expected to go, on the captures that the screen saw."""
+        """Excess that the effect is expected to remove, on the screened captures."""
         return self.before - self.after
 
 
 def screen(
     folder: Path, ids: tuple[str, ...], model: Model, effects: tuple[Effect, ...]
 ) -> list[ScreenResult]:
-    """Screen effects on some captures, for a model with fitted gains."""
+    """Screen effects on some captures.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the capture set.
+    ids : tuple of str
+        Captures to screen on.
+    model : Model
+        With fitted gains.
+    """
     captures = opened(folder)
     batches = load(captures, chosen(captures, ids))
     with torch.no_grad():
@@ -55,17 +74,18 @@ def screen(
 
 
 def screen_batches(batches: list[Batch], model: Model, effects: tuple[Effect, ...]) -> list[ScreenResult]:
+    """Screen effects on batches, for a model with fitted gains."""
     results = []
-    known: dict[bool, tuple[list[Predictor], list[Trace], Tensor, Tensor]] = {}
+    prepared: dict[bool, tuple[list[Predictor], list[Trace], Tensor, Tensor]] = {}
     for effect in effects:
-        wide = effect.touches_iris
-        if wide not in known:
-            reach = model if not wide else model.having(absent(effect, model.bench))
+        opens_iris = effect.touches_iris
+        if opens_iris not in prepared:
+            reach = model if not opens_iris else model.having(absent(effect, model.bench))
             predictors = [Predictor(reach, b) for b in batches]
             points = [p.trace(model) for p in predictors]
             nuisance = _stacked(model, keys_of(model, model.names), predictors, points)
-            known[wide] = (predictors, points, *nuisance)
-        predictors, points, residual, present = known[wide]
+            prepared[opens_iris] = (predictors, points, *nuisance)
+        predictors, points, residual, present = prepared[opens_iris]
         noise = sum(float((b.mask * b.noise).sum()) for b in batches)
         scale = float(joined([b.errors(torch.zeros_like(b.signal)) for b in batches]).variance.sum())
         before = (_remaining(residual, present) - noise) / scale
@@ -89,11 +109,11 @@ def _start(effect: Effect, model: Model, predictors: list[Predictor], points: li
         starts += [placed(effect, model.bench, values) for values in effect.starts(evidence)]
     if len(starts) == 1:
         return starts[0]
-    # A start need only be near: one colour and plane tell.
+    # A start need only be near: one colour and plane are enough.
     few, there = predictors[:1], points[:1]
     costs = [start_cost(model, few, there, start) for start in starts]
     if max(costs) - min(costs) < 1e-9 * max(costs):
-        # A period or a place says nothing while the amplitude is zero: look one step ahead.
+        # A period or a place changes nothing while the amplitude is zero: compare one step ahead.
         costs = [_one_step_ahead(model, few, there, start) for start in starts]
     return starts[costs.index(min(costs))]
 

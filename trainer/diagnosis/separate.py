@@ -16,28 +16,38 @@ PLANES = (0.6, 1.6)  # other planes proposed, as shares of the distance
 
 
 def captures_that_separate(
-    parts: CaptureRoles, one: tuple[str, Model], other: tuple[str, Model]
+    roles: CaptureRoles, one: tuple[str, Model], other: tuple[str, Model]
 ) -> list[str]:
-    """Sentences, most telling first; none where no proposed capture tells more than those at hand.
+    """Captures that would separate two explanations.
 
     For each proposal both models predict the same patterns; what counts is the squared difference, with the gain
     left free, over the variance of the signal.
+
+    Parameters
+    ----------
+    one, other : tuple of str and Model
+        Name and model of each explanation.
+
+    Returns
+    -------
+    list of str
+        Sentences, the best capture first; empty where no proposal is better than the captures that there are.
     """
-    row = parts.fitted[0]
-    batch = load_batch(parts.captures, [row])
+    row = roles.fitted[0]
+    batch = load_batch(roles.captures, [row])
     here = _difference(one[1], other[1], batch)
-    channels = [c.name for c in parts.captures.bench.channels]
+    channels = [c.name for c in roles.captures.bench.channels]
     proposals = [
         (f"the same patterns at {row.plane_mm * f:.3g} mm", replace(batch, plane_mm=row.plane_mm * f))
         for f in PLANES
     ]
-    unused = [c for c in channels if c not in parts.captures.channels]
+    unused = [c for c in channels if c not in roles.captures.channels]
     proposals += [(f"the same patterns in {c}", replace(batch, channel=c)) for c in unused]
     found = []
     for words, moved in proposals:
         try:
             there = _difference(one[1], other[1], moved)
-        except InputError:  # the plane is out of the light path's reach
+        except InputError:  # the sampling does not reach this plane
             continue
         if there > max(3 * here, 1e-4):
             found.append((there, words))
@@ -49,6 +59,7 @@ def captures_that_separate(
 
 
 def _difference(one: Model, other: Model, batch: Batch) -> float:
+    """Squared difference of two models' predictions of a batch, gain left free, over the signal's variance."""
     with torch.no_grad():
         predictions = []
         for model in (one, other):

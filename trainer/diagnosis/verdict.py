@@ -5,9 +5,9 @@ held-out captures), and does it matter (a share of the ideal model's excess, and
 
 The test: excess removed on held-out captures, two-sided normal interval over the picture's tiles, at a family-wise
 `level` shared among all candidates tried (Bonferroni). Against noise alone, the chance that any effect's interval
-lies above zero is at most half of `level`. A model's own small errors are no noise: where millions of pixels show
-an iris's edge wrong by 1e-5 of the signal's variance, its interval does lie above zero. That such an effect is not
-named is the work of the least amounts.
+lies above zero is at most half of `level`. A model's own small errors are not noise: where millions of pixels show
+an iris's edge wrong by 1e-5 of the signal's variance, its interval does lie above zero. The least amounts prevent
+that such an effect is named.
 """
 
 from __future__ import annotations
@@ -37,9 +37,16 @@ def verdict_of(complete: bool, worth_adding: bool) -> Verdict:
 
 @dataclass(frozen=True)
 class Thresholds:
-    """level : family-wise level of the test
-    share, excess : least excess removed to be worth adding, as a share of the ideal model's and absolute
-    complete_share, complete_excess : a model is complete below the larger of these
+    """Thresholds of the verdict.
+
+    Attributes
+    ----------
+    level : float
+        Family-wise level of the test.
+    share, excess : float
+        Least excess removed to be worth adding, as a share of the ideal model's and absolute.
+    complete_share, complete_excess : float
+        A model is complete below the larger of these, as a share of the ideal model's excess and absolute.
     """
 
     level: float = 0.05
@@ -49,7 +56,7 @@ class Thresholds:
     complete_excess: float = COMPLETE_EXCESS
 
     def as_json(self) -> dict[str, float]:
-        """For reports."""
+        """Keys `level`, `share`, `excess`, `complete_share` and `complete_excess`."""
         return asdict(self)
 
     def least(self, ideal_excess: float) -> float:
@@ -57,19 +64,34 @@ class Thresholds:
         return max(self.share * ideal_excess, self.excess)
 
     def worth_adding(self, removed: RemovedExcess, ideal_excess: float, candidates: int) -> bool:
-        """Is it real, and does it matter?"""
+        """Whether removed excess is real, and matters.
+
+        Parameters
+        ----------
+        ideal_excess : float
+            Held-out excess of the bench file's own model.
+        candidates : int
+            How many were tried, which the test is corrected for.
+        """
         low, _ = removed.interval(1 - self.level, candidates)
         return low > 0 and removed.value > self.least(ideal_excess)
 
     def complete(self, excess: float, ideal_excess: float) -> bool:
-        """Is what remains too little to explain?"""
+        """Whether what remains is too little to explain."""
         return is_complete(excess, ideal_excess, self.complete_share, self.complete_excess)
 
     def inseparable(self, difference: RemovedExcess, unexplained: float) -> bool:
-        """Can the data not tell two explanations apart?
+        """Whether the data cannot tell two explanations apart.
 
-        So it is when the interval of their difference holds zero, or when the difference is small: below `excess`, or
-        below a fifth of what the better one leaves `unexplained`, which is how wrong its own shape may be.
+        They cannot when the interval of the difference includes zero, or when the difference is small: below `excess`,
+        or below a fifth of what the better one leaves unexplained, which is how wrong its own shape may be.
+
+        Parameters
+        ----------
+        difference : RemovedExcess
+            Excess that the better one removes from the other.
+        unexplained : float
+            Excess that the better one leaves.
         """
         low, _ = difference.interval(1 - self.level)
         return low <= 0 or difference.value < max(self.excess, 0.2 * unexplained)

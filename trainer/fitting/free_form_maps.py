@@ -1,8 +1,8 @@
-"""Free-form maps fitted to captures through a model's light path: what probes and the panel's learned field share.
+"""Free-form maps fitted to captures through a model's light path, for probes and for the panel's learned field.
 
-By L-BFGS with the light path's own gradient, from "absent", and stopped early by captures that the gradient does not
-see: what one capture's noise asks of a map is not what the others ask, so the first iterations find what all captures
-share.
+By L-BFGS (Liu and Nocedal 1989) with the light path's own gradient, from "absent". The descent stops early, by
+captures that the gradient does not use: noise differs from capture to capture, so the first iterations find what all
+captures share.
 """
 
 from __future__ import annotations
@@ -21,32 +21,44 @@ from trainer.model.model import Model
 from trainer.prediction.predict import Trace, counts, light_on_camera, trace
 from trainer.prediction.scene import Scene, Stages
 
-Picture = tuple[str, np.ndarray, str]
+MapPicture = tuple[str, np.ndarray, str]  # title, values, unit
 Tensors = dict[str, Tensor]
 
-HISTORY = 10  # steps that L-BFGS remembers
+HISTORY = 10  # steps that L-BFGS keeps
 PATIENCE = 3  # rounds without progress on the captures that say when to stop
 
 
 @dataclass(frozen=True)
 class FreeFormStage:
-    """What is free at a stage. shapes: {name: (shape, physical units a unit of the optimiser's variable)}.
+    """The maps that are free at a stage.
 
-    prior : {name: standard deviation expected, physical units}, where squared errors are in units of their variance
-    irradiance : optional `(scene, stages, gray [1, H, W], tensors) -> irradiance`, where the stages alone do not say
-        what light there is; None for the light path's own
+    Attributes
+    ----------
+    stage : str
+        The first stage that the maps change.
+    shapes : dict
+        {name: (shape, physical units a unit of the optimiser's variable)}.
+    apply : callable
+        `(stages, maps) -> stages`.
+    pictures : callable
+        `maps -> [(title, array, unit)]`.
+    prior : mapping
+        {name: expected standard deviation, physical units}, where squared errors are in units of their variance.
+    irradiance : callable, optional
+        `(scene, stages, gray [1, H, W], maps) -> irradiance`, where the stages alone do not determine the light; the
+        light path's own otherwise.
     """
 
     stage: str
     shapes: dict[str, tuple[tuple[int, ...], float]]
     apply: Callable[[Stages, Tensors], Stages]
-    pictures: Callable[[Tensors], list[Picture]]
+    pictures: Callable[[Tensors], list[MapPicture]]
     prior: Mapping[str, float] = field(default_factory=dict)
     irradiance: Callable[[Scene, Stages, Tensor, Tensors], Tensor] | None = None
 
 
 class FreeFormBatch:
-    """One batch under a model, ready to be predicted with free maps on top.
+    """One batch under a model, prepared for predictions with free maps.
 
     Parameters
     ----------
@@ -63,40 +75,61 @@ class FreeFormBatch:
         with torch.no_grad():
             self.base = self.predictor.trace(model)
 
-    def predict(self, kind: FreeFormStage, tensors: Tensors, k: int) -> Tensor:
+    def predict(self, free: FreeFormStage, tensors: Tensors, k: int) -> Tensor:
         """Counts [1, h, w] of capture k."""
         scene, gray = self.predictor.scene, self.batch.gray[k : k + 1]
-        stages = kind.apply(self.stages, tensors)
+        stages = free.apply(self.stages, tensors)
         before = Trace(self.base.spectrum[k : k + 1], self.base.image[k : k + 1])
-        if kind.irradiance is None:
-            image = trace(scene, stages, gray, kind.stage, before).image
+        if free.irradiance is None:
+            image = trace(scene, stages, gray, free.stage, before).image
         else:
-            image = kind.irradiance(scene, stages, gray, tensors)
+            image = free.irradiance(scene, stages, gray, tensors)
         light = light_on_camera(scene, stages, image)
         measured = (self.batch.signal[k : k + 1], self.batch.mask[k : k + 1])
         return counts(scene, stages, light, self.gain[k : k + 1], measured)
 
-    def squared_error(self, kind: FreeFormStage, tensors: Tensors, k: int) -> Tensor:
+    def squared_error(self, free: FreeFormStage, tensors: Tensors, k: int) -> Tensor:
         """Weighted squared error of capture k."""
-        error = self.batch.signal[k : k + 1] - self.predict(kind, tensors, k)
+        error = self.batch.signal[k : k + 1] - self.predict(free, tensors, k)
         return (self.weight[k : k + 1] * error**2).sum()
 
 
 def descend(
-    kind: FreeFormStage,
-    seen: Sequence[FreeFormBatch],
-    unseen: Sequence[FreeFormBatch],
+    free: FreeFormStage,
+    fitted: Sequence[FreeFormBatch],
+    stopping: Sequence[FreeFormBatch],
     scale: float,
     iterations: int,
     rounds: int,
     progress: Callable[[float], None] | None = None,
 ) -> Tensors:
-    """The maps, in physical units, that serve the unseen captures best of those met on the way down.
+    """The maps of the descent that predict the stopping captures best.
 
-    scale : that squared errors are divided by, which sets the length of the first step. iterations : between two looks
-    at the unseen captures. The way begins at "absent", so what is found is never worse there.
+    The descent begins at "absent", so the result is never worse on the stopping captures.
+
+    Parameters
+    ----------
+    fitted : sequence of FreeFormBatch
+        Captures whose squared error is minimised.
+    stopping : sequence of FreeFormBatch
+        Captures that choose the best maps, and end the descent when they no longer improve.
+    scale : float
+        What squared errors are divided by, which sets the length of the first step.
+    iterations : int
+        Between two checks of the stopping captures.
+    rounds : int
+        Most checks.
+
+    Returns
+    -------
+    dict of tensors
+        Maps by name, in physical units.
+
+    References
+    ----------
+    Liu and Nocedal 1989.
     """
-    raw = {n: torch.zeros(shape, requires_grad=True) for n, (shape, _) in kind.shapes.items()}
+    raw = {n: torch.zeros(shape, requires_grad=True) for n, (shape, _) in free.shapes.items()}
     optimiser = torch.optim.LBFGS(
         list(raw.values()),
         max_iter=iterations,
@@ -107,28 +140,28 @@ def descend(
     )
 
     def physical(of: Mapping[str, Tensor]) -> Tensors:
-        return {n: t * kind.shapes[n][1] for n, t in of.items()}
+        return {n: t * free.shapes[n][1] for n, t in of.items()}
 
     def loss_and_gradient() -> float:
         optimiser.zero_grad()
         maps = physical(raw)
-        losses: list[Any] = [((maps[n] / spread) ** 2).sum() / scale for n, spread in kind.prior.items()]
+        losses: list[Any] = [((maps[n] / spread) ** 2).sum() / scale for n, spread in free.prior.items()]
         total = sum(_backward(loss) for loss in losses)
-        for working in seen:
-            for k in range(len(working.batch.ids)):
-                total += _backward(working.squared_error(kind, physical(raw), k) / scale)
+        for one in fitted:
+            for k in range(len(one.batch.ids)):
+                total += _backward(one.squared_error(free, physical(raw), k) / scale)
         return total
 
     @torch.no_grad()
-    def unseen_error() -> float:
+    def stopping_error() -> float:
         found = physical(raw)
-        return sum(float(w.squared_error(kind, found, k)) for w in unseen for k in range(len(w.batch.ids)))
+        return sum(float(b.squared_error(free, found, k)) for b in stopping for k in range(len(b.batch.ids)))
 
-    best, least = {n: t.detach().clone() for n, t in raw.items()}, unseen_error()
+    best, least = {n: t.detach().clone() for n, t in raw.items()}, stopping_error()
     waited = 0
     for number in range(rounds):
         optimiser.step(loss_and_gradient)
-        error = unseen_error()
+        error = stopping_error()
         if error < least:
             best, least, waited = {n: t.detach().clone() for n, t in raw.items()}, error, 0
         elif (waited := waited + 1) == PATIENCE:

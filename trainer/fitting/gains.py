@@ -35,7 +35,7 @@ def with_gains(
     found = with_gain(replace(model, gain={}), _Predictors(captures, model, rows, done))
     scene = scene_for(model, rows[0].channel, rows[0].plane_mm)
     if stages_of(scene, model).sensor.response is not None:
-        # Counts are not proportional to light: least squares is only where the fit starts.
+        # Counts are not proportional to light: least squares only gives the fit its start.
         found = fit(found, [], load(captures, rows)).model
     return replace(model, gain={**model.gain, **{c: found.gain[c] for c in channels}})
 

@@ -1,9 +1,9 @@
-"""Fits of effects to captures: damped Gauss-Newton on the very error that is reported.
+"""Fits of effects to captures: damped Gauss-Newton on the same error that is reported.
 
-Columns of the Jacobian are secants one small physical step wide. They cost one prediction from the effect's own
-stage on, whatever the effect does inside, and an iris edge or a laser line, whose derivative is zero or jumps where
-the effect is absent, has a good one. What the fit minimises is the squared error in counts, unweighted: the reported
-excess. The gain of each colour is always fitted along.
+Columns of the Jacobian are secants one small physical step wide. Each costs one prediction from the effect's own
+stage on. A secant is also good for an iris edge or a laser line, whose derivative is zero or jumps where the effect
+is absent. The fit minimises the squared error in counts, unweighted: the reported excess. The gain of each colour is
+always fitted too.
 """
 
 from __future__ import annotations
@@ -27,12 +27,24 @@ from trainer.model.model import Model, Values
 
 @dataclass(frozen=True)
 class FitResult:
-    """A fitted model with its error on the captures it saw, and the covariance of what was fitted."""
+    """A fitted model.
+
+    Attributes
+    ----------
+    model : Model
+        With fitted values and their standard errors.
+    errors : PredictionErrors
+        On the captures that it was fitted to.
+    covariance : array [keys + colours, keys + colours]
+        Of the fitted numbers, then of the logarithms of the gains.
+    keys : tuple
+        (effect, parameter, index into its values) of each fitted number.
+    """
 
     model: Model
     errors: PredictionErrors
     covariance: np.ndarray
-    keys: tuple[tuple[str, str, int], ...]  # (effect, parameter, index into its values)
+    keys: tuple[tuple[str, str, int], ...]
 
 
 def fit(
@@ -46,7 +58,14 @@ def fit(
     """Fit the named effects of a model, and the gains, to batches.
 
     Stops after `iterations`, or when a step lowers the excess by less than `tolerance` of it and less than 2e-6.
-    PredictionErrors are standard errors from the residuals themselves (a sandwich), so misfit widens them.
+    Errors of values are standard errors from the residuals themselves (a sandwich estimate), so misfit widens them.
+
+    Parameters
+    ----------
+    free : sequence of str
+        Names of the effects to fit; the others keep their values.
+    progress : callable, optional
+        Called with the share of the iterations that is done.
     """
     with torch.no_grad():
         return _fit(model, tuple(free), batches, iterations, tolerance, progress)
@@ -90,11 +109,11 @@ def _fit(
             damping = max(damping / 10, 1e-7)
         elif fresh:
             break
-        removed = before - errors.excess
-        if fresh and removed < max(tolerance * abs(errors.excess), 2e-6):
+        removed_excess = before - errors.excess
+        if fresh and removed_excess < max(tolerance * abs(errors.excess), 2e-6):
             break
-        # Secants are dear: they serve again while a step still takes more than half of what is left.
-        fresh = not removed > 0.5 * before
+        # Secants are costly: they are used again while a step still removes more than half of what is left.
+        fresh = not removed_excess > 0.5 * before
         if fresh and iteration + 1 < iterations:
             slopes = slopes_of(model, keys, channels, predictors, points)
     normal, scatter = _normal(slopes), _scatter(slopes, residuals)
@@ -105,7 +124,7 @@ def _fit(
 
 
 def _measured(model: Model, free: Sequence[str], batches: Sequence[Batch]) -> Model:
-    """The model with the values that effects read off the captures rather than fit."""
+    """The model with the values that effects read off the captures instead of fitting them."""
     for name in free:
         present = model.instance(name)
         if present.effect.measure is None:

@@ -18,6 +18,7 @@ STEP = 0.1  # of a parameter's scale: large against single precision's rounding,
 
 
 def keys_of(model: Model, free: Sequence[str]) -> tuple[tuple[str, str, int], ...]:
+    """Keys (effect, parameter, index into its values) of every number of the named effects."""
     keys = []
     for name in free:
         present = model.instance(name)
@@ -38,7 +39,7 @@ def stepped(model: Model, key: tuple[str, str, int], change: float) -> Model:
 
 
 def column_step(model: Model, key: tuple[str, str, int]) -> float:
-    """Width of the secant that stands for a derivative: towards the inside of the range."""
+    """Step of the secant for one number, towards the inside of its range; physical units."""
     present = model.instance(key[0])
     p = present.effect.parameter(key[1])
     value = float(present.values[key[1]].reshape(-1)[key[2]])
@@ -49,7 +50,19 @@ def column_step(model: Model, key: tuple[str, str, int]) -> float:
 def columns(
     model: Model, keys: Sequence[tuple[str, str, int]], predictor: Predictor, point: Trace
 ) -> tuple[Tensor, list[Tensor]]:
-    """Prediction [B, h, w] and its change a unit of each parameter, then of the logarithm of the gain."""
+    """Prediction of a batch and its derivatives.
+
+    Parameters
+    ----------
+    point : Trace
+        The batch's light under `model`.
+
+    Returns
+    -------
+    tensor [B, h, w], counts
+    list of tensors [B, h, w]
+        Change a unit of each parameter, then of the logarithm of the gain.
+    """
     light = predictor.light(model, point)
     base = predictor.counts(model, light)
     result = []

@@ -13,7 +13,13 @@ from trainer.prediction.predict import Trace, counts, light_on_camera
 
 
 def with_gain(model: Model, predictors: Sequence[Predictor], points: Sequence[Trace] | None = None) -> Model:
-    """The model with each colour's gain by least squares, other parameters as they are."""
+    """The model with each colour's gain by least squares, other parameters as they are.
+
+    Parameters
+    ----------
+    points : sequence of Trace, optional
+        The light of each predictor's batch under the model; computed where not given.
+    """
     sums: dict[str, list[float]] = {}
     for k, predictor in enumerate(predictors):
         batch = predictor.batch
@@ -25,9 +31,9 @@ def with_gain(model: Model, predictors: Sequence[Predictor], points: Sequence[Tr
         one = counts(
             predictor.scene, replace(stages, sensor=linear), light, batch.exposure[:, None, None], None
         )
-        seen = batch.signal if stages.sensor.offset is None else batch.signal - stages.sensor.offset
+        light_counts = batch.signal if stages.sensor.offset is None else batch.signal - stages.sensor.offset
         total = sums.setdefault(batch.channel, [0.0, 0.0])
-        total[0] += float((batch.mask * seen * one).sum(dtype=torch.float64))
+        total[0] += float((batch.mask * light_counts * one).sum(dtype=torch.float64))
         total[1] += float((batch.mask * one**2).sum(dtype=torch.float64))
     gain = {**model.gain, **{c: max(a, 1e-12) / max(b, 1e-30) for c, (a, b) in sums.items()}}
     return replace(model, gain=gain)

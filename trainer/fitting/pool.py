@@ -30,17 +30,26 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-TASKS = "trainer.diagnosis.candidates"  # what workers run
+TASKS = "trainer.diagnosis.candidate_fits"  # what workers run
 ANSWER_S = 5.0  # a Dask scheduler that has not answered by then is not there
 LOST = (
-    "a process that was fitting has removed, as when memory runs out: "
+    "a process that was fitting has ended, as when memory runs out: "
     "use fewer --workers or smaller captures, and try again"
 )
 
 
 @dataclass(frozen=True)
 class Pool:
-    """A `concurrent.futures` executor, how many tasks it runs at once, and whether in other processes."""
+    """Where independent tasks run.
+
+    Attributes
+    ----------
+    executor : concurrent.futures.Executor
+    workers : int
+        How many tasks run at once.
+    elsewhere : bool
+        In other processes.
+    """
 
     executor: Executor
     workers: int
@@ -52,9 +61,17 @@ class Pool:
         tasks: Iterable[tuple[Any, ...]],
         progress: Callable[[int], None] | None = None,
     ) -> list[T]:
-        """Results of `function(*task)` in the order of the tasks; `progress` is told how many are done.
+        """Results of `function(*task)` in the order of the tasks.
 
-        Raises what the function raises, and InputError when a process that works on tasks is lost.
+        Parameters
+        ----------
+        progress : callable, optional
+            Called with how many tasks are done.
+
+        Raises
+        ------
+        InputError
+            When a process that works on tasks is lost; whatever the function raises otherwise.
         """
         if self.elsewhere:
             packed = [pickle.dumps((function, task)) for task in tasks]
@@ -76,18 +93,29 @@ class Pool:
 
 
 def cores() -> int:
-    """Processors this process may use; OMP_NUM_THREADS lowers it, as everywhere."""
+    """Processors this process may use; OMP_NUM_THREADS lowers the number."""
     here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
-    told = os.environ.get("OMP_NUM_THREADS", "")
-    return min(here, int(told)) if told.isdigit() and int(told) > 0 else here
+    limit = os.environ.get("OMP_NUM_THREADS", "")
+    return min(here, int(limit)) if limit.isdigit() and int(limit) > 0 else here
 
 
 @contextmanager
 def open_pool(workers: int | None = None, cluster: str | None = None) -> Iterator[Pool]:
-    """A pool of `workers` processes (default: one a processor; 1: this process), or of a Dask cluster.
+    """A pool of processes, or of a Dask cluster.
 
-    Cluster workers need hololoop installed, and the capture set and effect files at the same paths. Raises
-    InputError when the cluster does not answer, has no workers, or its workers have no hololoop.
+    Cluster workers need hololoop installed, and the capture set and effect files at the same paths.
+
+    Parameters
+    ----------
+    workers : int, optional
+        Processes: one a processor by default; with 1, tasks run in this process.
+    cluster : str, optional
+        Address of a Dask scheduler.
+
+    Raises
+    ------
+    InputError
+        When the cluster does not answer, has no workers, or its workers have no hololoop.
     """
     if cluster is not None:
         with _cluster(cluster) as pool:
@@ -97,7 +125,7 @@ def open_pool(workers: int | None = None, cluster: str | None = None) -> Iterato
     if count < 1:
         raise InputError(f"--workers {workers}: give a number of processes from 1 on")
     if count == 1:
-        yield Pool(_Here(), 1, elsewhere=False)
+        yield Pool(_ThisProcess(), 1, elsewhere=False)
         return
     executor = _Processes(count, multiprocessing.get_context("spawn"), _single_threaded)
     try:
@@ -118,11 +146,11 @@ def _cluster(address: str) -> Iterator[Pool]:
         from distributed.scheduler import KilledWorker
     except ImportError as error:
         raise InputError("--cluster needs Dask: pip install 'hololoop[cluster]'") from error
-    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # one sentence says it, below
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # the InputError below says it
     try:
         _greet(address)
         client = Client(address, timeout=ANSWER_S, set_as_default=False)
-    except Exception as error:  # whatever a stranger at that address may have said
+    except Exception as error:  # anything may answer at that address
         known = str(error) if isinstance(error, OSError | ValueError) else ""
         raise InputError(
             f"no Dask scheduler answers at {address!r} ({known or 'what is there does not speak Dask'}): "
@@ -138,7 +166,7 @@ def _cluster(address: str) -> Iterator[Pool]:
 
 
 def _greet(address: str) -> None:
-    """Waits for a scheduler's first words; by itself a client waits for them for ever."""
+    """Waits for a scheduler's first message, for which a client alone would wait without limit."""
     import asyncio
 
     from distributed.comm import connect
@@ -147,12 +175,12 @@ def _greet(address: str) -> None:
         comm = await connect(address, timeout=ANSWER_S)
         comm.abort()
 
-    with ThreadPoolExecutor(1) as thread:  # a notebook's own thread runs a loop already
+    with ThreadPoolExecutor(1) as thread:  # a notebook's own thread already runs a loop
         thread.submit(lambda: asyncio.run(asyncio.wait_for(greeted(), ANSWER_S))).result()
 
 
 def _prepare(client: Client, address: str) -> None:
-    """Sees that there are workers, that they have hololoop, and that they read effect files again."""
+    """Checks that there are workers and that they have hololoop, and makes them read effect files again."""
     if not client.nthreads():
         raise InputError(
             f"the Dask scheduler at {address} has no workers: start one with: dask worker {address}"
@@ -168,14 +196,14 @@ def _prepare(client: Client, address: str) -> None:
 
 
 def _forget() -> None:
-    """Reads all that a worker needs, to say early what it lacks, and drops effect files of an earlier run."""
+    """Imports what a worker needs, so that a missing package shows early; drops effect files of earlier runs."""
     for name in (TASKS, "trainer.effects.effect_catalogue"):
         import_module(name)
     import_module("trainer.effects.effect_catalogue").forget_effect_files()
 
 
-class _Here(Executor):
-    """Runs each task at once in this process, so that Ctrl-C stops it there and then."""
+class _ThisProcess(Executor):
+    """Runs each task at once in this process, so that Ctrl-C stops it immediately."""
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
         """The finished future of a call."""
@@ -188,10 +216,10 @@ class _Here(Executor):
 
 
 class _Processes(ProcessPoolExecutor):
-    """Processes that Ctrl-C does not reach, from their very start: it is their parent's to handle."""
+    """Processes that Ctrl-C does not reach, from their start: their parent handles it."""
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
-        """The future of a call; starts a process where one is wanting."""
+        """The future of a call; starts a process where one is missing."""
         if not hasattr(signal, "pthread_sigmask"):  # Windows
             return super().submit(fn, *args, **kwargs)
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # processes inherit it
@@ -202,9 +230,9 @@ class _Processes(ProcessPoolExecutor):
 
 
 def _packed(task: bytes) -> bytes:
-    """Runs a task; a worker that cannot read it gives the error back, where Dask's own would never answer.
+    """Runs a task; a worker that cannot read it returns the error, where Dask itself would never answer.
 
-    Results are bytes for torch's sake, which otherwise passes tensors through sockets and shared memory.
+    Results are bytes because torch otherwise passes tensors through sockets and shared memory.
     """
     function, arguments = pickle.loads(task)
     return pickle.dumps(function(*arguments))
@@ -220,7 +248,7 @@ def _single_threaded() -> None:
 
 
 def _end_with_parent() -> None:
-    """A worker whose parent was killed has nobody to work for, and would wait for tasks for ever."""
+    """Ends a worker whose parent was killed, which would otherwise wait for tasks without limit."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

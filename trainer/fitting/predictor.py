@@ -29,7 +29,15 @@ class Predictor:
         return stages_of(self.scene, model)
 
     def trace(self, model: Model, start: str = "drive", before: Trace | None = None) -> Trace:
-        """Spectrum and irradiance from stage `start` on, a capture at a time to stay in the processor's cache."""
+        """Spectrum and irradiance of the batch, a capture at a time to stay in the processor's cache.
+
+        Parameters
+        ----------
+        start : str
+            The first stage that `model` changes.
+        before : Trace, optional
+            Of a model that is equal before that stage; without it everything is computed.
+        """
         if before is not None and start == "sensor":
             return before
         stages = self.stages(model)
@@ -44,7 +52,7 @@ class Predictor:
         return light_on_camera(self.scene, self.stages(model), point.image)
 
     def counts(self, model: Model, light: Tensor) -> Tensor:
-        """Counts above black [B, h, w]."""
+        """Counts above black [B, h, w], from the irradiance on the camera [B, h, w]."""
         gain = model.gain[self.batch.channel] * self.batch.exposure[:, None, None]
         measured = (self.batch.signal, self.batch.mask)
         return counts(self.scene, self.stages(model), light, gain, measured)
@@ -55,13 +63,13 @@ class Predictor:
 
 
 def evaluate(model: Model, batches: Sequence[Batch]) -> PredictionErrors:
-    """PredictionErrors of a model, with the gains it has, on batches."""
+    """Errors of a model, with the gains it has, on batches."""
     with torch.no_grad():
         return joined([b.errors(Predictor(model, b).predict(model)) for b in batches])
 
 
 def evaluate_captures(captures: CaptureSet, rows: Sequence[Capture], model: Model) -> PredictionErrors:
-    """PredictionErrors of a model on captures, one in memory at a time."""
+    """Errors of a model on captures, one in memory at a time."""
     with torch.no_grad():
         parts = []
         for row in rows:

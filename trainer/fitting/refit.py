@@ -47,8 +47,14 @@ def raise_order(
 ) -> FitResult:
     """Raise the order of an effect's map or curve while the error keeps falling.
 
-    `gain_needed(excess)` is how much excess a higher order must remove to be kept; `free` are the effects that are
-    refitted along, the effect alone by default.
+    Parameters
+    ----------
+    fitted : FitResult
+        Of a model with the effect.
+    gain_needed : callable
+        How much excess a higher order must remove to be kept, from the excess that there is.
+    free : sequence of str, optional
+        Effects that are refitted too; the effect alone by default.
     """
     while True:
         present = fitted.model.instance(name)

@@ -1,6 +1,6 @@
-"""A model as a bundle for the headset: each colour and plane's light path, baked into arrays.
+"""A model as a bundle for the headset: each colour and plane's light path as arrays.
 
-Only what the eye sees too goes in: effects that are told to the camera explain the measurement and stay out.
+Only effects that act on the display go in; those that act on the camera explain the measurement and are left out.
 Arrays are computed in double precision and stored as float32 and complex64.
 """
 
@@ -37,26 +37,41 @@ def export_bundle(
     network: Path | None = None,
     replace_folder: bool = False,
 ) -> dict[str, Any]:
-    """Write a model's light paths as a bundle, and say what went in.
+    """Write a model's light paths as a bundle.
 
-    captures: what the model was fitted to, for its planes and its hash; without it the bench's own distance,
-    for every colour. network: file of a trained approximator, which goes in as ONNX. Raises InputError where the
-    folder is not empty (unless `replace_folder`), where a plane cannot be computed, and where the network was
-    trained for another panel or other colours.
+    Parameters
+    ----------
+    captures : CaptureSet or None
+        What the model was fitted to, for its planes and its hash; without it the bench's own distance, for every
+        colour.
+    network : Path, optional
+        File of a trained approximator, which goes in as ONNX.
+    replace_folder : bool
+        Replace a bundle that is in the folder.
+
+    Returns
+    -------
+    dict
+        Keys `bundle`, `channels`, `planes_mm`, `effects`, `effects_left_out`, `panel_field`, `heldout`, `arrays`,
+        `network` and `megabytes`, for `export --json`.
+
+    Raises
+    ------
+    InputError
+        Where the folder is not empty (unless `replace_folder`), where a plane cannot be computed, and where the
+        network was trained for another panel, other colours or other effects.
     """
     if model.method == "fraunhofer":
         raise InputError(
             "a far-field model cannot be exported: the headset's light path is angular_spectrum or fresnel; change "
             "method under [propagation] in the model file"
         )
-    shown, left_out = (
-        acting_on_display(model),
-        [p.effect for p in model.present if p.effect.acts_on != "display"],
-    )
-    wanted = _colours_and_planes(model, captures)
+    exported = acting_on_display(model)
+    left_out = [p.effect for p in model.present if p.effect.acts_on != "display"]
+    scene_list = _colours_and_planes(model, captures)
     baked = [
-        (channel, plane, model.bench.channel(channel).wavelength_nm, baked_path(shown, channel, plane))
-        for channel, plane in wanted
+        (channel, plane, model.bench.channel(channel).wavelength_nm, baked_path(exported, channel, plane))
+        for channel, plane in scene_list
     ]
     records, arrays = pack_light_paths(baked)
     panel = model.bench.panel
@@ -71,10 +86,10 @@ def export_bundle(
         "channels": [
             {"name": c.name, "wavelength_nm": c.wavelength_nm}
             for c in model.bench.channels
-            if c.name in {channel for channel, _ in wanted}
+            if c.name in {channel for channel, _ in scene_list}
         ],
         "distance_mm": model.bench.distance_mm,
-        "planes_mm": sorted({plane for _, plane in wanted}),
+        "planes_mm": sorted({plane for _, plane in scene_list}),
         "method": model.method,
         "paths": records,
     }
@@ -86,10 +101,10 @@ def export_bundle(
         "history": list(model.history),
         "effects": [
             {"effect": p.effect.name, "stage": p.effect.stage, "parameters": json_values(p, model.bench)}
-            for p in shown.present
+            for p in exported.present
         ],
         "effects_left_out": [_named(e) for e in left_out],
-        "panel_field": shown.panel_field is not None,
+        "panel_field": exported.panel_field is not None,
     }
     files: dict[str, bytes] = {}
     if network is not None:
@@ -101,9 +116,9 @@ def export_bundle(
         "bundle": str(folder),
         "channels": [c["name"] for c in description["channels"]],
         "planes_mm": description["planes_mm"],
-        "effects": list(shown.names),
+        "effects": list(exported.names),
         "effects_left_out": [e.name for e in left_out],
-        "panel_field": shown.panel_field is not None,
+        "panel_field": exported.panel_field is not None,
         "heldout": provenance["heldout"],
         "arrays": len(arrays),
         "network": None if network is None else str(network),
@@ -112,7 +127,7 @@ def export_bundle(
 
 
 def _network_files(path: Path, model: Model, channels: list[str]) -> tuple[dict[str, bytes], dict[str, Any]]:
-    """ONNX files of a trained approximator, and what its own file says of it."""
+    """ONNX files of a trained approximator, and the facts that its file records."""
     from trainer.networks.approximator import read_approximator
     from trainer.networks.onnx_files import onnx_files
 
@@ -139,7 +154,7 @@ def _network_files(path: Path, model: Model, channels: list[str]) -> tuple[dict[
 
 
 def acting_on_display(model: Model) -> Model:
-    """The model with the effects that the eye sees too, and no others."""
+    """The model with only the effects that act on the display, which the eye sees too."""
     return replace(model, present=tuple(p for p in model.present if p.effect.acts_on == "display"))
 
 

@@ -11,7 +11,17 @@ from trainer.model.model import Model
 
 
 def recorded(model: Model, name: str | None, errors: PredictionErrors, dropped: str | None = None) -> Model:
-    """The model with one more record in its history."""
+    """The model with one more record in its history.
+
+    Parameters
+    ----------
+    name : str or None
+        The effect that was added; None for none.
+    errors : PredictionErrors
+        Held-out errors of the model.
+    dropped : str, optional
+        The effect that was taken out.
+    """
     record: dict[str, Any] = {
         "added": name or "",
         **errors.as_json(),

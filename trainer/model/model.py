@@ -17,7 +17,18 @@ Values = dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class EffectInstance:
-    """An effect in a model: its order, and its parameters' values and standard errors."""
+    """An effect in a model.
+
+    Attributes
+    ----------
+    effect : Effect
+    order : int
+        Of its map or curve.
+    values : dict of float64 arrays
+        By parameter, in the parameter's unit.
+    errors : dict of float64 arrays or None
+        Standard errors, shaped as `values`; None where nothing was fitted.
+    """
 
     effect: Effect
     order: int
@@ -25,19 +36,27 @@ class EffectInstance:
     errors: Values | None = None
 
     def with_values(self, values: Mapping[str, np.ndarray]) -> EffectInstance:
-        """The same with other values; errors are forgotten."""
+        """The same with other values, without errors."""
         return replace(self, values=dict(values), errors=None)
 
 
 @dataclass(frozen=True)
 class Model:
-    """The light path that is believed in.
+    """A model of a bench's light path.
 
-    present : effects in the order in which they were added
-    gain : counts a unit of irradiance and millisecond, by channel; empty before anything was fitted
-    method : propagation
-    history : one record a step: what was added, and the held-out error after it
-    panel_field : maps of the panel's learned field by name, float32 [m, n]; None: nothing was learned
+    Attributes
+    ----------
+    bench : Bench
+    present : tuple of EffectInstance
+        Effects in the order in which they were added.
+    gain : mapping
+        Camera counts a unit of irradiance and millisecond, by channel; empty before anything was fitted.
+    method : str
+        Of propagation.
+    history : tuple of dict
+        One record a step: what was added, and the held-out errors after it.
+    panel_field : mapping or None
+        Maps of the panel's learned field by name, float32 [m, n]; None where nothing was learned.
     """
 
     bench: Bench
@@ -76,7 +95,7 @@ class Model:
 
 
 def absent(effect: Effect, bench: Bench, order: int | None = None) -> EffectInstance:
-    """The effect at the values at which it is not there, at its lowest order unless another is given."""
+    """The effect at the values at which it changes nothing, at its lowest order unless another is given."""
     order = effect.orders[0] if order is None else order
     channels = len(bench.channels)
     values = {

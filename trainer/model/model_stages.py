@@ -18,7 +18,13 @@ IRIS_ROOM = 1.25  # how far an effect may open or move the iris, in units of wha
 
 
 def scene_for(model: Model, channel: str, plane_mm: float, dtype: torch.dtype = torch.float32) -> Scene:
-    """The scene of a model. Raises InputError where the propagation method's sampling does not hold."""
+    """The scene of a model for one colour and plane.
+
+    Raises
+    ------
+    InputError
+        Where the propagation method's sampling does not reach the plane.
+    """
     opened = IRIS_ROOM if any(p.effect.touches_iris for p in model.present) else 1.0
     return scene_at(model.bench, channel, plane_mm, model.method, opened, dtype)
 
@@ -26,8 +32,12 @@ def scene_for(model: Model, channel: str, plane_mm: float, dtype: torch.dtype = 
 def stages_for(scene: Scene, present: tuple[EffectInstance, ...], tensors: Any = None) -> Stages:
     """The scene's stages with effects applied in the order of `present`.
 
-    `tensors` gives {effect name: {parameter: tensor}} where values are to be differentiated; others are taken from
-    `present`. Per-channel parameters are cut to the scene's own colour.
+    Per-channel parameters are cut to the scene's own colour.
+
+    Parameters
+    ----------
+    tensors : mapping, optional
+        {effect name: {parameter: tensor}} of values to differentiate; the others are taken from `present`.
     """
     stages = bare_stages(scene)
     row = scene.channel_row()
@@ -56,7 +66,20 @@ def stages_of(scene: Scene, model: Model) -> Stages:
 
 
 def ideal_irradiance(bench: Bench, gray: np.ndarray, channel: str, plane_mm: float) -> np.ndarray:
-    """What the bench file alone predicts for one pattern: float32 [h, w] in camera pixels, of arbitrary scale."""
+    """What the bench file alone predicts for one pattern.
+
+    Parameters
+    ----------
+    gray : uint8 array [H, W]
+        Gray levels as sent to the panel.
+    plane_mm : float, mm
+        Panel to image plane.
+
+    Returns
+    -------
+    float32 array [h, w]
+        In camera pixels, of arbitrary scale.
+    """
     model = Model(bench)
     scene = scene_for(model, channel, plane_mm)
     stages = stages_for(scene, ())

@@ -1,7 +1,7 @@
 """A model as the text of its TOML file: written for a person to read and edit.
 
-Numbers are written with all their digits, so reading gives the same model back. Arrays that are too long for
-a text are left to the caller, under the name ``effect.parameter.value``.
+Numbers are written with all their digits, so reading gives the same model back. Arrays that are too long for a text
+are given to the caller to store, under the name ``effect.parameter.value``.
 """
 
 from __future__ import annotations
@@ -31,8 +31,12 @@ Store = Callable[[str, np.ndarray], str]
 def model_text(model: Model, about: Mapping[str, Any] | None, store: Store) -> str:
     """The TOML of a model, without the table that names the file of its long arrays.
 
-    about : free text, numbers and lists on where the model comes from
-    store : `(name, array) -> name`, called for each array of more than LONGEST numbers
+    Parameters
+    ----------
+    about : mapping or None
+        Free text, numbers and lists on where the model comes from.
+    store : callable
+        `(name, array) -> name`, called for each array of more than LONGEST numbers.
     """
     parts = [_head(), *_about(about), _bench(model.bench)]
     parts.append(f"[propagation]\nmethod = {literal(model.method)}")
@@ -69,7 +73,10 @@ def allowed(parameter: Parameter) -> str:
 def literal(value: Any) -> str:
     """TOML for text, a truth value, a number, a list or a table; entries that are None are left out.
 
-    Raises InputError for anything else.
+    Raises
+    ------
+    InputError
+        For a value of any other type.
     """
     if isinstance(value, (bool, np.bool_)):
         return "true" if value else "false"

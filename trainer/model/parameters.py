@@ -32,7 +32,7 @@ def _plain(parameter: Parameter, values: np.ndarray, bench: Bench) -> Any:
 
 
 def describe(present: EffectInstance, bench: Bench) -> str:
-    """The effect's size in physical units with an error, in a few words: what differs from "absent"."""
+    """The effect's parameters that differ from "absent", with units and errors, in one line."""
     words = []
     for p in present.effect.parameters:
         values = present.values[p.name]

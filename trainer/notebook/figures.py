@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from trainer.diagnosis.compare import Picture
+from trainer.diagnosis.compare import CapturePicture
 from trainer.formatting import percent
 
 
@@ -26,7 +26,7 @@ class NotebookFigure(Figure):
         return stream.getvalue()
 
 
-def comparison_figure(pictures: Sequence[Picture]) -> NotebookFigure:
+def comparison_figure(pictures: Sequence[CapturePicture]) -> NotebookFigure:
     """The first picture of a comparison: measured, predicted, difference."""
     figure = NotebookFigure(figsize=(9.0, 2.6), layout="constrained")
     _draw_picture(figure.subplots(1, 3), pictures)
@@ -34,7 +34,7 @@ def comparison_figure(pictures: Sequence[Picture]) -> NotebookFigure:
 
 
 def explanation_figure(
-    ladder: Sequence[Mapping[str, Any]], noise: float, pictures: Sequence[Picture]
+    ladder: Sequence[Mapping[str, Any]], noise: float, pictures: Sequence[CapturePicture]
 ) -> NotebookFigure:
     """The error after each step of a ladder, and the first picture of a comparison below it.
 
@@ -44,7 +44,7 @@ def explanation_figure(
         Keys `added`, `removed` and `nrmse`.
     noise : float
         The nrmse of the camera's noise alone.
-    pictures : sequence of Picture
+    pictures : sequence of CapturePicture
         Of the last model.
 
     Returns
@@ -86,7 +86,7 @@ def _change(step: Mapping[str, Any]) -> str:
     return f"+ {step['added']}" if step["added"] else f"− {step['removed']}"
 
 
-def _draw_picture(axes: Sequence[Axes], pictures: Sequence[Picture]) -> None:
+def _draw_picture(axes: Sequence[Axes], pictures: Sequence[CapturePicture]) -> None:
     if not pictures:
         for one in axes:
             one.set_axis_off()

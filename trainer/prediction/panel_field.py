@@ -1,8 +1,8 @@
 """The panel's learned field: what acts on the wave at the panel and is no named effect.
 
 One free complex map multiplies what leaves the panel. Another is added to it, which no pattern modulates. Both are
-learned from captures through the physical model (`trainer.fitting.learn_field`). Absent, they change nothing at all. A
-stripe, a speck of dust or a scratch is corrected there as a wave; a network on irradiance cannot do that. The headset
+learned from captures through the physical model (`trainer.fitting.learned_field`). Absent, they change nothing at all.
+A stripe, a speck of dust or a scratch is corrected there as a wave; a network on irradiance cannot do that. The headset
 needs nothing new for it, because the maps become part of its source and leak.
 """
 

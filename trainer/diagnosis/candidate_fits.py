@@ -1,9 +1,4 @@
-"""Trying effects on a model: a quick screen of all, and real fits of some. Each is a task that any process can run.
-
-The screen is a score test: how much of the residual lies in the span of the effect's derivative at "absent" (or at
-the best of its starting points, where the derivative at absent does not reach), with the gains and the parameters of
-all present effects projected out.
-"""
+"""Fits of one candidate effect on a model, judged on held-out captures: tasks that any process can run."""
 
 from __future__ import annotations
 
@@ -13,7 +8,6 @@ from pathlib import Path
 from runtime.excess import PredictionErrors
 from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet, chosen, opened
-from trainer.fitting.gauss_newton import FitResult
 from trainer.fitting.predictor import evaluate_captures
 from trainer.fitting.refit import fit_from, least_for_order, raise_order, settled
 from trainer.model.model import EffectInstance, Model
@@ -21,11 +15,20 @@ from trainer.model.model import EffectInstance, Model
 
 @dataclass(frozen=True)
 class CandidateFit:
-    """A fitted candidate: the model with it, and its held-out errors."""
+    """A fitted candidate.
+
+    Attributes
+    ----------
+    effect : str
+        Name of the candidate.
+    model : Model
+        With the candidate in it.
+    held_out : PredictionErrors
+        Errors of `model` on the held-out captures.
+    """
 
     effect: str
     model: Model
-    fitted_excess: float
     held_out: PredictionErrors
 
 
@@ -38,14 +41,24 @@ def try_effect(
     raising: bool,
     iterations: int = 8,
 ) -> CandidateFit:
-    """Fit one effect, with present ones as they are, and judge it on held-out captures."""
+    """Fit one effect, with present ones as they are, and judge it on held-out captures.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the capture set.
+    ids, held_ids : tuple of str
+        Captures to fit, and captures to judge by.
+    raising : bool
+        Raise the effect's order as far as that helps.
+    """
     captures = opened(folder)
     batches = load(captures, chosen(captures, ids))
     name = start.effect.name
     fitted = fit_from(model, start, batches, iterations)
     if raising:
         fitted = raise_order(fitted, name, batches, least_for_order)
-    return _judged(name, fitted, captures, held_ids)
+    return _judged(name, fitted.model, captures, held_ids)
 
 
 def try_together(
@@ -53,9 +66,9 @@ def try_together(
 ) -> CandidateFit:
     """Fit all effects of a model together, and judge it on held-out captures as an explanation by effect `name`."""
     captures = opened(folder)
-    return _judged(name, settled(model, load(captures, chosen(captures, ids))), captures, held_ids)
+    fitted = settled(model, load(captures, chosen(captures, ids)))
+    return _judged(name, fitted.model, captures, held_ids)
 
 
-def _judged(name: str, fitted: FitResult, captures: CaptureSet, held_ids: tuple[str, ...]) -> CandidateFit:
-    held_out = evaluate_captures(captures, chosen(captures, held_ids), fitted.model)
-    return CandidateFit(name, fitted.model, fitted.errors.excess, held_out)
+def _judged(name: str, model: Model, captures: CaptureSet, held_ids: tuple[str, ...]) -> CandidateFit:
+    return CandidateFit(name, model, evaluate_captures(captures, chosen(captures, held_ids), model))

@@ -1,7 +1,8 @@
-"""Learning the panel's field from captures: what acts on the wave there and no effect names.
+"""The panel's field, learned from captures: what acts on the wave at the panel and no effect describes.
 
-Most probable maps given the captures: squared errors in units of the noise's variance, and a Gaussian prior a pixel
-about "absent", which holds what the captures do not say. Stopped by captures that the gradient does not see.
+The most probable maps given the captures: squared errors in units of the noise's variance, and a Gaussian prior a
+pixel around "absent", which decides where the captures do not. The descent is stopped by captures that the gradient
+does not use.
 """
 
 from __future__ import annotations
@@ -33,22 +34,30 @@ SPREAD = {
     "added_real": 0.03,
     "added_imaginary": 0.03,
 }  # of the prior, UNITS
-FLOOR = 0.1  # of the mean noise variance, added to each pixel's: no dark pixel is trusted without end
-ITERATIONS, ROUNDS = 10, 20  # between two looks at the captures that say when to stop; of such
-REFITS = 8  # iterations of the effects' fit beside the field
+FLOOR = 0.1  # of the mean noise variance, added to each pixel's, which limits the weight of dark pixels
+ITERATIONS, ROUNDS = 10, 20  # between two checks of the captures that say when to stop; most checks
+REFITS = 8  # iterations of the effects' fit together with the field
 REFINED, REFINED_ROUNDS = 0.1, 10  # share of the prior's spread, and rounds, for the field of one picture
 
 
 @dataclass(frozen=True)
-class LearnedField:
-    """A model with its learned field, and held-out errors without and with it."""
+class PanelFieldFit:
+    """A model with a learned panel field, and its held-out errors.
+
+    Attributes
+    ----------
+    model : Model
+        With the field.
+    before, after : PredictionErrors
+        Without and with the field.
+    """
 
     model: Model
     before: PredictionErrors
     after: PredictionErrors
 
     def as_json(self) -> dict[str, Any]:
-        """For `--json`: both errors, and the range of each map over the panel's pixels."""
+        """Keys `before` and `after` (errors), and `maps`: `lowest` and `highest` of each over the panel's pixels."""
         assert self.model.panel_field is not None
         maps = {
             f"{name}_{unit}" if unit != "1" else name: {
@@ -62,17 +71,27 @@ class LearnedField:
 
 def learn_field(
     captures: CaptureSet, model: Model, progress: Callable[[float], None] | None = None
-) -> LearnedField:
-    """The model with a field learned from the captures that fits may see, judged on the others.
+) -> PanelFieldFit:
+    """Learn a model's panel field from the captures that fits may use, and judge it on the others.
 
-    A field that is there already is learned anew. Raises InputError as the capture set's reader does.
+    A field that the model already has is replaced.
+
+    Parameters
+    ----------
+    progress : callable, optional
+        Called with the share that is done, 0 .. 1.
+
+    Raises
+    ------
+    InputError
+        As the capture set's reader does.
     """
-    parts = split(captures)
-    model = with_gains(captures, replace(model, gain={}, panel_field=None), parts.fitted)
-    before = evaluate_captures(captures, parts.held_out, model)
-    learned = with_learned_field(captures, parts.fitted, model, progress)
-    after = evaluate_captures(captures, parts.held_out, learned)
-    return LearnedField(recorded(learned, NAME, after), before, after)
+    divided = split(captures)
+    model = with_gains(captures, replace(model, gain={}, panel_field=None), divided.fitted)
+    before = evaluate_captures(captures, divided.held_out, model)
+    learned = with_learned_field(captures, divided.fitted, model, progress)
+    after = evaluate_captures(captures, divided.held_out, learned)
+    return PanelFieldFit(recorded(learned, NAME, after), before, after)
 
 
 def with_learned_field(
@@ -81,19 +100,26 @@ def with_learned_field(
     model: Model,
     progress: Callable[[float], None] | None = None,
 ) -> Model:
-    """The model, whose gains are fitted, with a field learned from these captures.
+    """The model with a field learned from these captures.
 
-    Its effects were fitted to light that the field was missing from, so they are fitted once more beside the field,
-    and the field is learned anew beside them. The last capture of each colour and plane says when to stop, and is not
-    learned from unless it is the only one.
+    The model's effects were fitted without the field, so they are fitted once more with it, and the field is learned
+    again with them. The last capture of each colour and plane says when to stop, and is not learned from unless it is
+    the only one.
+
+    Parameters
+    ----------
+    model : Model
+        With fitted gains.
+    progress : callable, optional
+        Called with the share that is done, 0 .. 1.
     """
-    say = progress or (lambda done: None)
+    report = progress or (lambda done: None)
     last = list({(c.channel, c.plane_mm): c for c in rows}.values())
     first = [c for c in rows if c not in last] or list(rows)
 
     def learned(begin: Model, share: float) -> Model:
-        seen, unseen = (_working(begin, load(captures, part)) for part in (first, last))
-        found = _descend(begin, SPREAD, seen, unseen, ROUNDS, lambda done: say(share + 0.5 * done))
+        fitted, stopping = (_in_noise_units(begin, load(captures, part)) for part in (first, last))
+        found = _descend(begin, SPREAD, fitted, stopping, ROUNDS, lambda done: report(share + 0.5 * done))
         return replace(begin, panel_field=found)
 
     once = learned(model, 0.0)
@@ -106,29 +132,33 @@ def with_learned_field(
 
 
 def with_refined_field(model: Model, sets: Sequence[tuple[CaptureSet, Sequence[Capture]]]) -> Model:
-    """The model with its field refined for the few pictures of these captures (seed section 7, on the wave).
+    """The model with its field refined for the few pictures of these captures.
 
-    What pixels of this size cannot say of dust and the like differs from picture to picture; near one picture's
-    patterns a slightly different field says it.
+    Dust and other structure finer than the pixels acts differently on each picture; near one picture's patterns a
+    slightly different field describes it.
+
+    References
+    ----------
+    Chakravarthula et al. 2020, section 7, here on the wave at the panel.
     """
     assert model.panel_field is not None
     narrow = {name: REFINED * spread for name, spread in SPREAD.items()}
-    seen = []
+    batches = []
     for captures, rows in sets:
-        seen += _working(with_gains(captures, replace(model, gain={}), rows), load(captures, rows))
-    found = _descend(model, narrow, seen, seen, REFINED_ROUNDS)
+        batches += _in_noise_units(with_gains(captures, replace(model, gain={}), rows), load(captures, rows))
+    found = _descend(model, narrow, batches, batches, REFINED_ROUNDS)
     return replace(model, panel_field=combined(model.panel_field, found))
 
 
 def _descend(
     model: Model,
     spread: Mapping[str, float],
-    seen: Sequence[FreeFormBatch],
-    unseen: Sequence[FreeFormBatch],
+    fitted: Sequence[FreeFormBatch],
+    stopping: Sequence[FreeFormBatch],
     rounds: int,
     progress: Callable[[float], None] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Most probable maps on top of the model; a unit of the optimiser's variables is large, over the whole panel."""
+    """Most probable maps beyond the model; a unit of the optimiser's variables is a large change of the panel."""
     height, width = model.bench.panel.shape
     unit = 5 * math.sqrt(height * width)
     shapes: dict[str, tuple[tuple[int, ...], float]] = {n: ((height, width), unit * spread[n]) for n in UNITS}
@@ -136,13 +166,13 @@ def _descend(
     def apply(stages: Stages, maps: Tensors) -> Stages:
         return replace(stages, panel=with_field(stages.panel, maps))
 
-    kind = FreeFormStage("panel", shapes, apply, lambda maps: [], spread)
-    pixels = sum(float((w.batch.mask > 0).sum()) for w in seen)
-    found = descend(kind, seen, unseen, max(pixels, 1.0), ITERATIONS, rounds, progress)
+    free = FreeFormStage("panel", shapes, apply, lambda maps: [], spread)
+    pixels = sum(float((b.batch.mask > 0).sum()) for b in fitted)
+    found = descend(free, fitted, stopping, max(pixels, 1.0), ITERATIONS, rounds, progress)
     return {name: surface.numpy() for name, surface in found.items()}
 
 
-def _working(model: Model, batches: Sequence[Batch]) -> list[FreeFormBatch]:
+def _in_noise_units(model: Model, batches: Sequence[Batch]) -> list[FreeFormBatch]:
     """Batches whose squared errors are multiples of the noise's variance."""
     found = []
     for batch in batches:

@@ -1,0 +1,196 @@
+"""Candidates fitted to the captures, and ranked by the held-out excess that each removes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from runtime.excess import PredictionErrors, RemovedExcess, removed_excess
+from trainer.captures.held_out import CaptureRoles
+from trainer.diagnosis.candidate_fits import CandidateFit, try_effect, try_together
+from trainer.diagnosis.screen import ScreenResult
+from trainer.diagnosis.verdict import Thresholds
+from trainer.effects.definition import Effect
+from trainer.effects.effect_catalogue import Catalogue
+from trainer.fitting.pool import Pool
+from trainer.model.model import Model
+from trainer.model.parameters import json_values
+
+FITTED_TOGETHER = 3  # candidates fitted with the present effects free, when none explains anything alone
+
+
+@dataclass(frozen=True)
+class RankedEffect:
+    """A candidate in the ranking.
+
+    Attributes
+    ----------
+    model : Model
+        The diagnosed model with the candidate fitted in it.
+    held_out : PredictionErrors
+        Errors of `model` on the held-out captures.
+    removed : RemovedExcess
+        Held-out excess that the candidate removes.
+    worth_adding : bool
+        The removal is real, and it matters.
+    indistinguishable_from : tuple of str
+        Candidates that these captures cannot tell it from.
+    """
+
+    effect: Effect
+    model: Model
+    held_out: PredictionErrors
+    removed: RemovedExcess
+    worth_adding: bool
+    indistinguishable_from: tuple[str, ...] = ()
+
+    @property
+    def base(self) -> Model:
+        """The model without the candidate; other effects as they were fitted with it."""
+        return self.model.without(self.effect.name)
+
+    def as_json(self) -> dict[str, Any]:
+        """A row of the key `ranking` of `diagnose --json`.
+
+        Keys `effect`, `stage`, `excess_after`, `excess_removed`, `ci95`, `worth_adding`, `parameters` and
+        `indistinguishable_from`.
+        """
+        low, high = self.removed.interval()
+        return {
+            "effect": self.effect.name,
+            "stage": self.effect.stage,
+            "excess_after": self.held_out.excess,
+            "excess_removed": self.removed.value,
+            "ci95": [low, high],
+            "worth_adding": self.worth_adding,
+            "parameters": json_values(self.model.instance(self.effect.name), self.model.bench),
+            "indistinguishable_from": list(self.indistinguishable_from),
+        }
+
+
+def try_all(
+    roles: CaptureRoles,
+    model: Model,
+    before: PredictionErrors,
+    screened: Sequence[ScreenResult],
+    pool: Pool,
+    report: Callable[[float, str], None],
+    start: float,
+    end: float,
+) -> list[CandidateFit]:
+    """Fit candidates at their lowest order, then raise the order of those that do about as well as the best.
+
+    Parameters
+    ----------
+    before : PredictionErrors
+        Held-out errors of `model`.
+    report : callable
+        Called with the share of the whole diagnosis that is done, and what is being done.
+    start, end : float
+        Shares of the diagnosis at which these fits begin and end.
+    """
+    ids = tuple(c.capture for c in roles.fitted)
+    held = tuple(c.capture for c in roles.held_out)
+
+    def fitted(count: int) -> None:
+        report(start + (end - start) * count / max(1, len(screened)), "fitting candidates")
+
+    tasks = [(roles.folder, ids, held, model, s.start, False) for s in screened]
+    fits = pool.map(try_effect, tasks, fitted)
+    if not fits:
+        return []
+    least, most = min(f.held_out.excess for f in fits), before.excess
+    again = [
+        k
+        for k, f in enumerate(fits)
+        if len(f.model.instance(f.effect).effect.orders) > 1
+        and most - f.held_out.excess > 0.3 * (most - least)
+    ]
+    tasks = [
+        (
+            roles.folder,
+            ids,
+            held,
+            replace(model, gain=fits[k].model.gain),
+            fits[k].model.instance(fits[k].effect),
+            True,
+        )
+        for k in again
+    ]
+    raised = pool.map(try_effect, tasks, lambda count: report(end, "raising orders"))
+    for k, better in zip(again, raised, strict=True):
+        fits[k] = better
+    return fits
+
+
+def try_together_with_present(
+    roles: CaptureRoles, model: Model, fits: Sequence[CandidateFit], pool: Pool
+) -> tuple[PredictionErrors, list[CandidateFit]]:
+    """Fit the candidates that came closest once more, each together with the effects that are present.
+
+    An effect that was added alone may have taken up a part of one that is still missing, and then hides it.
+
+    Returns
+    -------
+    PredictionErrors
+        Held-out errors of the present effects alone, all fitted together.
+    list of CandidateFit
+    """
+    ids = tuple(c.capture for c in roles.fitted)
+    held = tuple(c.capture for c in roles.held_out)
+    closest = sorted(fits, key=lambda f: f.held_out.excess)[:FITTED_TOGETHER]
+    tasks = [(roles.folder, ids, held, model, "")]
+    tasks += [(roles.folder, ids, held, f.model, f.effect) for f in closest]
+    without, *together = pool.map(try_together, tasks)
+    return without.held_out, together
+
+
+def rank(
+    before: PredictionErrors,
+    fits: Sequence[CandidateFit],
+    known: Catalogue,
+    thresholds: Thresholds,
+    ideal_excess: float,
+    candidates: int,
+) -> list[RankedEffect]:
+    """Candidates by excess removed, each with those that the captures cannot tell it from.
+
+    Parameters
+    ----------
+    before : PredictionErrors
+        Held-out errors without any of the candidates.
+    ideal_excess : float
+        Held-out excess of the bench file's own model.
+    candidates : int
+        How many were screened, which the test of each is corrected for.
+    """
+    complete = thresholds.complete(before.excess, ideal_excess)
+    ordered = sorted(fits, key=lambda f: f.held_out.excess)
+    ranked = []
+    for one in ordered:
+        removed = removed_excess(before, one.held_out)
+        worth_adding = not complete and thresholds.worth_adding(removed, ideal_excess, candidates)
+        alike = tuple(
+            other.effect
+            for other in ordered
+            if other is not one
+            and worth_adding
+            and _inseparable(one, other, before, thresholds, ideal_excess, candidates)
+        )
+        ranked.append(RankedEffect(known[one.effect], one.model, one.held_out, removed, worth_adding, alike))
+    return ranked
+
+
+def _inseparable(
+    one: CandidateFit,
+    other: CandidateFit,
+    before: PredictionErrors,
+    thresholds: Thresholds,
+    ideal_excess: float,
+    candidates: int,
+) -> bool:
+    if not thresholds.worth_adding(removed_excess(before, other.held_out), ideal_excess, candidates):
+        return False
+    worse, better = (one, other) if one.held_out.excess > other.held_out.excess else (other, one)
+    return thresholds.inseparable(removed_excess(worse.held_out, better.held_out), better.held_out.excess)
