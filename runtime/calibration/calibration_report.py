@@ -18,10 +18,9 @@ from PIL import Image
 
 from runtime.bundle.whole_files import whole_file
 from runtime.calibration.calibrate import Calibration
-from runtime.calibration.command import sentence_of
 from runtime.calibration.response import Sweep
 from runtime.calibration.shown_patterns import proof_picture
-from runtime.calibration.summary import numbers
+from runtime.calibration.summary import numbers, sentence_of
 from runtime.solver.targets import encode_srgb
 
 WIDTH = 320  # of a picture, screen pixels
@@ -72,9 +71,9 @@ def write_report(path: Path, found: Calibration, replaced: bool) -> None:
         _row([_signed(r, "σ", "as it was", 8.0) for r in found.before.residuals]),
         _row([_signed(r, "σ", "refitted", 8.0) for r in found.after.residuals]),
         "<h2>Where the camera looks</h2>",
-        _row([_gray(t.dots.signal, f"Dots as the camera saw them, {c}") for c, t in found.shots.items()]),
+        _row([_gray(t.dots.signal, f"Dots as the camera saw them, {c}") for c, t in found.captures.items()]),
         _registration(values),
-        f"<p>{found.captures} pictures were taken in {found.seconds['capturing']:.1f} s and explained in "
+        f"<p>{found.pictures_taken} pictures were taken in {found.seconds['capturing']:.1f} s and explained in "
         f"{found.seconds['fitting']:.1f} s, in the plane at {found.plane_mm:g} mm.</p>",
     ]
     page = (

@@ -49,7 +49,7 @@ def run(args: Namespace) -> dict[str, Any]:
     from runtime.calibration.bundle_replacement import previous, replace_bundle, restore_bundle
     from runtime.calibration.calibrate import calibrate
     from runtime.calibration.calibration_report import write_report
-    from runtime.calibration.summary import numbers
+    from runtime.calibration.summary import numbers, sentence_of
     from runtime.headset.open_devices import open_devices
 
     if args.restore:
@@ -117,30 +117,3 @@ def _power(colour: dict[str, Any]) -> str:
     steady = f"steady to {100 * colour['power_spread']:.2f} %"
     change = colour["power_change"]
     return steady if change is None else f"{100 * change:+.1f} % since the last calibration, {steady}"
-
-
-def sentence_of(found: dict[str, Any], replaced: bool) -> str:
-    """The verdict in plain words."""
-    before, after = found["heldout"]["before"]["excess"], found["heldout"]["after"]["excess"]
-    if found["verdict"] == "unchanged" and found["camera_scale"] is not None:
-        return (
-            f"Nothing has drifted for certain (excess {before:.2g} on held-out patterns): the camera's scale is off by "
-            f"{found['camera_scale']:+.5f}, or defocus and distance have drifted as below, which at one plane looks "
-            "the same; nothing was replaced. To know, register the camera again."
-        )
-    if found["verdict"] == "unchanged":
-        return (
-            f"Nothing has drifted that the camera can see: the excess on held-out patterns is {before:.2g}."
-        )
-    if found["verdict"] == "not_explained":
-        return (
-            f"The light path does not fit (excess {before:.2g} on held-out patterns) and refitting what drifts does "
-            f"not mend it ({after:.2g}): take captures and run hololoop-trainer diagnose; nothing was replaced."
-        )
-    done = "it was replaced" if replaced else "nothing was replaced, as asked"
-    more = (
-        ""
-        if found["complete"]
-        else ("; more is wrong than drifts here: take captures and run hololoop-trainer diagnose")
-    )
-    return f"The light path has drifted: the refit takes the excess from {before:.2g} to {after:.2g}; {done}{more}."

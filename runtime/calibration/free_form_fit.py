@@ -17,7 +17,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from runtime.calibration.drift import drifted, node_weights
-from runtime.calibration.drift_fit import Base, Estimate, Shot, gain_of, seen_by
+from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, gain_of, light_on_camera
 from runtime.camera.view import sampler_and_adjoint
 from runtime.lightpath.light_path import panel_phase
 from runtime.lightpath.light_path_adjoint import irradiance_and_pullback
@@ -32,7 +32,7 @@ Progress = Callable[[float], None]
 
 
 def fit_freeform(
-    bases: Mapping[str, Base],
+    bases: Mapping[str, ColourLightPath],
     shots: Sequence[Shot],
     start: Estimate,
     progress: Progress | None = None,
@@ -63,7 +63,7 @@ def fit_freeform(
             path, (sample, back) = paths[shot.channel], readers[bases[shot.channel].path.grid]
             phase = panel_phase(path, shot.gray.astype(np.int64))
             image, pullback = irradiance_and_pullback(path, phase, factor=True)
-            light = seen_by(start.view, sample, image)
+            light = light_on_camera(start.view, sample, image)
             gain = gain_of(shot, light)
             residual = shot.signal - gain * light
             total += float(np.vdot(shot.weight * residual, residual))

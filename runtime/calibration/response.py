@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.signal import find_peaks
 
 from firmware_iface.errors import InputError
-from runtime.calibration.drift_fit import Base, Estimate, Shot, predicted
+from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, predicted
 from runtime.calibration.shown_patterns import grating
 from runtime.camera.view import Sampler
 from runtime.lightpath.legendre import legendre_curve
@@ -42,7 +42,7 @@ class Sweep:
     visibility: np.ndarray
 
 
-def best_period(base: Base, channel: str, estimate: Estimate, sample: Sampler) -> int:
+def best_period(base: ColourLightPath, channel: str, estimate: Estimate, sample: Sampler) -> int:
     """The grating's period, pixels, whose phase is seen best in this plane: gratings image themselves at
     some distances, and there a phase shows nothing.
     """
@@ -54,12 +54,14 @@ def best_period(base: Base, channel: str, estimate: Estimate, sample: Sampler) -
     return max(PERIODS, key=seen)
 
 
-def _blank(channel: str, base: Base, period: int, gray: int) -> Shot:
+def _blank(channel: str, base: ColourLightPath, period: int, gray: int) -> Shot:
     nothing = np.zeros((1, 1), np.float32)
     return Shot(channel, grating(base.path.grid.shape, period, gray), nothing, nothing)
 
 
-def measured_sweep(base: Base, shots: Sequence[Shot], estimate: Estimate, sample: Sampler) -> Sweep:
+def measured_sweep(
+    base: ColourLightPath, shots: Sequence[Shot], estimate: Estimate, sample: Sampler
+) -> Sweep:
     """The phase of each shot's brighter gray against gray 0, given all else of an estimate."""
     believed = estimate.drift.response.get(shots[0].channel, base.path.response)
     found = []
@@ -81,7 +83,9 @@ def measured_sweep(base: Base, shots: Sequence[Shot], estimate: Estimate, sample
     return Sweep(grays, unwrapped, errors, visibility)
 
 
-def _harmonics(base: Base, shot: Shot, estimate: Estimate, sample: Sampler) -> tuple[np.ndarray, ...]:
+def _harmonics(
+    base: ColourLightPath, shot: Shot, estimate: Estimate, sample: Sampler
+) -> tuple[np.ndarray, ...]:
     """A, B and C [h, w] of what the camera sees of a grating, for a phase d beyond what is believed."""
     gray = int(shot.gray.max())
     believed = np.asarray(estimate.drift.response.get(shot.channel, base.path.response), float)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware_iface.errors import InputError
-from runtime.calibration.drift_fit import Shot
+from runtime.calibration.estimate import Shot
 from runtime.headset.open_devices import Devices
 
 AIM, BRIGHTEST = 0.7, 0.999  # this share of full scale for this quantile of a picture

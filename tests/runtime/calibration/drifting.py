@@ -12,7 +12,7 @@ from firmware_iface.virtual import BenchDescription, VirtualHeadset
 from firmware_iface.virtual.defects import make_defect
 from runtime.bundle.bundle_folder import INITIALISER, write_bundle
 from runtime.bundle.light_path_arrays import pack_light_paths
-from runtime.calibration.drift_fit import Base
+from runtime.calibration.estimate import ColourLightPath
 from runtime.headset.open_devices import Devices
 from runtime.lightpath.legendre import edge_to_edge
 from tests.runtime.benches import ideal_path
@@ -39,9 +39,9 @@ def opened(headset: VirtualHeadset) -> Callable[[], AbstractContextManager[Devic
     return lambda: nullcontext(devices(headset))
 
 
-def base(shape: tuple[int, int] = SHAPE) -> Base:
+def base(shape: tuple[int, int] = SHAPE) -> ColourLightPath:
     """The light path that the bundle believes in: nothing wrong."""
-    return Base(ideal_path(shape, DISTANCE_MM * 1e-3, dtype=np.float32), WAVELENGTH_NM)
+    return ColourLightPath(ideal_path(shape, DISTANCE_MM * 1e-3, dtype=np.float32), WAVELENGTH_NM)
 
 
 def ideal_bundle(folder: Path, shape: tuple[int, int] = SHAPE) -> Path:

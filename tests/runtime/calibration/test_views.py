@@ -17,8 +17,7 @@ from runtime.bundle.bundle_folder import Bundle, read_bundle, write_bundle
 from runtime.bundle.light_path_arrays import load_light_path, pack_light_paths
 from runtime.calibration.bundle_replacement import replace_bundle
 from runtime.calibration.calibrate import calibrate
-from runtime.calibration.command import sentence_of
-from runtime.calibration.summary import numbers
+from runtime.calibration.summary import numbers, sentence_of
 from runtime.camera.registration import panel_points
 from runtime.camera.view import View, on_panel, sampler, view_of
 from runtime.lightpath.legendre import edge_to_edge
