@@ -31,7 +31,16 @@ class HeldOutErrors:
 def held_out_errors(
     bases: Mapping[str, ColourLightPath], shots: Sequence[Shot], estimate: Estimate
 ) -> HeldOutErrors:
-    """Errors of an estimate on shots, each with its own gain."""
+    """Errors of an estimate on shots that no fit has seen.
+
+    Parameters
+    ----------
+    bases : mapping of str to ColourLightPath
+        By colour.
+    shots : sequence of Shot
+        Each is predicted with its own best gain.
+    estimate : Estimate
+    """
     parts, residuals = [], []
     for number, shot in enumerate(shots):
         base = bases[shot.channel]

@@ -29,7 +29,15 @@ FEWEST = 0.6  # share of the expected dots that must be found
 
 @dataclass(frozen=True)
 class Dots:
-    """The dots of a pattern. xy : float [n, 2], panel pixels, row by row; the marker's two come first."""
+    """The dots of a pattern.
+
+    Attributes
+    ----------
+    xy : float array [n, 2], panel pixels
+        Centres, row by row; the marker's two come first.
+    spacing : float, panel pixels
+    columns, rows : int
+    """
 
     xy: np.ndarray
     spacing: float
@@ -38,9 +46,18 @@ class Dots:
 
 
 def dots_of(shape: tuple[int, int], spacing: float) -> Dots:
-    """The dots that `dot_pattern` shows on a panel of that shape (height, width); spacing in panel pixels.
+    """The dots that `dot_pattern` shows on a panel.
 
-    Raises InputError if fewer than 4 x 4 dots fit, or a dot would be too small to be shown.
+    Parameters
+    ----------
+    shape : (int, int)
+        (height, width) of the panel, pixels.
+    spacing : float, panel pixels
+
+    Raises
+    ------
+    InputError
+        If fewer than 4 x 4 dots fit, or a dot would be too small to be shown.
     """
     rows, columns = (int((n - 1.2 * spacing) // spacing) + 1 if spacing > 0 else 0 for n in shape)
     if not spacing >= 8 or rows < 4 or columns < 4:
@@ -54,9 +71,22 @@ def dots_of(shape: tuple[int, int], spacing: float) -> Dots:
 
 
 def dot_pattern(shape: tuple[int, int], spacing: float) -> np.ndarray:
-    """Irradiance to aim for, float32 [H, W], 0 to 1: Gaussian dots on black with an asymmetric marker.
+    """Gaussian dots on black with an asymmetric marker, as irradiance to aim for.
 
-    Raises InputError as `dots_of` does.
+    Parameters
+    ----------
+    shape : (int, int)
+        (H, W) of the panel, pixels.
+    spacing : float, panel pixels
+
+    Returns
+    -------
+    float32 array [H, W], 0 to 1
+
+    Raises
+    ------
+    InputError
+        As `dots_of` does.
     """
     dots = dots_of(shape, spacing)
     y, x = np.arange(shape[0])[:, None], np.arange(shape[1])[None]
@@ -69,12 +99,27 @@ def dot_pattern(shape: tuple[int, int], spacing: float) -> np.ndarray:
 
 
 def find_homography(image: np.ndarray, dots: Dots, believed: np.ndarray | None = None) -> np.ndarray:
-    """The homography, float64 [3, 3], from a camera picture [h, w] of a dot pattern.
+    """The homography of a camera from its picture of a dot pattern.
 
-    image : counts or any scale, uneven background allowed; mirrored and turned pictures are found as well
-    believed : a homography that is right to a quarter of the dots' spacing, for pictures in which the marker is not
-        told from other dots
-    Raises InputError if too few dots are seen, or they are not the expected grid.
+    Parameters
+    ----------
+    image : array [h, w]
+        In counts or any scale; an uneven background is allowed, and the picture may be mirrored and turned.
+    dots : Dots
+        Of the pattern.
+    believed : float array [3, 3], optional
+        A homography that is right to a quarter of the dots' spacing, for pictures in which the marker cannot be told
+        from other dots.
+
+    Returns
+    -------
+    float64 array [3, 3]
+        From camera pixels (x, y, 1) to panel pixels (x, y, 1) up to scale; its last number is 1.
+
+    Raises
+    ------
+    InputError
+        If too few dots are seen, or they are not the expected grid.
     """
     points, light = _spots(image)
     if len(points) < FEWEST * len(dots.xy):
@@ -104,7 +149,19 @@ def find_homography(image: np.ndarray, dots: Dots, believed: np.ndarray | None =
 
 
 def panel_points(homography: np.ndarray, camera_xy: np.ndarray) -> np.ndarray:
-    """Panel points, float [n, 2], for camera points (x, y), [n, 2], pixels."""
+    """Points of the panel that camera points look at.
+
+    Parameters
+    ----------
+    homography : float array [3, 3]
+    camera_xy : float array [n, 2], camera pixels
+        Points (x, y).
+
+    Returns
+    -------
+    float array [n, 2], panel pixels
+        Points (x, y).
+    """
     points = np.concatenate([camera_xy, np.ones((len(camera_xy), 1))], 1) @ np.asarray(homography).T
     return points[:, :2] / points[:, 2:]
 
@@ -141,6 +198,7 @@ def _spots(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _resized(picture: np.ndarray, shape: tuple[int, ...], method: Image.Resampling) -> np.ndarray:
+    """A picture [h, w] resized to `shape`."""
     return np.asarray(Image.fromarray(picture).resize((shape[1], shape[0]), method))
 
 
@@ -226,7 +284,7 @@ def _refined(points: np.ndarray, guess: np.ndarray, dots: Dots) -> tuple[float, 
         _, only = np.unique(index[keep], return_index=True)
         keep = keep[only]
         if reach > 1e6 and len(keep) > 16:
-            # the marker's dots lean on each other: they lead, but do not measure
+            # the marker's broad dots shift each other's centres: they guide the search, but are not measured
             keep = keep[index[keep] > 1]
         if len(keep) < 4:
             return None
@@ -245,9 +303,9 @@ def _fitted_map(
 ) -> np.ndarray | None:
     """The homography, or affine map, [3, 3], that takes camera points [n, 2] to panel points [n, 2], by OpenCV.
 
-    Points farther off than `tolerance` (panel pixels) have no say (RANSAC). None where there is no such map.
+    Points farther off than `tolerance` (panel pixels) are left out (RANSAC). None where there is no such map.
     """
-    import cv2  # the headset needs it for a dot pattern alone
+    import cv2  # only a dot pattern needs it on the headset
 
     if perspective:
         found, _ = cv2.findHomography(camera, panel, cv2.RANSAC, tolerance)

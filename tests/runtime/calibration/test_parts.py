@@ -21,7 +21,6 @@ from runtime.calibration.response import (
     best_period,
     fitted_response,
     measured_sweep,
-    phase_of_power,
 )
 from runtime.calibration.shown_patterns import grains, grating
 from runtime.calibration.taking import Taker
@@ -30,6 +29,7 @@ from runtime.excess import PredictionErrors, is_complete
 from runtime.lightpath.light_path import irradiance, panel_phase, pixel_irradiance
 from tests.runtime.benches import PITCH, ideal_path, random_path
 from tests.runtime.calibration.drifting import WAVELENGTH_NM, base, devices, drifted_bench, headset
+from tests.runtime.calibration.power_sweep import phase_of_power
 
 SMALL = (40, 52)
 
