@@ -104,7 +104,9 @@ def prediction_errors(
     """
     signal, prediction, noise, mask = (np.asarray(a) for a in (signal, prediction, noise, mask))
     squared = tile_sums(mask * (signal - prediction) ** 2)
-    count = np.maximum(mask.sum((-2, -1), dtype=np.float64), 1)  # a capture saturated throughout says nothing
+    count = np.maximum(
+        mask.sum((-2, -1), dtype=np.float64), 1
+    )  # a capture that is saturated everywhere has none
     mean = (mask * signal).sum((-2, -1), dtype=np.float64) / count
     variance = (mask * (signal - mean[:, None, None].astype(signal.dtype)) ** 2).sum(
         (-2, -1), dtype=np.float64

@@ -253,11 +253,13 @@ def rectified(picture: np.ndarray, y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
     Parameters
     ----------
-    picture : float array [h, w]
+    picture : array [h, w]
     y, x : float arrays [H, W], pixels of the picture
 
     Returns
     -------
-    array [H, W] of the picture's type
+    float array [H, W]
+        Of the picture's type; float32 for whole numbers.
     """
-    return np.asarray(ndimage.map_coordinates(picture, (y, x), order=3)).reshape(y.shape)
+    kind = picture.dtype if np.issubdtype(picture.dtype, np.floating) else np.float32
+    return np.asarray(ndimage.map_coordinates(picture, (y, x), output=kind, order=3)).reshape(y.shape)

@@ -161,3 +161,8 @@ def test_a_rectified_picture_is_read_at_places_and_0_outside() -> None:
     np.testing.assert_allclose(rectified(picture, v, u), np.sin(v / 6) + np.cos(u / 7), atol=1e-3)
     outside = rectified(np.ones((6, 8)), np.array([-0.1, 5.1, 3.0]), np.array([4.0, 4.0, 7.1]))
     assert outside.tolist() == [0, 0, 0]
+    for kind, result in ((np.uint16, np.float32), (np.float32, np.float32), (np.float64, np.float64)):
+        counts = (100 * picture + 200).astype(kind)
+        read = rectified(counts, v, u)
+        assert read.dtype == result
+        np.testing.assert_allclose(read, 200 + 100 * (np.sin(v / 6) + np.cos(u / 7)), atol=2)
