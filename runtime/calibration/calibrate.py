@@ -225,6 +225,7 @@ def _check(devices: Devices, channels: list[str], shape: tuple[int, int]) -> Non
 
 
 def _wavelength(bundle: Bundle, channel: str) -> float:
+    """Of a colour, nm."""
     return float(next(r["wavelength_nm"] for r in bundle_paths(bundle) if r["channel"] == channel))
 
 
