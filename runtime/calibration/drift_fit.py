@@ -2,7 +2,7 @@
 
 Derivatives over wavefront, beam and distance are the light path's own linearisation, 2 Re(z* dz); those of
 the camera's view cost no propagation. Each capture's gain follows in closed form (its columns are taken with
-the gain projected out), so laser power may wander while patterns are shown. Orders rise in steps: low ones
+the gain projected out), so laser power may change while patterns are shown. Orders rise in steps: low ones
 find the way from far, high ones then need to go only a little.
 
 The trainer has a Gauss-Newton fit of its own (`trainer/fitting/gauss_newton.py`). The two stay two on purpose.
@@ -44,7 +44,7 @@ class DriftFit:
     errors : Drift
         Standard errors of the estimate's drift, in its own shape.
     chi2 : float
-        Per pixel seen; 1 is the camera's noise alone.
+        Per pixel that counts; 1 is the camera's noise alone.
     """
 
     estimate: Estimate

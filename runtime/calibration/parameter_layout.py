@@ -70,14 +70,14 @@ class ParameterLayout:
         """The vector of an estimate."""
         drift, view = estimate.drift, estimate.view
         beams = [drift.log_amplitude[c] for c in self.channels]
-        seen = [getattr(view, name) for name, _ in self.view]
-        parts = [drift.wavefront_nm, *beams, [drift.distance_mm], seen, view.sensitivity, [view.stray]]
+        of_view = [getattr(view, name) for name, _ in self.view]
+        parts = [drift.wavefront_nm, *beams, [drift.distance_mm], of_view, view.sensitivity, [view.stray]]
         return np.concatenate([np.asarray(p, float) for p in parts])
 
     def moved(self, estimate: Estimate, step: np.ndarray) -> Estimate:
         """An estimate with a vector added to its numbers."""
         vector = self.numbers(estimate) + step
-        wavefront, beams, distance, seen = (
+        wavefront, beams, distance, of_view = (
             vector[a:b] for a, b in zip(self.edges[:-1], self.edges[1:], strict=True)
         )
         split = beams.reshape(len(self.channels), self.amplitude)
@@ -87,11 +87,11 @@ class ParameterLayout:
             log_amplitude=dict(zip(self.channels, split, strict=True)),
             distance_mm=float(distance[0]),
         )
-        values: dict[str, Any] = dict(zip((name for name, _ in self.view), map(float, seen), strict=False))
+        values: dict[str, Any] = dict(zip((name for name, _ in self.view), map(float, of_view), strict=False))
         for name in ("blur_y_px2", "blur_x_px2"):
             values[name] = max(values[name], SHARPEST)
-        sensitivity = tuple(float(v) for v in seen[len(self.view) : -1])
-        view = replace(estimate.view, sensitivity=sensitivity, stray=float(seen[-1]), **values)
+        sensitivity = tuple(float(v) for v in of_view[len(self.view) : -1])
+        view = replace(estimate.view, sensitivity=sensitivity, stray=float(of_view[-1]), **values)
         return Estimate(drift, view)
 
     def widened(self, estimate: Estimate) -> Estimate:

@@ -105,14 +105,14 @@ def _harmonics(
     """A, B and C [h, w] of what the camera sees of a grating, for a phase d beyond what is believed."""
     gray = int(shot.gray.max())
     believed = np.asarray(estimate.drift.response.get(shot.channel, base.path.response), float)
-    seen = []
+    trials = []
     for trial in TRIALS:
         response = believed.copy()
         response[gray] += trial
         drift = replace(estimate.drift, response={**estimate.drift.response, shot.channel: response})
-        seen.append(predicted(base, shot, replace(estimate, drift=drift), sample))
-    mean = (seen[0] + seen[1] + seen[2]) / 3
-    return mean, (2 * seen[0] - seen[1] - seen[2]) / 3, (seen[1] - seen[2]) / math.sqrt(3)
+        trials.append(predicted(base, shot, replace(estimate, drift=drift), sample))
+    mean = (trials[0] + trials[1] + trials[2]) / 3
+    return mean, (2 * trials[0] - trials[1] - trials[2]) / 3, (trials[1] - trials[2]) / math.sqrt(3)
 
 
 def fitted_response(believed: np.ndarray, sweep: Sweep) -> np.ndarray:
@@ -131,9 +131,9 @@ def fitted_response(believed: np.ndarray, sweep: Sweep) -> np.ndarray:
     levels = len(believed)
     t = np.arange(levels) / (levels - 1)
     shapes = t * legendre_curve(2 * t - 1, min(TERMS, len(sweep.gray)))
-    wanted = sweep.phase - (believed[sweep.gray] - believed[0])
+    deviation = sweep.phase - (believed[sweep.gray] - believed[0])
     weight = 1 / np.hypot(sweep.error, 1e-3)  # no panel is smoother than a milliradian
-    terms = np.linalg.lstsq((shapes[:, sweep.gray] * weight).T, wanted * weight, rcond=None)[0]
+    terms = np.linalg.lstsq((shapes[:, sweep.gray] * weight).T, deviation * weight, rcond=None)[0]
     response = believed + terms @ shapes
     steps = np.diff(believed)
     if (steps >= 0).all():

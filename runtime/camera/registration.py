@@ -260,9 +260,9 @@ def _guesses(points: np.ndarray, first: int, second: int, dots: Dots) -> list[np
     guesses = []
     for side in (1.0, -1.0):
         # the dot of the next row is where a right angle puts it, or the nearest that is seen
-        wanted = points[first] + side * np.array([-along[1], along[0]])
-        near = points[int(np.argmin(np.hypot(*(points - wanted).T)))]
-        if np.hypot(*(near - wanted)) > 0.45 * np.hypot(*along):
+        corner = points[first] + side * np.array([-along[1], along[0]])
+        near = points[int(np.argmin(np.hypot(*(points - corner).T)))]
+        if np.hypot(*(near - corner)) > 0.45 * np.hypot(*along):
             continue
         camera = np.stack([points[first], points[second], near])
         guess = _fitted_map(camera, dots.xy[[0, 1, dots.columns]], perspective=False)
