@@ -58,7 +58,7 @@ class PredictionErrors:
 
     @property
     def noise_nrmse(self) -> float:
-        """What `nrmse` would be with nothing but the camera's noise."""
+        """What `nrmse` would be with the camera's noise alone."""
         return math.sqrt(float(self.noise.sum() / self.variance.sum()))
 
     def by_capture(self) -> list[float]:
@@ -78,13 +78,27 @@ class PredictionErrors:
 
 @dataclass(frozen=True)
 class RemovedExcess:
-    """Excess that one prediction has and another has not, with its standard error."""
+    """Excess that one prediction has and another has not.
+
+    Attributes
+    ----------
+    value : float
+    error : float
+        Standard error of the value.
+    """
 
     value: float
     error: float
 
     def interval(self, confidence: float = CONFIDENCE, candidates: int = 1) -> tuple[float, float]:
-        """Two-sided interval at a confidence, corrected for the number of candidates tried (Bonferroni)."""
+        """Two-sided interval of the value.
+
+        Parameters
+        ----------
+        confidence : float, 0 to 1
+        candidates : int
+            How many were tried, for Bonferroni's correction.
+        """
         z = NormalDist().inv_cdf(1 - (1 - confidence) / (2 * candidates))
         return self.value - z * self.error, self.value + z * self.error
 
@@ -104,7 +118,9 @@ def prediction_errors(
     """
     signal, prediction, noise, mask = (np.asarray(a) for a in (signal, prediction, noise, mask))
     squared = tile_sums(mask * (signal - prediction) ** 2)
-    count = np.maximum(mask.sum((-2, -1), dtype=np.float64), 1)  # a capture saturated throughout says nothing
+    count = np.maximum(
+        mask.sum((-2, -1), dtype=np.float64), 1
+    )  # a capture that is saturated everywhere has none
     mean = (mask * signal).sum((-2, -1), dtype=np.float64) / count
     variance = (mask * (signal - mean[:, None, None].astype(signal.dtype)) ** 2).sum(
         (-2, -1), dtype=np.float64
@@ -142,7 +158,15 @@ def removed_excess(before: PredictionErrors, after: PredictionErrors) -> Removed
 def is_complete(
     excess: float, reference: float, share: float = COMPLETE_SHARE, least: float = COMPLETE_EXCESS
 ) -> bool:
-    """Whether an excess is too little to explain: below a share of a reference excess, or below a least one."""
+    """Whether an excess is too little to explain.
+
+    Parameters
+    ----------
+    excess, reference : float
+        What is left, and what there was before.
+    share, least : float
+        The excess is too little below the larger of `share` times the reference, and `least`.
+    """
     return excess < max(share * reference, least)
 
 

@@ -1,1 +1,1 @@
-"""Self-calibration: a headset finds out with its own camera what has drifted since its bundle was exported."""
+"""Self-calibration: a headset measures with its own camera what has drifted since its bundle was exported."""

@@ -1,4 +1,4 @@
-"""A bundle with a calibration put in, in place of the one that was there, which is kept."""
+"""Writes a calibrated bundle in place of the one that was there, which is kept; and puts that one back."""
 
 from __future__ import annotations
 
@@ -15,17 +15,29 @@ from runtime.calibration.summary import numbers
 
 
 def previous(folder: Path) -> Path:
-    """Where the bundle goes that a calibration replaces."""
+    """Where the bundle is kept that a calibration replaces."""
     whole = Path(os.path.realpath(folder))
     return whole.with_name(f"{whole.name}.previous")
 
 
 def replace_bundle(folder: Path, bundle: Bundle, found: Calibration) -> Path:
-    """Write a bundle whose light paths have the calibration's drift put in, at every colour and plane.
+    """Write a bundle whose light paths have the calibration's drift applied, at every colour and plane.
 
-    The folder holds the old bundle or the new one at every moment; the old one is kept beside it, and what stood
-    there before goes. Returns where the old one is. The camera's view goes into the description, and the
-    calibration's numbers are added to the provenance.
+    The folder holds the old bundle or the new one at every moment. The old one is kept next to it, in place of one kept
+    before. The camera's view goes into the description, and the calibration's numbers are added to the provenance.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the bundle.
+    bundle : Bundle
+        What the folder holds.
+    found : Calibration
+
+    Returns
+    -------
+    Path
+        Where the old bundle is.
     """
     drift, paths = found.estimate.drift, []
     for record in bundle_paths(bundle):
@@ -54,7 +66,10 @@ def replace_bundle(folder: Path, bundle: Bundle, found: Calibration) -> Path:
 def restore_bundle(folder: Path) -> None:
     """Put back the bundle that the last calibration replaced; the calibrated one goes to where that was.
 
-    Raises InputError where none was kept, or it is not whole.
+    Raises
+    ------
+    InputError
+        Where none was kept, or it is not whole.
     """
     kept = previous(folder)
     if not kept.is_dir():

@@ -20,8 +20,7 @@ from runtime.bundle.whole_files import whole_file
 from runtime.calibration.calibrate import Calibration
 from runtime.calibration.response import Sweep
 from runtime.calibration.shown_patterns import proof_picture
-from runtime.calibration.summary import numbers
-from runtime.calibration.verdict_sentence import sentence_of
+from runtime.calibration.summary import numbers, sentence_of
 from runtime.solver.targets import encode_srgb
 
 WIDTH = 320  # of a picture, screen pixels
@@ -40,7 +39,21 @@ td:first-child, th:first-child { text-align: left; }
 
 
 def write_report(path: Path, found: Calibration, replaced: bool) -> None:
-    """Write the report; the file appears whole or not at all. Raises InputError where it cannot be written."""
+    """Write the report; the file appears whole or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        An HTML file.
+    found : Calibration
+    replaced : bool
+        Whether the bundle was replaced.
+
+    Raises
+    ------
+    InputError
+        Where it cannot be written.
+    """
     values = numbers(found)
     shape = next(iter(found.bases.values())).path.grid.shape
     parts = [
@@ -72,9 +85,9 @@ def write_report(path: Path, found: Calibration, replaced: bool) -> None:
         _row([_signed(r, "σ", "as it was", 8.0) for r in found.before.residuals]),
         _row([_signed(r, "σ", "refitted", 8.0) for r in found.after.residuals]),
         "<h2>Where the camera looks</h2>",
-        _row([_gray(t.dots.signal, f"Dots as the camera saw them, {c}") for c, t in found.shots.items()]),
+        _row([_gray(t.dots.signal, f"Dots as the camera saw them, {c}") for c, t in found.captures.items()]),
         _registration(values),
-        f"<p>{found.captures} pictures were taken in {found.seconds['capturing']:.1f} s and explained in "
+        f"<p>{found.pictures_taken} pictures were taken in {found.seconds['capturing']:.1f} s and explained in "
         f"{found.seconds['fitting']:.1f} s, in the plane at {found.plane_mm:g} mm.</p>",
     ]
     page = (
@@ -86,6 +99,7 @@ def write_report(path: Path, found: Calibration, replaced: bool) -> None:
 
 
 def _heldout_table(values: dict[str, Any]) -> str:
+    """Errors on held-out patterns, before and after."""
     rows = "".join(
         f"<tr><td>{name}</td><td>{v['nrmse']:.4f}</td><td>{v['noise_nrmse']:.4f}</td><td>{v['excess']:.2g}</td></tr>"
         for name, v in (("as it was", values["heldout"]["before"]), ("refitted", values["heldout"]["after"]))
@@ -121,6 +135,7 @@ def _colour(found: Calibration, values: dict[str, Any], channel: str) -> str:
 
 
 def _registration(values: dict[str, Any]) -> str:
+    """Where the camera looks, in a sentence."""
     view = values["registration"]
     return (
         f"<p>Against its homography the camera is moved by {view['shift_y_px']:.3f} rows and "
@@ -131,7 +146,7 @@ def _registration(values: dict[str, Any]) -> str:
 
 
 def _free_form(found: Calibration, values: dict[str, Any]) -> list[str]:
-    """The part of the wavefront that no polynomial holds, where one was fitted."""
+    """A picture of the free-form part of the wavefront, where one was fitted."""
     if values["wavefront"]["free_form"]["nodes"] is None:
         return []
     shape = next(iter(found.bases.values())).path.grid.shape
@@ -140,6 +155,7 @@ def _free_form(found: Calibration, values: dict[str, Any]) -> list[str]:
 
 
 def _row(figures: Sequence[str]) -> str:
+    """Figures side by side."""
     return f'<div class="row">{"".join(figures)}</div>'
 
 
@@ -162,6 +178,7 @@ def _signed(values: np.ndarray, unit: str, caption: str, most: float | None = No
 
 
 def _figure(pixels: np.ndarray, caption: str) -> str:
+    """A picture, uint8 [h, w] or [h, w, 3], with its caption."""
     picture = Image.fromarray(pixels)
     if picture.width > 2 * WIDTH:
         picture.thumbnail((2 * WIDTH, 2 * WIDTH))

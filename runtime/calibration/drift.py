@@ -2,7 +2,7 @@
 
 The panel's wavefront and the beam multiply the source field and the leak, distance multiplies the transfer
 functions, and the response replaces the table. A tilt of the wavefront is left out: at one plane it is the
-same as a camera that has moved sideways, and no eye sees it.
+same as a camera that has moved sideways, and no eye notices it.
 """
 
 from __future__ import annotations
@@ -25,10 +25,20 @@ LOWEST_WAVEFRONT, LOWEST_AMPLITUDE = 2, 1  # Legendre orders: without piston and
 class Drift:
     """How a headset's light differs from what its bundle says.
 
-    wavefront_nm: Legendre terms of a path difference over the panel, from order 2 on, one for all colours.
-    log_amplitude: of each colour, Legendre terms from order 1 on of the logarithm of the beam's amplitude.
-    distance_mm: how much farther the image plane is. response: of each colour that has a new one, the phase
-    (rad) of each gray level.
+    Attributes
+    ----------
+    wavefront_nm : float array [terms], nm
+        Legendre terms of a path difference over the panel, from order 2 on, one for all colours.
+    log_amplitude : mapping of str to float array [terms]
+        Of each colour, Legendre terms of the logarithm of the beam's amplitude, from order 1 on.
+    distance_mm : float, mm
+        How much farther the image plane is.
+    response : mapping of str to float array [levels], rad
+        Phase of each gray level, of each colour that has a new response.
+    wavefront_nodes_nm : float array [rows, columns], nm
+        Nodes of a cubic B-spline over the panel that is added to the path difference; empty: none.
+    amplitude_nodes : mapping of str to float array [rows, columns]
+        Of each colour, the same for the logarithm of the beam's amplitude.
     """
 
     wavefront_nm: np.ndarray = field(default_factory=lambda: np.zeros(0))
@@ -40,17 +50,19 @@ class Drift:
 
     def wavefront(self, shape: tuple[int, int]) -> np.ndarray:
         """The path difference over the panel, nm, float64 [H, W]."""
-        fine = _splined(self.wavefront_nodes_nm, shape)
-        return _surface(self.wavefront_nm, shape, LOWEST_WAVEFRONT) + fine
+        fine = _spline_surface(self.wavefront_nodes_nm, shape)
+        return _legendre_surface(self.wavefront_nm, shape, LOWEST_WAVEFRONT) + fine
 
     def amplitude(self, channel: str, shape: tuple[int, int]) -> np.ndarray:
         """The factor on a colour's amplitude over the panel, float64 [H, W]."""
-        fine = _splined(self.amplitude_nodes.get(channel, np.zeros((0, 0))), shape)
-        return np.exp(_surface(self.log_amplitude.get(channel, np.zeros(0)), shape, LOWEST_AMPLITUDE) + fine)
+        fine = _spline_surface(self.amplitude_nodes.get(channel, np.zeros((0, 0))), shape)
+        return np.exp(
+            _legendre_surface(self.log_amplitude.get(channel, np.zeros(0)), shape, LOWEST_AMPLITUDE) + fine
+        )
 
 
 def drifted(path: LightPath, channel: str, wavelength_nm: float, drift: Drift) -> LightPath:
-    """A colour's light path with a drift put in, in the path's own precision."""
+    """A colour's light path with a drift applied, in the path's own precision."""
     shape, complex_type = path.grid.shape, path.source.dtype
     turn = np.exp(2j * math.pi / wavelength_nm * drift.wavefront(shape))
     factor = (drift.amplitude(channel, shape) * turn).astype(complex_type)
@@ -90,14 +102,16 @@ def node_weights(pixels: int, nodes: int) -> np.ndarray:
     return np.asarray(BSpline.design_matrix(np.arange(pixels), knots, 3).toarray())
 
 
-def _splined(nodes: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def _spline_surface(nodes: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """The surface [H, W] of a cubic B-spline's nodes; 0 without nodes."""
     if not nodes.size:
         return np.zeros(shape)
     rows, columns = (node_weights(n, m) for n, m in zip(shape, nodes.shape, strict=True))
     return np.asarray(rows @ nodes @ columns.T)
 
 
-def _surface(terms: np.ndarray, shape: tuple[int, int], lowest: int) -> np.ndarray:
+def _legendre_surface(terms: np.ndarray, shape: tuple[int, int], lowest: int) -> np.ndarray:
+    """The surface [H, W] of Legendre terms from an order on; 0 without terms."""
     if not len(terms):
         return np.zeros(shape)
     return legendre_surface(np.asarray(terms, np.float64), *edge_to_edge(shape), lowest)

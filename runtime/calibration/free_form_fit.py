@@ -1,10 +1,10 @@
 """Free-form maps over the panel: what is left of wavefront and beam after the polynomials.
 
 A real panel and its beam have structure as fine as a few pixels. Maps of cubic B-splines with a node every few
-pixels are fitted to the same captures by L-BFGS (Liu and Nocedal 1989), with the light path's own adjoint. A pattern
-has a pixel's worth of evidence a pixel, and a map one number every NODE x NODE pixels, so ten patterns determine it
-some 160 times over; a weak prior holds what no light shows, and few iterations keep the rest from following noise.
-Time and memory grow with pixels alone.
+pixels are fitted to the same captures by L-BFGS (Liu and Nocedal 1989), with the light path's own adjoint. A capture
+gives one measurement a pixel, and a map has one number every NODE x NODE pixels, so ten patterns determine it
+some 160 times over. A weak prior holds what no light shows, and few iterations keep the rest from following noise.
+Time and memory grow only with the number of pixels.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ import numpy as np
 from scipy.optimize import minimize
 
 from runtime.calibration.drift import drifted, node_weights
-from runtime.calibration.drift_fit import Base, Estimate, Shot, gain_of, seen_by
+from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, gain_of, light_on_camera
 from runtime.camera.view import sampler_and_adjoint
 from runtime.lightpath.light_path import panel_phase
 from runtime.lightpath.light_path_adjoint import irradiance_and_pullback
 
 NODE = 4  # panel pixels
 MOST = (270, 480)  # nodes: larger panels get coarser maps
-LIKELY_NM, LIKELY_LOG = 30.0, 0.3  # standard deviations of a node, before anything is seen
+LIKELY_NM, LIKELY_LOG = 30.0, 0.3  # standard deviations of a node, before any capture
 ITERATIONS = 30
 MEMORY = 8  # steps that L-BFGS remembers
 
@@ -32,13 +32,26 @@ Progress = Callable[[float], None]
 
 
 def fit_freeform(
-    bases: Mapping[str, Base],
+    bases: Mapping[str, ColourLightPath],
     shots: Sequence[Shot],
     start: Estimate,
     progress: Progress | None = None,
 ) -> Estimate:
-    """The estimate with maps of wavefront (one for all colours) and of each colour's beam that explain the shots
-    best, all else held. progress: share done.
+    """The estimate with maps of wavefront and beam that explain the shots best, all else held.
+
+    Parameters
+    ----------
+    bases : mapping of str to ColourLightPath
+        By colour.
+    shots : sequence of Shot
+    start : Estimate
+    progress : callable, optional
+        Called with the share done, 0 to 1.
+
+    Returns
+    -------
+    Estimate
+        Its drift has one map of the wavefront for all colours, and one of the beam for each colour.
     """
     grid = next(iter(bases.values())).path.grid
     rows, columns = (node_weights(n, m) for n, m in zip(grid.shape, nodes_of(grid.shape), strict=True))
@@ -63,7 +76,7 @@ def fit_freeform(
             path, (sample, back) = paths[shot.channel], readers[bases[shot.channel].path.grid]
             phase = panel_phase(path, shot.gray.astype(np.int64))
             image, pullback = irradiance_and_pullback(path, phase, factor=True)
-            light = seen_by(start.view, sample, image)
+            light = light_on_camera(start.view, sample, image)
             gain = gain_of(shot, light)
             residual = shot.signal - gain * light
             total += float(np.vdot(shot.weight * residual, residual))
@@ -75,7 +88,7 @@ def fit_freeform(
             gradient[1 + channels.index(shot.channel)] += LIKELY_LOG * (rows.T @ over.real @ columns)
         return total, gradient.ravel()
 
-    def told(_: np.ndarray) -> None:
+    def count_iteration(_: np.ndarray) -> None:
         nonlocal done
         done += 1
         if progress:
@@ -85,7 +98,7 @@ def fit_freeform(
     begin = [drift.wavefront_nodes_nm / LIKELY_NM if drift.wavefront_nodes_nm.size else nothing]
     begin += [drift.amplitude_nodes.get(c, nothing) / LIKELY_LOG for c in channels]
     found = minimize(
-        cost, np.ravel(begin), jac=True, method="L-BFGS-B", callback=told,
+        cost, np.ravel(begin), jac=True, method="L-BFGS-B", callback=count_iteration,
         options={"maxiter": ITERATIONS, "maxfun": 2 * ITERATIONS, "maxcor": MEMORY, "ftol": 1e-7},
     )  # fmt: skip
     return with_maps(found.x)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from runtime.calibration.drift_fit import Base, Estimate, Shot, gain_of, predicted
+from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, gain_of, predicted
 from runtime.camera.view import sampler
 from runtime.excess import PredictionErrors, joined, prediction_errors
 
@@ -28,8 +28,19 @@ class HeldOutErrors:
     residuals: tuple[np.ndarray, ...]
 
 
-def held_out_errors(bases: Mapping[str, Base], shots: Sequence[Shot], estimate: Estimate) -> HeldOutErrors:
-    """Errors of an estimate on shots, each with its own gain."""
+def held_out_errors(
+    bases: Mapping[str, ColourLightPath], shots: Sequence[Shot], estimate: Estimate
+) -> HeldOutErrors:
+    """Errors of an estimate on shots that no fit has seen.
+
+    Parameters
+    ----------
+    bases : mapping of str to ColourLightPath
+        By colour.
+    shots : sequence of Shot
+        Each is predicted with its own best gain.
+    estimate : Estimate
+    """
     parts, residuals = [], []
     for number, shot in enumerate(shots):
         base = bases[shot.channel]

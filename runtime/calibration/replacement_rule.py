@@ -6,7 +6,7 @@ from typing import Literal
 
 from runtime.excess import PredictionErrors, RemovedExcess, removed_excess
 
-LEAST_SHARE = 0.5  # of the excess that has come since the light path was made: a refit must remove more
+LEAST_SHARE = 0.5  # of the excess added since the light path was made: a refit must remove more
 LEAST_EXCESS = 0.0001  # and more than this
 WRONG_EXCESS = 0.001  # above it a light path does not fit: an error of 3 % of the contrast
 

@@ -2,8 +2,7 @@
 
 The field is then a sum of two, one of them turned by the phase d between the two grays, so every camera pixel sees
 A + B cos d + C sin d. A, B and C follow from the light path at three trial phases; d and its error follow by linear
-least squares over all pixels, and which of several turns it is from its neighbours in the sweep. In the first
-diffraction order, where a power meter would stand, A = 1/2, B = -1/2 and C = 0: `phase_of_power` is for that.
+least squares over all pixels, and which of several turns it is from its neighbours in the sweep.
 """
 
 from __future__ import annotations
@@ -11,14 +10,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
-from scipy.signal import find_peaks
 
-from firmware_iface.errors import InputError
-from runtime.calibration.drift_fit import Base, Estimate, Shot, predicted
+from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, predicted
 from runtime.calibration.shown_patterns import grating
 from runtime.camera.view import Sampler
 from runtime.lightpath.legendre import legendre_curve
@@ -27,13 +22,21 @@ SWEEP = (*range(16, 256, 16), 255)  # gray levels
 PERIODS = (4, 6, 8, 12, 16, 24)  # pixels
 TERMS = 6  # of the curve's deviation from what was believed
 TRIALS = (0.0, 2 * math.pi / 3, -2 * math.pi / 3)
-PROMINENCE = 0.25  # of the range of power: what turns less than this is noise
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """A measured sweep. gray: int [n]. phase: rad from gray 0, float [n]. error: standard errors, float [n].
-    visibility: of the gratings against the prediction, [n]; 1 where the light path is right.
+    """A measured sweep of gray levels.
+
+    Attributes
+    ----------
+    gray : int array [n]
+    phase : float array [n], rad
+        From gray 0.
+    error : float array [n], rad
+        Standard errors of the phase.
+    visibility : float array [n]
+        Contrast of the gratings against the prediction; 1 where the light path is right.
     """
 
     gray: np.ndarray
@@ -42,25 +45,40 @@ class Sweep:
     visibility: np.ndarray
 
 
-def best_period(base: Base, channel: str, estimate: Estimate, sample: Sampler) -> int:
-    """The grating's period, pixels, whose phase is seen best in this plane: gratings image themselves at
-    some distances, and there a phase shows nothing.
+def best_period(base: ColourLightPath, channel: str, estimate: Estimate, sample: Sampler) -> int:
+    """The period of a grating whose phase changes the picture most in this plane, panel pixels.
+
+    Gratings image themselves at some distances (the Talbot effect), and there a phase changes nothing.
     """
 
-    def seen(period: int) -> float:
+    def contrast(period: int) -> float:
         _, cosine, sine = _harmonics(base, _blank(channel, base, period, 128), estimate, sample)
         return float(np.mean(cosine**2 + sine**2))
 
-    return max(PERIODS, key=seen)
+    return max(PERIODS, key=contrast)
 
 
-def _blank(channel: str, base: Base, period: int, gray: int) -> Shot:
+def _blank(channel: str, base: ColourLightPath, period: int, gray: int) -> Shot:
+    """A grating without a picture."""
     nothing = np.zeros((1, 1), np.float32)
     return Shot(channel, grating(base.path.grid.shape, period, gray), nothing, nothing)
 
 
-def measured_sweep(base: Base, shots: Sequence[Shot], estimate: Estimate, sample: Sampler) -> Sweep:
-    """The phase of each shot's brighter gray against gray 0, given all else of an estimate."""
+def measured_sweep(
+    base: ColourLightPath, shots: Sequence[Shot], estimate: Estimate, sample: Sampler
+) -> Sweep:
+    """The phase of each grating's brighter gray level from gray 0.
+
+    Parameters
+    ----------
+    base : ColourLightPath
+    shots : sequence of Shot
+        Of gratings of one colour.
+    estimate : Estimate
+        All but the response is taken from it; its response says where the search starts.
+    sample : Sampler
+        Of the estimate's view.
+    """
     believed = estimate.drift.response.get(shots[0].channel, base.path.response)
     found = []
     for shot in shots:
@@ -81,63 +99,43 @@ def measured_sweep(base: Base, shots: Sequence[Shot], estimate: Estimate, sample
     return Sweep(grays, unwrapped, errors, visibility)
 
 
-def _harmonics(base: Base, shot: Shot, estimate: Estimate, sample: Sampler) -> tuple[np.ndarray, ...]:
+def _harmonics(
+    base: ColourLightPath, shot: Shot, estimate: Estimate, sample: Sampler
+) -> tuple[np.ndarray, ...]:
     """A, B and C [h, w] of what the camera sees of a grating, for a phase d beyond what is believed."""
     gray = int(shot.gray.max())
     believed = np.asarray(estimate.drift.response.get(shot.channel, base.path.response), float)
-    seen = []
+    trials = []
     for trial in TRIALS:
         response = believed.copy()
         response[gray] += trial
         drift = replace(estimate.drift, response={**estimate.drift.response, shot.channel: response})
-        seen.append(predicted(base, shot, replace(estimate, drift=drift), sample))
-    mean = (seen[0] + seen[1] + seen[2]) / 3
-    return mean, (2 * seen[0] - seen[1] - seen[2]) / 3, (seen[1] - seen[2]) / math.sqrt(3)
+        trials.append(predicted(base, shot, replace(estimate, drift=drift), sample))
+    mean = (trials[0] + trials[1] + trials[2]) / 3
+    return mean, (2 * trials[0] - trials[1] - trials[2]) / 3, (trials[1] - trials[2]) / math.sqrt(3)
 
 
 def fitted_response(believed: np.ndarray, sweep: Sweep) -> np.ndarray:
-    """A response [levels] (rad) that follows a sweep: what was believed and a smooth deviation, 0 at gray 0.
+    """A response that follows a sweep: the one that was believed, and a smooth deviation, 0 at gray 0.
 
-    It is monotone where what was believed was.
+    Parameters
+    ----------
+    believed : float array [levels], rad
+    sweep : Sweep
+
+    Returns
+    -------
+    float array [levels], rad
+        Monotone if `believed` is.
     """
     levels = len(believed)
     t = np.arange(levels) / (levels - 1)
     shapes = t * legendre_curve(2 * t - 1, min(TERMS, len(sweep.gray)))
-    wanted = sweep.phase - (believed[sweep.gray] - believed[0])
+    deviation = sweep.phase - (believed[sweep.gray] - believed[0])
     weight = 1 / np.hypot(sweep.error, 1e-3)  # no panel is smoother than a milliradian
-    terms = np.linalg.lstsq((shapes[:, sweep.gray] * weight).T, wanted * weight, rcond=None)[0]
+    terms = np.linalg.lstsq((shapes[:, sweep.gray] * weight).T, deviation * weight, rcond=None)[0]
     response = believed + terms @ shapes
     steps = np.diff(believed)
     if (steps >= 0).all():
         return np.maximum.accumulate(response)
     return np.minimum.accumulate(response) if (steps <= 0).all() else response
-
-
-def phase_of_power(power: np.ndarray) -> np.ndarray:
-    """Phase (rad) of each gray level from the first-order power [levels] of gratings of gray 0 and that gray.
-
-    power goes as (1 - cos phase) / 2 between its extremes, which may differ from turn to turn, as on a real panel.
-    Phase starts at 0 and only grows; beyond the last extreme the last range of power holds on. Raises InputError
-    where power never turns, so that there is no half wave to measure by.
-    """
-    power = np.asarray(power, float)
-    smooth = gaussian_filter1d(power, 1.0)
-    least = PROMINENCE * float(np.ptp(smooth))
-    turns = np.sort(np.concatenate([find_peaks(s * smooth, prominence=least)[0] for s in (1, -1)]))
-    if len(turns) == 0:
-        raise InputError(
-            "the first order's power has no maximum over the gray levels, so the panel's phase stays below half a "
-            "wave: give it more voltage range, or sweep at a shorter wavelength"
-        )
-    edges = [0, *turns.tolist(), len(power) - 1]
-    phase = np.zeros(len(power))
-    low, high = smooth[0], smooth[turns[0]]
-    for half, (first, last) in enumerate(pairwise(edges)):
-        if half < len(turns):
-            low, high = smooth[first], smooth[last]
-        else:  # an unfinished half wave: it would reach what the one before came from
-            low, high = smooth[first], smooth[edges[half - 1]]
-        inside = slice(first, last + 1)
-        share = np.clip((power[inside] - low) / (high - low), 0, 1)
-        phase[inside] = math.pi * half + np.arccos(1 - 2 * share)
-    return np.maximum.accumulate(phase)

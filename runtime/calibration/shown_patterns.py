@@ -9,10 +9,22 @@ HELD_OUT = (3, 5)
 
 
 def grains(shape: tuple[int, int], size: int, seed: int) -> np.ndarray:
-    """Squares of `size` pixels with random gray levels, uint8 [H, W].
+    """Squares of random gray levels.
 
     Their speckle fills the image, and moves and deforms with every error of the light path: the smaller the
     squares, the finer the speckle and the farther apart the places of the panel that meet in one of the image.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        (H, W) of the panel, pixels.
+    size : int, pixels
+        Of the squares.
+    seed : int
+
+    Returns
+    -------
+    uint8 array [H, W]
     """
     rng = np.random.default_rng([seed, size])
     rows, columns = (-(-n // size) + 1 for n in shape)
@@ -23,13 +35,13 @@ def grains(shape: tuple[int, int], size: int, seed: int) -> np.ndarray:
 
 
 def grating(shape: tuple[int, int], period: int, gray: int) -> np.ndarray:
-    """A binary grating of gray 0 and `gray`, lines `period` pixels apart along a row, uint8 [H, W]."""
+    """A binary grating of gray 0 and `gray`, its lines `period` pixels apart along a row: uint8 [H, W]."""
     stripes = np.arange(shape[1]) % period >= period // 2
     return np.broadcast_to(np.where(stripes, gray, 0).astype(np.uint8), shape).copy()
 
 
 def proof_picture(shape: tuple[int, int]) -> np.ndarray:
-    """A picture to judge a display by, irradiance [H, W], 0.02 .. 1: bars, a ramp, discs, a star, darkness."""
+    """A test picture for a display: bars, a ramp, discs, a star and darkness, irradiance 0.02 to 1, float32 [H, W]."""
     height, width = shape
     y, x = np.mgrid[:height, :width]
     v, u = y / height, x / width

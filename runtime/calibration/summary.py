@@ -17,7 +17,14 @@ from runtime.lightpath.legendre import edge_to_edge, legendre_maps, legendre_ord
 
 
 def numbers(found: Calibration) -> dict[str, Any]:
-    """What was found, as numbers."""
+    """What was found, as numbers.
+
+    Returns
+    -------
+    dict
+        Keys `verdict`, `complete`, `heldout`, `wavefront`, `distance_mm`, `registration`, `camera_scale`, `channels`,
+        `plane_mm`, `patterns`, `captures` and `seconds` of `calibrate --json`. `captures` counts all pictures taken.
+    """
     drift, view = found.estimate.drift, found.estimate.view
     shape = next(iter(found.bases.values())).path.grid.shape
     wavefront = drift.wavefront(shape)
@@ -42,7 +49,7 @@ def numbers(found: Calibration) -> dict[str, Any]:
             "counts_per_ms": counts,
             "power_change": counts / known - 1 if known else None,
             "power_spread": spread,
-            "exposure_ms": found.shots[channel].exposure_ms,
+            "exposure_ms": found.captures[channel].exposure_ms,
             "picture_psnr_db": {name: psnr for name, (_, psnr) in found.pictures[channel].items()},
         }
     return {
@@ -71,9 +78,44 @@ def numbers(found: Calibration) -> dict[str, Any]:
         "channels": colours,
         "plane_mm": found.plane_mm,
         "patterns": {"fitted": len(GRAINS), "gratings": len(SWEEP), "held_out": len(HELD_OUT) + 1, "dots": 1},
-        "captures": found.captures,
+        "captures": found.pictures_taken,
         "seconds": {name: round(value, 2) for name, value in found.seconds.items()},
     }
+
+
+def sentence_of(found: dict[str, Any], replaced: bool) -> str:
+    """The verdict in plain words.
+
+    Parameters
+    ----------
+    found : dict
+        As from `numbers`.
+    replaced : bool
+        Whether the bundle was replaced.
+    """
+    before, after = found["heldout"]["before"]["excess"], found["heldout"]["after"]["excess"]
+    if found["verdict"] == "unchanged" and found["camera_scale"] is not None:
+        return (
+            f"It is not certain that anything has drifted (excess {before:.2g} on held-out patterns): the camera's "
+            f"scale is off by {found['camera_scale']:+.5f}, or defocus and distance have drifted as below, which at "
+            "one plane looks the same; nothing was replaced. To know, register the camera again."
+        )
+    if found["verdict"] == "unchanged":
+        return (
+            f"Nothing has drifted that the camera can see: the excess on held-out patterns is {before:.2g}."
+        )
+    if found["verdict"] == "not_explained":
+        return (
+            f"The light path does not fit (excess {before:.2g} on held-out patterns) and refitting what drifts does "
+            f"not correct it ({after:.2g}): take captures and run hololoop-trainer diagnose; nothing was replaced."
+        )
+    done = "it was replaced" if replaced else "nothing was replaced, as asked"
+    more = (
+        ""
+        if found["complete"]
+        else ("; more is wrong than drifts here: take captures and run hololoop-trainer diagnose")
+    )
+    return f"The light path has drifted: the refit takes the excess from {before:.2g} to {after:.2g}; {done}{more}."
 
 
 def _rms_error(errors: np.ndarray, shape: tuple[int, int], lowest: int) -> float:

@@ -1,1 +1,1 @@
-"""Where the camera looks and how it sees the image plane."""
+"""Where the camera looks and how it sees the image plane: registration, sampling, view."""

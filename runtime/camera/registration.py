@@ -10,15 +10,13 @@ a second, less broad one next to it along x. Together they tell every mirroring 
 from __future__ import annotations
 
 import itertools
-import math
 from dataclasses import dataclass
 
 import numpy as np
-from PIL import Image
-from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from firmware_iface.errors import InputError
+from runtime.camera.spots import bright_spots
 
 SPREAD = 0.11  # standard deviation of a plain dot, share of the spacing
 BROAD = (1.7, 1.35)  # of the marker's two dots, against a plain dot
@@ -29,7 +27,15 @@ FEWEST = 0.6  # share of the expected dots that must be found
 
 @dataclass(frozen=True)
 class Dots:
-    """The dots of a pattern. xy : float [n, 2], panel pixels, row by row; the marker's two come first."""
+    """The dots of a pattern.
+
+    Attributes
+    ----------
+    xy : float array [n, 2], panel pixels
+        Centres, row by row; the marker's two come first.
+    spacing : float, panel pixels
+    columns, rows : int
+    """
 
     xy: np.ndarray
     spacing: float
@@ -38,9 +44,18 @@ class Dots:
 
 
 def dots_of(shape: tuple[int, int], spacing: float) -> Dots:
-    """The dots that `dot_pattern` shows on a panel of that shape (height, width); spacing in panel pixels.
+    """The dots that `dot_pattern` shows on a panel.
 
-    Raises InputError if fewer than 4 x 4 dots fit, or a dot would be too small to be shown.
+    Parameters
+    ----------
+    shape : (int, int)
+        (height, width) of the panel, pixels.
+    spacing : float, panel pixels
+
+    Raises
+    ------
+    InputError
+        If fewer than 4 x 4 dots fit, or a dot would be too small to be shown.
     """
     rows, columns = (int((n - 1.2 * spacing) // spacing) + 1 if spacing > 0 else 0 for n in shape)
     if not spacing >= 8 or rows < 4 or columns < 4:
@@ -54,9 +69,22 @@ def dots_of(shape: tuple[int, int], spacing: float) -> Dots:
 
 
 def dot_pattern(shape: tuple[int, int], spacing: float) -> np.ndarray:
-    """Irradiance to aim for, float32 [H, W], 0 to 1: Gaussian dots on black with an asymmetric marker.
+    """Gaussian dots on black with an asymmetric marker, as irradiance to aim for.
 
-    Raises InputError as `dots_of` does.
+    Parameters
+    ----------
+    shape : (int, int)
+        (H, W) of the panel, pixels.
+    spacing : float, panel pixels
+
+    Returns
+    -------
+    float32 array [H, W], 0 to 1
+
+    Raises
+    ------
+    InputError
+        As `dots_of` does.
     """
     dots = dots_of(shape, spacing)
     y, x = np.arange(shape[0])[:, None], np.arange(shape[1])[None]
@@ -69,14 +97,29 @@ def dot_pattern(shape: tuple[int, int], spacing: float) -> np.ndarray:
 
 
 def find_homography(image: np.ndarray, dots: Dots, believed: np.ndarray | None = None) -> np.ndarray:
-    """The homography, float64 [3, 3], from a camera picture [h, w] of a dot pattern.
+    """The homography of a camera from its picture of a dot pattern.
 
-    image : counts or any scale, uneven background allowed; mirrored and turned pictures are found as well
-    believed : a homography that is right to a quarter of the dots' spacing, for pictures in which the marker is not
-        told from other dots
-    Raises InputError if too few dots are seen, or they are not the expected grid.
+    Parameters
+    ----------
+    image : array [h, w]
+        In counts or any scale; an uneven background is allowed, and the picture may be mirrored and turned.
+    dots : Dots
+        Of the pattern.
+    believed : float array [3, 3], optional
+        A homography that is right to a quarter of the dots' spacing, for pictures in which the marker cannot be told
+        from other dots.
+
+    Returns
+    -------
+    float64 array [3, 3]
+        From camera pixels (x, y, 1) to panel pixels (x, y, 1) up to scale; its last number is 1.
+
+    Raises
+    ------
+    InputError
+        If too few dots are seen, or they are not the expected grid.
     """
-    points, light = _spots(image)
+    points, light = bright_spots(image)
     if len(points) < FEWEST * len(dots.xy):
         raise InputError(
             f"only {len(points)} of {len(dots.xy)} dots are seen in the dot picture: focus the "
@@ -104,83 +147,21 @@ def find_homography(image: np.ndarray, dots: Dots, believed: np.ndarray | None =
 
 
 def panel_points(homography: np.ndarray, camera_xy: np.ndarray) -> np.ndarray:
-    """Panel points, float [n, 2], for camera points (x, y), [n, 2], pixels."""
+    """Points of the panel that camera points look at.
+
+    Parameters
+    ----------
+    homography : float array [3, 3]
+    camera_xy : float array [n, 2], camera pixels
+        Points (x, y).
+
+    Returns
+    -------
+    float array [n, 2], panel pixels
+        Points (x, y).
+    """
     points = np.concatenate([camera_xy, np.ones((len(camera_xy), 1))], 1) @ np.asarray(homography).T
     return points[:, :2] / points[:, 2:]
-
-
-def _spots(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centres (x, y), float [n, 2], of a picture's bright dots, and their light against neighbours', [n]."""
-    image = np.asarray(image)
-    if image.ndim != 2 or min(image.shape) < 16:
-        raise InputError(f"the dot picture has shape {image.shape}: give a gray one, 16 x 16 pixels or more")
-    raw = np.nan_to_num(image.astype(np.float32), posinf=0, neginf=0)
-    picture: np.ndarray = ndimage.gaussian_filter(raw, 0.7)
-    coarse = ndimage.gaussian_filter(_resized(picture, (24, 24), Image.Resampling.BOX), 4)
-    background = _resized(coarse, picture.shape, Image.Resampling.BILINEAR)
-    light = picture - np.minimum(background, np.median(picture))
-    noise = 1.4826 * float(np.median(np.abs(light - np.median(light))))
-    bright = float(np.quantile(light, 0.995))
-    level = float(np.median(light)) + max(6 * noise, 0.25 * (bright - float(np.median(light))))
-    labels, count = ndimage.label(light > level, np.ones((3, 3)))
-    areas = np.bincount(labels.ravel(), minlength=count + 1)[1:]
-    points = []
-    for area, (rows, columns) in zip(areas, ndimage.find_objects(labels), strict=True):
-        h, w = rows.stop - rows.start, columns.stop - columns.start
-        at_edge = not (rows.start and columns.start) or rows.stop == picture.shape[0]
-        if area < 4 or at_edge or columns.stop == picture.shape[1] or max(w, h) > 3 * min(w, h):
-            continue
-        x, y = (columns.start + columns.stop - 1) / 2, (rows.start + rows.stop - 1) / 2
-        points.append(_centroid(light, x, y, max(w, h)))
-    if len(points) < 9:
-        return np.zeros((0, 2)), np.zeros(0)
-    xy = np.asarray(points)
-    distance, near = cKDTree(xy).query(xy, k=9)
-    flux = _flux(light, xy, 0.48 * float(np.median(distance[:, 1])))
-    return xy, flux / np.maximum(np.median(flux[near[:, 1:]], axis=1), 1e-9)
-
-
-def _resized(picture: np.ndarray, shape: tuple[int, ...], method: Image.Resampling) -> np.ndarray:
-    return np.asarray(Image.fromarray(picture).resize((shape[1], shape[0]), method))
-
-
-def _flux(light: np.ndarray, xy: np.ndarray, radius: float) -> np.ndarray:
-    """The light within radius pixels of each point, [n], above what is on the rim."""
-    reach = math.ceil(radius) + 1
-    flux = np.zeros(len(xy))
-    for number, (x, y) in enumerate(xy):
-        left, top = max(round(x) - reach, 0), max(round(y) - reach, 0)
-        part = light[top : round(y) + reach + 1, left : round(x) + reach + 1]
-        away = np.hypot(np.arange(part.shape[1]) + left - x, np.arange(part.shape[0])[:, None] + top - y)
-        inside = np.clip(radius + 0.5 - away, 0, 1)
-        rim = part[np.abs(away - radius) < 0.8]
-        flux[number] = float(((part - (np.median(rim) if rim.size else 0)) * inside).sum())
-    return flux
-
-
-def _centroid(light: np.ndarray, x: float, y: float, size: float) -> tuple[float, float]:
-    """The centre of a dot near (x, y), by its moments under a Gaussian window that follows it."""
-    sigma = max(size / 2.5, 1.0)
-    reach = math.ceil(3.5 * sigma)
-    for _ in range(12):
-        left, top = max(round(x) - reach, 0), max(round(y) - reach, 0)
-        part = light[top : round(y) + reach + 1, left : round(x) + reach + 1]
-        part = np.maximum(part - np.quantile(part, 0.1), 0)
-        u, v = np.arange(part.shape[1]) + left - x, np.arange(part.shape[0])[:, None] + top - y
-        weight = part * np.exp(-(u**2 + v**2) / (2 * sigma**2))
-        total = float(weight.sum()) + 1e-12
-        dx, dy = float((weight * u).sum()) / total, float((weight * v).sum()) / total
-        spread = float((weight * (u**2 + v**2)).sum()) / total / 2
-        width = math.sqrt(1 / max(1 / max(spread, 1e-3) - 1 / sigma**2, 1 / (9 * sigma**2)))
-        # the window pulls the moments towards its own centre: the step is lengthened by what it takes away
-        stretch = 1 + (width / sigma) ** 2
-        step = min(1.0, reach / (2 * stretch * math.hypot(dx, dy) + 1e-9))
-        x, y = x + stretch * dx * step, y + stretch * dy * step
-        if not (0 <= x < light.shape[1] and 0 <= y < light.shape[0]):
-            break
-        if math.hypot(dx, dy) < 1e-3:
-            break
-    return float(x), float(y)
 
 
 def _markers(points: np.ndarray, light: np.ndarray) -> list[tuple[int, int]]:
@@ -202,9 +183,9 @@ def _guesses(points: np.ndarray, first: int, second: int, dots: Dots) -> list[np
     guesses = []
     for side in (1.0, -1.0):
         # the dot of the next row is where a right angle puts it, or the nearest that is seen
-        wanted = points[first] + side * np.array([-along[1], along[0]])
-        near = points[int(np.argmin(np.hypot(*(points - wanted).T)))]
-        if np.hypot(*(near - wanted)) > 0.45 * np.hypot(*along):
+        corner = points[first] + side * np.array([-along[1], along[0]])
+        near = points[int(np.argmin(np.hypot(*(points - corner).T)))]
+        if np.hypot(*(near - corner)) > 0.45 * np.hypot(*along):
             continue
         camera = np.stack([points[first], points[second], near])
         guess = _fitted_map(camera, dots.xy[[0, 1, dots.columns]], perspective=False)
@@ -226,7 +207,7 @@ def _refined(points: np.ndarray, guess: np.ndarray, dots: Dots) -> tuple[float, 
         _, only = np.unique(index[keep], return_index=True)
         keep = keep[only]
         if reach > 1e6 and len(keep) > 16:
-            # the marker's dots lean on each other: they lead, but do not measure
+            # the marker's broad dots shift each other's centres: they guide the search, but are not measured
             keep = keep[index[keep] > 1]
         if len(keep) < 4:
             return None
@@ -245,9 +226,9 @@ def _fitted_map(
 ) -> np.ndarray | None:
     """The homography, or affine map, [3, 3], that takes camera points [n, 2] to panel points [n, 2], by OpenCV.
 
-    Points farther off than `tolerance` (panel pixels) have no say (RANSAC). None where there is no such map.
+    Points farther off than `tolerance` (panel pixels) are left out (RANSAC). None where there is no such map.
     """
-    import cv2  # the headset needs it for a dot pattern alone
+    import cv2  # only a dot pattern needs it on the headset
 
     if perspective:
         found, _ = cv2.findHomography(camera, panel, cv2.RANSAC, tolerance)

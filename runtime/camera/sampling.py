@@ -31,6 +31,10 @@ def pixel_area(iy: Array, ix: Array, y: Array, x: Array) -> Array:
         Frequencies of the irradiance.
     y, x : arrays [h, w], panel pixels
         Where each camera pixel's centre looks. The pixel's sides are taken at the picture's centre.
+
+    Returns
+    -------
+    real array [n, m]
     """
     xp = array_namespace(iy)
     i, j = y.shape[0] // 2, y.shape[1] // 2
@@ -47,6 +51,10 @@ def spline_filter(iy: Array, ix: Array, finer: int) -> Array:
     iy, ix : arrays [n, 1] and [1, m], cycles a panel pixel
     finer : int
         How many times as fine as the light path's own fine grid the splines' samples are.
+
+    Returns
+    -------
+    real array [n, m]
     """
     xp = array_namespace(iy)
     rows, columns = ((2 + xp.cos(2 * math.pi * f / (FINE * finer))) / 3 for f in (iy, ix))
@@ -61,7 +69,10 @@ def finer_picture(spectrum: Array, shape: tuple[int, int], finer: int) -> Array:
     spectrum : complex array [..., n, m // 2 + 1]
         As from `rfft2` of a picture of `shape`. The highest frequency of an even axis has no sign of its own and is
         left out.
+    shape : (int, int)
+        (n, m), samples of the picture.
     finer : int
+        How many times as fine the result is.
 
     Returns
     -------
@@ -72,17 +83,30 @@ def finer_picture(spectrum: Array, shape: tuple[int, int], finer: int) -> Array:
 
 
 def finer_picture_adjoint(spectrum: Array, shape: tuple[int, int]) -> Array:
-    """The frequencies of a picture of `shape`, of a finer one's spectrum as from `rfft2`."""
+    """Adjoint of `finer_picture`: `irfft2` of the result is the adjoint's picture.
+
+    Parameters
+    ----------
+    spectrum : complex array [..., finer n, finer m // 2 + 1]
+        As from `rfft2` of a finer picture.
+    shape : (int, int)
+        (n, m), samples of the coarser picture.
+
+    Returns
+    -------
+    complex array [..., n, m // 2 + 1]
+    """
     xp = array_namespace(spectrum)
-    half, columns = shape[0] // 2, shape[1] // 2 + 1
+    half, columns = (shape[0] + 1) // 2, shape[1] // 2 + 1
     kept = xp.concat([spectrum[..., :half, :columns], spectrum[..., half - shape[0] :, :columns]], axis=-2)
     return kept * _below_highest(shape, kept)
 
 
 def _widened(spectrum: Array, shape: tuple[int, int], finer: int) -> Array:
+    """A half spectrum with zeros for the frequencies that only a finer grid has."""
     xp = array_namespace(spectrum)
     spectrum = spectrum * _below_highest(shape, spectrum)
-    half, leading = shape[0] // 2, tuple(spectrum.shape[:-2])
+    half, leading = (shape[0] + 1) // 2, tuple(spectrum.shape[:-2])
     device = spectrum.device
 
     def zeros(rows: int, columns: int) -> Array:
@@ -97,7 +121,7 @@ def _widened(spectrum: Array, shape: tuple[int, int], finer: int) -> Array:
 
 
 def _below_highest(shape: tuple[int, int], like: Array) -> Array:
-    """1 for every frequency of `rfft2` but an even axis's highest, which is 0: [n, m // 2 + 1]."""
+    """0 at an even axis's highest frequency, else 1: [n, m // 2 + 1], for a spectrum as from `rfft2`."""
     xp = array_namespace(like)
     kept = np.ones((shape[0], shape[1] // 2 + 1))
     if shape[0] % 2 == 0:
@@ -108,13 +132,25 @@ def _below_highest(shape: tuple[int, int], like: Array) -> Array:
 
 
 def sample_places(grid: Grid, y: Array, x: Array, finer: int) -> tuple[Array, Array]:
-    """Places in panel pixels as places in samples of a picture that is `finer` than the light path's fine grid."""
+    """Places in panel pixels as places in samples of a picture.
+
+    Parameters
+    ----------
+    grid : Grid
+    y, x : arrays [h, w], panel pixels
+    finer : int
+        How many times as fine as the light path's fine grid the picture is.
+
+    Returns
+    -------
+    (y, x), arrays [h, w], samples
+    """
     samples = FINE * finer
     return samples * (y + grid.margin), samples * (x + grid.margin)
 
 
 def spline_samples(coefficients: Array, y: Array, x: Array) -> Array:
-    """Cubic B-spline sum at places; 0 where a place is outside the samples.
+    """Cubic B-spline sum at places; 0 where a place has not two samples on each side.
 
     Parameters
     ----------
@@ -141,7 +177,18 @@ def spline_samples(coefficients: Array, y: Array, x: Array) -> Array:
 
 
 def spline_matrix(y: np.ndarray, x: np.ndarray, shape: tuple[int, int]) -> csr_matrix:
-    """`spline_samples` of a picture of `shape` at fixed places [h, w], as a sparse matrix [h w, n m] in float32."""
+    """`spline_samples` at fixed places, as a matrix.
+
+    Parameters
+    ----------
+    y, x : float arrays [h, w], samples
+    shape : (int, int)
+        (n, m), samples of the picture.
+
+    Returns
+    -------
+    sparse float32 matrix [h w, n m]
+    """
     (rows, wy), (columns, wx) = _taps(y.ravel(), shape[0]), _taps(x.ravel(), shape[1])
     index = np.stack(rows)[:, None] * shape[1] + np.stack(columns)[None, :]
     weight = np.stack(wy)[:, None] * np.stack(wx)[None, :]
@@ -173,6 +220,8 @@ def panel_on_camera(homography: np.ndarray, shape: tuple[int, int]) -> tuple[np.
     ----------
     homography : float array [3, 3]
         From camera pixels (x, y, 1) to panel pixels.
+    shape : (int, int)
+        (H, W), pixels of the panel.
 
     Returns
     -------
@@ -183,11 +232,34 @@ def panel_on_camera(homography: np.ndarray, shape: tuple[int, int]) -> tuple[np.
 
 
 def camera_places(homography: np.ndarray, y: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where on the camera places (y, x) [H, W] of the panel fall, by a homography from the camera to the panel."""
+    """Where on the camera places of the panel fall.
+
+    Parameters
+    ----------
+    homography : float array [3, 3]
+        From camera pixels (x, y, 1) to panel pixels.
+    y, x : float arrays [H, W], panel pixels
+
+    Returns
+    -------
+    (y, x), float64 arrays [H, W], camera pixels
+    """
     there = panel_points(np.linalg.inv(np.asarray(homography, float)), np.stack([x.ravel(), y.ravel()], 1))
     return there[:, 1].reshape(y.shape), there[:, 0].reshape(y.shape)
 
 
 def rectified(picture: np.ndarray, y: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """A picture [h, w] at places (y, x) [H, W] in its pixels, by cubic splines; 0 outside."""
-    return np.asarray(ndimage.map_coordinates(picture, (y, x), order=3)).reshape(y.shape)
+    """A picture resampled at places, by cubic splines through its pixels; 0 outside.
+
+    Parameters
+    ----------
+    picture : array [h, w]
+    y, x : float arrays [H, W], pixels of the picture
+
+    Returns
+    -------
+    float array [H, W]
+        Of the picture's type; float32 for whole numbers.
+    """
+    kind = picture.dtype if np.issubdtype(picture.dtype, np.floating) else np.float32
+    return np.asarray(ndimage.map_coordinates(picture, (y, x), output=kind, order=3)).reshape(y.shape)

@@ -1,6 +1,6 @@
 """How the headset's camera sees the image plane: where it looks, how sharply, how evenly.
 
-None of this reaches the light path: it explains the measurement. Positions are (y, x) in panel pixels.
+None of this changes the light path: it explains the measurement. Positions are (y, x) in panel pixels.
 """
 
 from __future__ import annotations
@@ -38,12 +38,26 @@ Sampler = Callable[[np.ndarray], np.ndarray]
 class View:
     """A camera in front of the image plane.
 
-    shape: (h, w), pixels. homography: 9 numbers, row-major, from camera pixels (x, y, 1) to panel pixels.
-    shift_y_px, shift_x_px, rotation_mrad: a rigid motion on the panel after it, about the panel's centre.
-    magnification, aspect, shear, keystone_y, keystone_x: what a homography from dots is still wrong by, relative,
-    at the panel's border. distortion: radial, of the lens: relative, at the panel's corners.
-    blur_y_px2, blur_x_px2: variance of the lens's blur, panel pixels squared. sensitivity: Legendre terms of
-    its logarithm, from order 1 on. stray: light that is added, share of a picture's mean.
+    Attributes
+    ----------
+    shape : (int, int)
+        (h, w), camera pixels.
+    homography : tuple of 9 floats
+        Row-major, from camera pixels (x, y, 1) to panel pixels (x, y, 1) up to scale.
+    shift_y_px, shift_x_px : float, panel pixels
+        A motion on the panel after the homography.
+    rotation_mrad : float, mrad
+        A rotation after the homography, about the panel's centre.
+    magnification, aspect, shear, keystone_y, keystone_x : float, relative at the panel's border
+        Corrections of a homography from dots.
+    distortion : float, relative at the panel's corners
+        Radial, of the lens.
+    blur_y_px2, blur_x_px2 : float, panel pixels squared
+        Variance of the lens's blur.
+    sensitivity : tuple of float
+        Legendre terms of the logarithm of the camera's sensitivity, from order 1 on.
+    stray : float, share of a picture's mean
+        Light that is added.
     """
 
     shape: tuple[int, int]
@@ -63,12 +77,18 @@ class View:
     stray: float = 0.0
 
     def as_json(self) -> dict[str, Any]:
-        """For a bundle's description."""
+        """The view for a bundle's description: its fields by name."""
         return asdict(self)
 
     @classmethod
     def from_json(cls, given: Mapping[str, Any]) -> View:
-        """What `as_json` gave. Raises TypeError or ValueError where it is something else."""
+        """The view from what `as_json` gave.
+
+        Raises
+        ------
+        TypeError, ValueError
+            Where it is something else.
+        """
         values = {f.name: given[f.name] for f in fields(cls) if f.name in given}
         for name in ("shape", "homography", "sensitivity"):
             values[name] = tuple(values[name])
@@ -98,7 +118,13 @@ class View:
 
 
 def view_of(bundle: Bundle) -> View | None:
-    """The camera's view of an earlier calibration, if the bundle holds one."""
+    """The camera's view of an earlier calibration, if the bundle holds one.
+
+    Raises
+    ------
+    InputError
+        Where the bundle's record cannot be read.
+    """
     given = bundle.description.get("camera")
     if not isinstance(given, Mapping) or "view" not in given:
         return None
@@ -125,7 +151,21 @@ def _bent(
 
 
 def on_panel(signal: np.ndarray, view: View, shape: tuple[int, int]) -> np.ndarray:
-    """A capture [h, w] on the panel's pixels, float32 [H, W], without stray light and the camera's unevenness."""
+    """A capture on the panel's pixels, without stray light and the camera's unevenness.
+
+    Parameters
+    ----------
+    signal : float array [h, w], counts
+        Above black.
+    view : View
+    shape : (int, int)
+        (H, W), pixels of the panel.
+
+    Returns
+    -------
+    float32 array [H, W], counts
+        0 where the camera does not look.
+    """
     stray = view.stray / (1 + view.stray) * float(signal.mean())
     rows, columns = np.mgrid[: shape[0], : shape[1]]
     y, x = _bent(rows, columns, shape, -view.distortion)
@@ -136,15 +176,23 @@ def on_panel(signal: np.ndarray, view: View, shape: tuple[int, int]) -> np.ndarr
 def sampler(view: View, grid: Grid, finer: int = 2) -> Sampler:
     """The linear map from irradiance on a fine grid [..., *grid.image_shape] to camera pixels [..., h, w].
 
-    Light is integrated over the camera pixel's area, blurred by the lens, and read where the pixel looks, by
-    cubic splines on a grid `finer` times as fine again: 2 to predict; 1 is enough for a direction to go in.
-    Pixels that look beyond the grid read 0.
+    Light is integrated over the camera pixel's area, blurred by the lens, and read where the pixel looks. Pixels that
+    look beyond the grid read 0.
+
+    Parameters
+    ----------
+    view : View
+    grid : Grid
+        Of the light path.
+    finer : int
+        How many times as fine as the light path's fine grid the splines' samples are: 2 to predict; 1 is enough for
+        the direction of a step.
     """
     return sampler_and_adjoint(view, grid, finer)[0]
 
 
 def sampler_and_adjoint(view: View, grid: Grid, finer: int = 2) -> tuple[Sampler, Sampler]:
-    """`sampler`, and its adjoint."""
+    """`sampler`, and its adjoint, from camera pixels [..., h, w] to irradiance on the fine grid."""
     y, x = view.positions(grid.shape)
     fy, fx = image_frequencies(grid, np.zeros((), np.float64))
     fy, fx = fy[:, None] * grid.pitch, fx[None, :] * grid.pitch  # cycles a panel pixel

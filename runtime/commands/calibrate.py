@@ -42,8 +42,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     from runtime.calibration.bundle_replacement import previous, replace_bundle, restore_bundle
     from runtime.calibration.calibrate import calibrate
     from runtime.calibration.calibration_report import write_report
-    from runtime.calibration.summary import numbers
-    from runtime.calibration.verdict_sentence import sentence_of
+    from runtime.calibration.summary import numbers, sentence_of
     from runtime.headset.open_devices import open_devices
 
     if args.restore:

@@ -1,4 +1,7 @@
-"""Pictures carried from the camera's pixels to the panel's and back, for training."""
+"""Pictures carried from the camera's pixels to the panel's and back, for training.
+
+The resampling is `runtime.camera.sampling.rectified`, in NumPy: no gradient passes through it.
+"""
 
 from __future__ import annotations
 
@@ -8,21 +11,25 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from runtime.camera.sampling import panel_on_camera, rectified
+from trainer.captures.bench_file import Bench
 from trainer.prediction.scene import Scene, Stages
+
+Places = tuple[np.ndarray, np.ndarray]
 
 
 def onto_panel(scene: Scene, stages: Stages, picture: Tensor) -> Tensor:
     """A picture on the camera's pixels [h, w], resampled at the panel's [H, W]; zero where the camera does not look."""
     if _same_pixels(scene, stages):
         return picture
-    y, x = first_y, first_x = _panel_on_camera(scene)
-    if stages.sensor.displacement is not None:
-        moves = [d.to(picture.dtype).expand(picture.shape) for d in stages.sensor.displacement]
+    y, x = first_y, first_x = _panel_on_camera(scene.bench)
+    moves = _displacement(stages, picture.shape)
+    if moves is not None:
         # A camera pixel looks where the one a displacement further on should; displacements vary slowly.
         for _ in range(2):
-            dy, dx = (_sampled(d, y, x) for d in moves)
+            dy, dx = (rectified(d, y, x) for d in moves)
             y, x = first_y - dy, first_x - dx
-    return _sampled(picture, y, x)
+    return _resampled(picture, y, x)
 
 
 def onto_camera(scene: Scene, stages: Stages, picture: Tensor) -> Tensor:
@@ -30,10 +37,11 @@ def onto_camera(scene: Scene, stages: Stages, picture: Tensor) -> Tensor:
     if _same_pixels(scene, stages):
         return picture
     camera = scene.bench.camera
-    y, x = (torch.as_tensor(a, dtype=picture.dtype) for a in np.indices(camera.shape, dtype=float))
-    if stages.sensor.displacement is not None:
-        y, x = y + stages.sensor.displacement[0], x + stages.sensor.displacement[1]
-    return _sampled(picture, *camera.on_panel(y, x))
+    y, x = np.indices(camera.shape, dtype=float)
+    moves = _displacement(stages, camera.shape)
+    if moves is not None:
+        y, x = y + moves[0], x + moves[1]
+    return _resampled(picture, *camera.on_panel(y, x))
 
 
 def _same_pixels(scene: Scene, stages: Stages) -> bool:
@@ -43,24 +51,23 @@ def _same_pixels(scene: Scene, stages: Stages) -> bool:
     return aligned and stages.sensor.displacement is None
 
 
-@lru_cache(maxsize=8)
-def _panel_on_camera(scene: Scene) -> tuple[Tensor, Tensor]:
-    """Where on the camera each panel pixel's centre falls, camera pixels (y, x), each [H, W]."""
-    y, x = np.indices(scene.bench.panel.shape, dtype=float)
-    given = scene.bench.camera.homography
-    if given is not None:
-        m = np.linalg.inv(np.asarray(given, dtype=float).reshape(3, 3))
-        w = m[2, 0] * x + m[2, 1] * y + m[2, 2]
-        y, x = (m[1, 0] * x + m[1, 1] * y + m[1, 2]) / w, (m[0, 0] * x + m[0, 1] * y + m[0, 2]) / w
-    return torch.as_tensor(y, dtype=scene.dtype), torch.as_tensor(x, dtype=scene.dtype)
+def _displacement(stages: Stages, shape: tuple[int, ...]) -> Places | None:
+    """How far from its place each camera pixel looks, camera pixels (y, x), float64 [h, w]; None: not at all."""
+    given = stages.sensor.displacement
+    if given is None:
+        return None
+    dy, dx = (np.broadcast_to(d.detach().cpu().double().numpy(), shape) for d in given)
+    return dy, dx
 
 
-def _sampled(picture: Tensor, y: Tensor, x: Tensor) -> Tensor:
-    """Cubic interpolation of a picture [h, w] at places in its pixels; zero outside."""
-    height, width = picture.shape
-    places = torch.stack((2 * x / max(width - 1, 1) - 1, 2 * y / max(height - 1, 1) - 1), -1).to(
-        picture.dtype
-    )
-    return torch.nn.functional.grid_sample(
-        picture[None, None], places[None], mode="bicubic", padding_mode="zeros", align_corners=True
-    )[0, 0]
+@lru_cache(maxsize=2)
+def _panel_on_camera(bench: Bench) -> Places:
+    """Where on the camera each panel pixel's centre falls, camera pixels (y, x), float64 [H, W]."""
+    given = bench.camera.homography
+    return panel_on_camera(np.eye(3) if given is None else np.asarray(given, float), bench.panel.shape)
+
+
+def _resampled(picture: Tensor, y: np.ndarray, x: np.ndarray) -> Tensor:
+    """A picture [h, w] at places in its pixels, as a tensor of its type; zero outside."""
+    values = rectified(picture.detach().cpu().numpy(), y, x)
+    return torch.as_tensor(values, dtype=picture.dtype, device=picture.device)

@@ -12,7 +12,7 @@ from firmware_iface.virtual import BenchDescription, VirtualHeadset
 from firmware_iface.virtual.defects import make_defect
 from runtime.bundle.bundle_folder import INITIALISER, write_bundle
 from runtime.bundle.light_path_arrays import pack_light_paths
-from runtime.calibration.drift_fit import Base
+from runtime.calibration.estimate import ColourLightPath
 from runtime.headset.open_devices import Devices
 from runtime.lightpath.legendre import edge_to_edge
 from tests.runtime.benches import ideal_path
@@ -35,13 +35,13 @@ def devices(headset: VirtualHeadset) -> Devices:
 
 
 def opened(headset: VirtualHeadset) -> Callable[[], AbstractContextManager[Devices]]:
-    """What opens a headset that is there already."""
+    """A function that opens an existing headset."""
     return lambda: nullcontext(devices(headset))
 
 
-def base(shape: tuple[int, int] = SHAPE) -> Base:
-    """The light path that the bundle believes in: nothing wrong."""
-    return Base(ideal_path(shape, DISTANCE_MM * 1e-3, dtype=np.float32), WAVELENGTH_NM)
+def base(shape: tuple[int, int] = SHAPE) -> ColourLightPath:
+    """The light path of the bundle: a perfect one."""
+    return ColourLightPath(ideal_path(shape, DISTANCE_MM * 1e-3, dtype=np.float32), WAVELENGTH_NM)
 
 
 def ideal_bundle(folder: Path, shape: tuple[int, int] = SHAPE) -> Path:
@@ -54,7 +54,7 @@ def ideal_bundle(folder: Path, shape: tuple[int, int] = SHAPE) -> Path:
 
 
 def without_tilt(surface: np.ndarray) -> np.ndarray:
-    """A map [H, W] less its best plane, which at one plane cannot be told from a camera that has moved."""
+    """A map [H, W] less its best plane, which at one plane looks the same as a camera that has moved."""
     y, x = edge_to_edge(surface.shape)
     plane = np.stack([np.ones(surface.size), y.ravel(), x.ravel()], 1)
     flat = surface.ravel()

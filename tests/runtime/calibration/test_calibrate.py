@@ -1,4 +1,4 @@
-"""A headset that has drifted in four ways calibrates itself, by the command, and the truth is known."""
+"""A headset that has drifted in four known ways calibrates itself by the command."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ HIDDEN = ("panel_wavefront", "illumination", "distance", "phase_response")
 
 
 @dataclass(frozen=True)
-class Ran:
+class CommandRun:
     """A folder in which the command ran, and what it printed."""
 
     folder: Path
@@ -48,7 +48,7 @@ def run(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def ran(tmp_path_factory: pytest.TempPathFactory) -> Ran:
+def ran(tmp_path_factory: pytest.TempPathFactory) -> CommandRun:
     """One calibration of a headset with four hidden defects, shared by the tests."""
     from contextlib import redirect_stdout
     from io import StringIO
@@ -64,10 +64,10 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> Ran:
             ["calibrate", str(bundle), "--headset", str(bench), "--report", str(folder / "r.html"), "--json"]
         )
     assert code == 0
-    return Ran(folder, json.loads(out.getvalue()))
+    return CommandRun(folder, json.loads(out.getvalue()))
 
 
-def test_the_wavefront_is_found_to_a_170th_of_a_wave_with_ten_patterns(ran: Ran) -> None:
+def test_the_wavefront_is_found_to_a_170th_of_a_wave_with_ten_patterns(ran: CommandRun) -> None:
     """Schroff et al. 2024 report lambda / 170 rms with ten patterns for a panel calibrated by a camera."""
     assert ran.result["patterns"]["fitted"] == 10
     path = load_light_path(read_bundle(ran.folder / "bundle"))
@@ -85,7 +85,7 @@ def test_the_wavefront_is_found_to_a_170th_of_a_wave_with_ten_patterns(ran: Ran)
     assert 0 < ran.result["wavefront"]["error_rms_nm"] < error
 
 
-def test_distance_and_response_and_beam_are_found(ran: Ran) -> None:
+def test_distance_and_response_and_beam_are_found(ran: CommandRun) -> None:
     assert ran.result["distance_mm"]["value"] == pytest.approx(0.18, abs=0.001)
     path = load_light_path(read_bundle(ran.folder / "bundle"))
     bench = drifted_bench(*HIDDEN)
@@ -96,7 +96,7 @@ def test_distance_and_response_and_beam_are_found(ran: Ran) -> None:
     assert (found / found.mean() / (beam / beam.mean())).std() < 0.03
 
 
-def test_the_error_on_held_out_patterns_falls_to_the_cameras_noise(ran: Ran) -> None:
+def test_the_error_on_held_out_patterns_falls_to_the_cameras_noise(ran: CommandRun) -> None:
     before, after = (ran.result["heldout"][k] for k in ("before", "after"))
     assert before["excess"] > 0.1 and before["noise_nrmse"] < 0.1
     assert after["excess"] < 0.0003
@@ -104,12 +104,14 @@ def test_the_error_on_held_out_patterns_falls_to_the_cameras_noise(ran: Ran) -> 
     assert ran.result["verdict"] == "recalibrated" and ran.result["complete"] and ran.result["replaced"]
 
 
-def test_the_picture_that_is_shown_gets_better(ran: Ran) -> None:
+def test_the_picture_that_is_shown_gets_better(ran: CommandRun) -> None:
     psnr = ran.result["channels"]["green"]["picture_psnr_db"]
     assert psnr["after"] > psnr["before"] + 8
 
 
-def test_the_bundle_is_replaced_and_the_old_one_is_kept(ran: Ran, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_bundle_is_replaced_and_the_old_one_is_kept(
+    ran: CommandRun, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = ran.folder / "bundle"
     kept = Path(ran.result["previous"])
     old, new = read_bundle(kept), read_bundle(folder)
@@ -125,7 +127,7 @@ def test_the_bundle_is_replaced_and_the_old_one_is_kept(ran: Ran, capsys: pytest
     assert read_bundle(folder).provenance == new.provenance
 
 
-def test_the_report_is_one_file_with_pictures_and_the_verdict(ran: Ran) -> None:
+def test_the_report_is_one_file_with_pictures_and_the_verdict(ran: CommandRun) -> None:
     page = (ran.folder / "r.html").read_text(encoding="utf-8")
     assert ran.result["sentence"] in page
     assert len(re.findall(r'src="data:image/png;base64,[A-Za-z0-9+/=]{100,}"', page)) >= 10

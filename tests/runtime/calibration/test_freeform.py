@@ -9,7 +9,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from runtime.calibration.drift import Drift, drifted, node_weights
-from runtime.calibration.drift_fit import Base, Estimate, Shot, chi_squared, predicted
+from runtime.calibration.drift_fit import chi_squared
+from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, predicted
 from runtime.calibration.free_form_fit import fit_freeform, nodes_of
 from runtime.calibration.shown_patterns import grains
 from runtime.camera.view import View, sampler, sampler_and_adjoint
@@ -47,7 +48,7 @@ def test_a_cameras_reading_has_its_adjoint() -> None:
 @pytest.mark.parametrize("make", [ideal_path, random_path])
 def test_fine_structure_is_found_in_wavefront_and_beam(make: object) -> None:
     path: LightPath = ideal_path(SHAPE, 8e-3) if make is ideal_path else random_path(SHAPE)
-    base = Base(path, WAVELENGTH_NM)
+    base = ColourLightPath(path, WAVELENGTH_NM)
     hidden_nm, hidden_log = fine_map(0, 15.0), fine_map(1, 0.08)
     factor = np.exp(hidden_log + 2j * np.pi / WAVELENGTH_NM * hidden_nm)
     leak = None if path.leak is None else path.leak * factor
@@ -71,6 +72,6 @@ def test_fine_structure_is_found_in_wavefront_and_beam(make: object) -> None:
     put_in = drifted(path, "green", WAVELENGTH_NM, found.drift)
     one = Estimate(Drift(), start.view)
     np.testing.assert_allclose(
-        predicted(Base(put_in, WAVELENGTH_NM), shots[0], one, sample),
+        predicted(ColourLightPath(put_in, WAVELENGTH_NM), shots[0], one, sample),
         predicted(base, shots[0], found, sample),
     )

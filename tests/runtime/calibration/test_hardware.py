@@ -1,4 +1,4 @@
-"""The same calibration through the drivers: USB panel, I2C lasers in their guard, emulated down to the bytes."""
+"""The same calibration through the drivers: a USB panel and guarded I2C lasers, emulated byte by byte."""
 
 from __future__ import annotations
 

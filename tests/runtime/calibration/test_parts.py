@@ -11,7 +11,9 @@ import pytest
 from firmware_iface.errors import InputError
 from firmware_iface.virtual.simulated_drive import Drive
 from runtime.calibration.drift import Drift, drifted, wavefront_maps
-from runtime.calibration.drift_fit import Base, Estimate, Shot, _columns, _Layout, _stepped_views, predicted
+from runtime.calibration.drift_fit import _columns, _stepped_views
+from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, predicted
+from runtime.calibration.parameter_layout import ParameterLayout
 from runtime.calibration.replacement_rule import replacement_verdict
 from runtime.calibration.response import (
     SWEEP,
@@ -19,7 +21,6 @@ from runtime.calibration.response import (
     best_period,
     fitted_response,
     measured_sweep,
-    phase_of_power,
 )
 from runtime.calibration.shown_patterns import grains, grating
 from runtime.calibration.taking import Taker
@@ -28,6 +29,7 @@ from runtime.excess import PredictionErrors, is_complete
 from runtime.lightpath.light_path import irradiance, panel_phase, pixel_irradiance
 from tests.runtime.benches import PITCH, ideal_path, random_path
 from tests.runtime.calibration.drifting import WAVELENGTH_NM, base, devices, drifted_bench, headset
+from tests.runtime.calibration.power_sweep import phase_of_power
 
 SMALL = (40, 52)
 
@@ -99,11 +101,11 @@ def test_a_view_is_what_it_was_after_a_bundle() -> None:
 def test_derivatives_are_what_differences_say() -> None:
     """Every column of the fit against a central difference of the prediction, with modes, leak and crosstalk."""
     full = random_path(SMALL)
-    one = Base(full, WAVELENGTH_NM)
+    one = ColourLightPath(full, WAVELENGTH_NM)
     rng = np.random.default_rng(2)
     gray = rng.integers(0, 256, SMALL, dtype=np.uint8)
     shot = Shot("green", gray, np.zeros(SMALL, np.float32), np.ones(SMALL, np.float32))
-    layout = _Layout(("green",), 3, 2)
+    layout = ParameterLayout(("green",), 3, 2)
     start = layout.moved(
         layout.nothing(Estimate(Drift(), View(SMALL))), 0.02 * rng.normal(size=int(layout.edges[-1]))
     )

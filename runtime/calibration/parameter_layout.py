@@ -1,0 +1,114 @@
+"""The numbers of an estimate that a fit moves: their places in one vector, and what is likely of them beforehand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from runtime.calibration.drift import Drift, amplitude_maps, wavefront_maps
+from runtime.calibration.estimate import Estimate
+from runtime.camera.view import TERMS, View
+
+# Standard deviations of what is possible before any capture; they hold what no light shows.
+LIKELY = {"wavefront": 1000.0, "amplitude": 1.0, "distance": 5.0, "view": 3.0}
+LIKELY_STRETCH = 0.01  # of a homography from dots
+SHARPEST = -0.05  # square pixels: a lens cannot sharpen; this much is room for noise
+HELD = 1e30  # precision of what must not move
+VIEW = (
+    ("shift_y_px", 0.02),
+    ("shift_x_px", 0.02),
+    ("rotation_mrad", 0.05),
+    ("distortion", 1e-3),
+    ("blur_y_px2", 0.02),
+    ("blur_x_px2", 0.02),
+)  # fields of a View and the steps of their secants
+STRETCH = tuple((name, 1e-3) for name in ("magnification", "aspect", "shear", "keystone_y", "keystone_x"))
+
+
+class ParameterLayout:
+    """Where each number of an estimate stands in the vector that is fitted.
+
+    Parameters
+    ----------
+    channels : tuple of str
+    wavefront, amplitude : int
+        Highest Legendre orders of the wavefront and of the beam's amplitude; (0, 0) holds the distance too.
+    view : tuple of (str, float)
+        Fields of the view that are fitted, and the steps of their secants.
+
+    Attributes
+    ----------
+    edges : int array [5]
+        Where wavefront, amplitudes, distance and view begin in the vector, and its length.
+    precision : float array [edges[-1]]
+        1 / variance of each number beforehand.
+    """
+
+    def __init__(
+        self,
+        channels: tuple[str, ...],
+        wavefront: int,
+        amplitude: int,
+        view: tuple[tuple[str, float], ...] = VIEW,
+    ) -> None:
+        shape = (1, 1)
+        self.channels, self.view = channels, view
+        self.orders = (wavefront, amplitude)
+        self.wavefront = len(wavefront_maps(shape, wavefront)) if wavefront >= 2 else 0
+        self.amplitude = len(amplitude_maps(shape, amplitude)) if amplitude >= 1 else 0
+        sizes = [self.wavefront, self.amplitude * len(channels), 1, len(view) + TERMS + 1]
+        self.edges = np.cumsum([0, *sizes])
+        spread = [np.full(n, LIKELY[k]) for n, k in zip(sizes, LIKELY, strict=True)]
+        self.precision = 1 / np.concatenate(spread) ** 2
+        self.precision[self.edges[3] + len(VIEW) :][: len(view) - len(VIEW)] = 1 / LIKELY_STRETCH**2
+        if not any(self.orders):
+            self.precision[self.edges[2]] = HELD
+
+    def numbers(self, estimate: Estimate) -> np.ndarray:
+        """The vector of an estimate."""
+        drift, view = estimate.drift, estimate.view
+        beams = [drift.log_amplitude[c] for c in self.channels]
+        of_view = [getattr(view, name) for name, _ in self.view]
+        parts = [drift.wavefront_nm, *beams, [drift.distance_mm], of_view, view.sensitivity, [view.stray]]
+        return np.concatenate([np.asarray(p, float) for p in parts])
+
+    def moved(self, estimate: Estimate, step: np.ndarray) -> Estimate:
+        """An estimate with a vector added to its numbers."""
+        vector = self.numbers(estimate) + step
+        wavefront, beams, distance, of_view = (
+            vector[a:b] for a, b in zip(self.edges[:-1], self.edges[1:], strict=True)
+        )
+        split = beams.reshape(len(self.channels), self.amplitude)
+        drift = replace(
+            estimate.drift,
+            wavefront_nm=wavefront,
+            log_amplitude=dict(zip(self.channels, split, strict=True)),
+            distance_mm=float(distance[0]),
+        )
+        values: dict[str, Any] = dict(zip((name for name, _ in self.view), map(float, of_view), strict=False))
+        for name in ("blur_y_px2", "blur_x_px2"):
+            values[name] = max(values[name], SHARPEST)
+        sensitivity = tuple(float(v) for v in of_view[len(self.view) : -1])
+        view = replace(estimate.view, sensitivity=sensitivity, stray=float(of_view[-1]), **values)
+        return Estimate(drift, view)
+
+    def widened(self, estimate: Estimate) -> Estimate:
+        """An estimate with as many terms as are to be fitted: further ones 0."""
+        drift = estimate.drift
+        beams = {c: _sized(drift.log_amplitude.get(c, np.zeros(0)), self.amplitude) for c in self.channels}
+        wavefront = _sized(drift.wavefront_nm, self.wavefront)
+        return replace(estimate, drift=replace(drift, wavefront_nm=wavefront, log_amplitude=beams))
+
+    def nothing(self, estimate: Estimate) -> Estimate:
+        """An estimate that says that nothing has drifted."""
+        return self.widened(Estimate(Drift(), View(estimate.view.shape)))
+
+    def prior(self, estimate: Estimate) -> float:
+        """What an estimate adds to chi squared by being unlikely."""
+        return float(np.sum(self.precision * self.numbers(estimate) ** 2))
+
+
+def _sized(terms: np.ndarray, count: int) -> np.ndarray:
+    return np.concatenate([terms, np.zeros(max(0, count - len(terms)))])[:count]

@@ -1,0 +1,163 @@
+"""The refit of a headset from its captures: camera, distance, response, wavefront and beam, in turn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from runtime.calibration.colour_captures import ColourCaptures, dot_spacing
+from runtime.calibration.drift import Drift
+from runtime.calibration.drift_fit import DriftFit, chi_squared, fit
+from runtime.calibration.estimate import ColourLightPath, Estimate
+from runtime.calibration.free_form_fit import fit_freeform
+from runtime.calibration.held_out_errors import held_out_errors
+from runtime.calibration.replacement_rule import is_certain
+from runtime.calibration.response import Sweep, fitted_response, measured_sweep
+from runtime.calibration.shown_patterns import GRAINS
+from runtime.camera.registration import dots_of, find_homography, panel_points
+from runtime.camera.view import View, sampler
+from runtime.excess import removed_excess
+
+ORDERS = ((4, 2), (8, 4), (12, 6))  # of wavefront and beam, one fit after the other
+TURNS = 4  # of free-form maps, and all else around them
+SCAN_MM = (
+    0.0,
+    *(s * d for d in (0.1, 0.2, 0.35, 0.6, 1.0, 1.6, 2.5) for s in (-1, 1)),
+)  # starts of the distance
+SAME_PX = 6.0  # a camera that the dots put within this of the known view has not been exchanged
+
+Progress = Callable[[float, str], None]
+
+
+def start_view(
+    captures: ColourCaptures, known: View | None, shape: tuple[int, int], camera: tuple[int, int]
+) -> tuple[View, bool]:
+    """Where the camera looks, by the dots.
+
+    A camera of the panel's own size may be registered, and a camera may be known from an earlier calibration. Then only
+    its rigid motion is taken from the dots. Its scale is the lens's and does not drift: the light makes a picture that
+    is magnified. Only a camera that is turned, mirrored or scaled against that by many pixels is taken from the dots
+    as a whole.
+
+    Parameters
+    ----------
+    captures : ColourCaptures
+        Its dots are used.
+    known : View or None
+        Of an earlier calibration.
+    shape, camera : (int, int)
+        (height, width) of the panel and of the camera, pixels.
+
+    Returns
+    -------
+    View
+    bool
+        Whether the whole of it is new.
+
+    Raises
+    ------
+    InputError
+        Where the dots are not found.
+    """
+    start = known if known is not None and known.shape == camera else View(camera)
+    found = find_homography(captures.dots.signal, dots_of(shape, dot_spacing(shape)), start.matrix(shape))
+    corners = np.array(
+        [[0, 0], [0, camera[0] - 1], [camera[1] - 1, 0], [camera[1] - 1, camera[0] - 1]], float
+    )
+    away = panel_points(found, corners) - panel_points(start.matrix(shape), corners)
+    right, down = away.mean(0)
+    if np.hypot(*(away - (right, down)).T).max() > SAME_PX:
+        return View(camera, tuple(float(v) for v in found.ravel())), True
+    down, right = start.shift_y_px + float(down), start.shift_x_px + float(right)
+    return replace(start, shift_y_px=down, shift_x_px=right), False
+
+
+def refit(
+    bases: Mapping[str, ColourLightPath],
+    captures: Mapping[str, ColourCaptures],
+    view: View,
+    new_view: bool,
+    say: Progress,
+) -> tuple[DriftFit, dict[str, Sweep]]:
+    """Distance from several starts, then response and the rest in turn, with rising orders, then free-form maps.
+
+    Parameters
+    ----------
+    bases, captures : mappings
+        By colour.
+    view : View
+        To start from.
+    new_view : bool
+        Whether the view's homography is only as good as dots are.
+    say : callable
+        Called with the share done, 0 to 1, and what is done now.
+
+    Returns
+    -------
+    DriftFit
+    dict of str to Sweep
+        The measured phase response of each colour.
+    """
+    shots = [shot for t in captures.values() for shot in t.fitted]
+    estimate = Estimate(Drift(), view)
+    coarse = [t.fitted[GRAINS.index(size)] for t in captures.values() for size in sorted(GRAINS)[-2:]]
+    say(0.0, "distance")
+    costs = {
+        mm: chi_squared(bases, coarse, replace(estimate, drift=Drift(distance_mm=mm)), 1) for mm in SCAN_MM
+    }
+    estimate = replace(estimate, drift=Drift(distance_mm=min(costs, key=lambda mm: costs[mm])))
+    parts = len(ORDERS) + TURNS
+    for number, orders in enumerate(ORDERS):
+        say(number / parts, "phase response")
+        estimate, sweeps = _with_response(bases, captures, estimate)
+        what = f"wavefront and beam to order {orders[0]}"
+        progress = _part(say, number, parts, what)
+        found = fit(bases, shots, estimate, orders, new_view=new_view, progress=progress)
+        estimate = found.estimate
+    estimate, sweeps = _with_response(bases, captures, estimate)
+    found = replace(found, estimate=estimate)
+    return _with_maps(bases, captures, found, sweeps, new_view, say)
+
+
+def _with_maps(
+    bases: Mapping[str, ColourLightPath],
+    captures: Mapping[str, ColourCaptures],
+    found: DriftFit,
+    sweeps: dict[str, Sweep],
+    new_view: bool,
+    say: Progress,
+) -> tuple[DriftFit, dict[str, Sweep]]:
+    """A fit with free-form maps and all else in turn, where held-out patterns certainly get better by them."""
+    shots = [shot for t in captures.values() for shot in t.fitted]
+    heldout = [shot for t in captures.values() for shot in t.heldout]
+    before = held_out_errors(bases, heldout, found.estimate)
+    for turn in range(TURNS):
+        progress = _part(say, len(ORDERS) + turn, len(ORDERS) + TURNS, "wavefront and beam, free-form")
+        estimate = fit_freeform(bases, shots, found.estimate, progress)
+        removed = removed_excess(before.errors, held_out_errors(bases, heldout, estimate).errors)
+        if turn == 0 and not is_certain(removed):
+            break
+        found = fit(bases, shots, estimate, ORDERS[-1], iterations=2, new_view=new_view)
+        estimate, sweeps = _with_response(bases, captures, found.estimate)
+        found = replace(found, estimate=estimate)
+    return found, sweeps
+
+
+def _part(say: Progress, number: int, parts: int, what: str) -> Callable[[float], None]:
+    """Progress of one part as progress of the whole refit."""
+    return lambda done: say((number + done) / parts, what)
+
+
+def _with_response(
+    bases: Mapping[str, ColourLightPath], captures: Mapping[str, ColourCaptures], estimate: Estimate
+) -> tuple[Estimate, dict[str, Sweep]]:
+    """The estimate with each colour's response from its sweep, all else as it is."""
+    sweeps, responses = {}, dict(estimate.drift.response)
+    for channel, base in bases.items():
+        sample = sampler(estimate.view, base.path.grid)
+        sweeps[channel] = measured_sweep(base, captures[channel].sweep, estimate, sample)
+        believed = np.asarray(responses.get(channel, base.path.response), np.float64)
+        responses[channel] = fitted_response(believed, sweeps[channel])
+    return replace(estimate, drift=replace(estimate.drift, response=responses)), sweeps
