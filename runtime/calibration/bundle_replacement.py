@@ -9,8 +9,8 @@ from pathlib import Path
 from firmware_iface.errors import InputError
 from runtime.bundle.bundle_folder import Bundle, read_bundle, write_bundle
 from runtime.bundle.light_path_arrays import bundle_paths, load_light_path, pack_light_paths
-from runtime.calibration.calibrate import Calibration
 from runtime.calibration.drift import drifted
+from runtime.calibration.self_calibration import Calibration
 from runtime.calibration.summary import numbers
 
 

@@ -17,8 +17,8 @@ import numpy as np
 from PIL import Image
 
 from runtime.bundle.whole_files import whole_file
-from runtime.calibration.calibrate import Calibration
 from runtime.calibration.response import Sweep
+from runtime.calibration.self_calibration import Calibration
 from runtime.calibration.shown_patterns import proof_picture
 from runtime.calibration.summary import numbers, sentence_of
 from runtime.solver.targets import encode_srgb

@@ -28,10 +28,9 @@ from runtime.lightpath.light_path import (
     panel_phase,
     panel_spectrum,
 )
+from runtime.program.progress import Progress, no_progress, part_of
 
 SETTLED = 0.3  # a step that lowers chi squared by less, per parameter, is the last
-
-Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
@@ -136,7 +135,7 @@ def fit(
 
 def _share_of(progress: Progress | None, iteration: int, iterations: int) -> Progress:
     """Progress of one iteration as progress of the whole fit."""
-    return (lambda done: progress((iteration + done) / iterations)) if progress else (lambda done: None)
+    return part_of(progress or no_progress, iteration / iterations, (iteration + 1) / iterations)
 
 
 def _samplers(bases: Mapping[str, ColourLightPath], view: View, finer: int) -> dict[str, Sampler]:

@@ -10,7 +10,7 @@ Time and memory grow only with the number of pixels.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,14 +21,13 @@ from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, gain_o
 from runtime.camera.view import sampler_and_adjoint
 from runtime.lightpath.light_path import panel_phase
 from runtime.lightpath.light_path_adjoint import irradiance_and_pullback
+from runtime.program.progress import Progress
 
 NODE = 4  # panel pixels
 MOST = (270, 480)  # nodes: larger panels get coarser maps
 LIKELY_NM, LIKELY_LOG = 30.0, 0.3  # standard deviations of a node, before any capture
 ITERATIONS = 30
 MEMORY = 8  # steps that L-BFGS remembers
-
-Progress = Callable[[float], None]
 
 
 def fit_freeform(

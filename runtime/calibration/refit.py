@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from runtime.calibration.shown_patterns import GRAINS
 from runtime.camera.registration import dots_of, find_homography, panel_points
 from runtime.camera.view import View, sampler
 from runtime.excess import removed_excess
+from runtime.program.progress import Progress, part_of
 
 ORDERS = ((4, 2), (8, 4), (12, 6))  # of wavefront and beam, one fit after the other
 TURNS = 4  # of free-form maps, and all else around them
@@ -27,8 +28,6 @@ SCAN_MM = (
     *(s * d for d in (0.1, 0.2, 0.35, 0.6, 1.0, 1.6, 2.5) for s in (-1, 1)),
 )  # starts of the distance
 SAME_PX = 6.0  # a camera that the dots put within this of the known view has not been exchanged
-
-Progress = Callable[[float, str], None]
 
 
 def start_view(
@@ -145,9 +144,9 @@ def _with_maps(
     return found, sweeps
 
 
-def _part(say: Progress, number: int, parts: int, what: str) -> Callable[[float], None]:
+def _part(say: Progress, number: int, parts: int, what: str) -> Progress:
     """Progress of one part as progress of the whole refit."""
-    return lambda done: say((number + done) / parts, what)
+    return part_of(say, number / parts, (number + 1) / parts, what)
 
 
 def _with_response(

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from runtime.calibration.calibrate import Calibration
 from runtime.calibration.drift import LOWEST_AMPLITUDE, LOWEST_WAVEFRONT
 from runtime.calibration.response import SWEEP
+from runtime.calibration.self_calibration import Calibration
 from runtime.calibration.shown_patterns import GRAINS, HELD_OUT
 from runtime.excess import removed_excess
 from runtime.lightpath.legendre import edge_to_edge, legendre_maps, legendre_order

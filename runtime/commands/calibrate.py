@@ -40,8 +40,8 @@ def run(args: Namespace, screen: Screen) -> Result:
     """Calibrate, report, and replace the bundle where that is right."""
     from runtime.bundle.bundle_folder import read_bundle
     from runtime.calibration.bundle_replacement import previous, replace_bundle, restore_bundle
-    from runtime.calibration.calibrate import calibrate
     from runtime.calibration.calibration_report import write_report
+    from runtime.calibration.self_calibration import calibrate
     from runtime.calibration.summary import numbers, sentence_of
     from runtime.headset.open_devices import open_devices
 

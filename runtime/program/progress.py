@@ -34,10 +34,11 @@ def part_of(progress: Progress, begin: float, end: float, name: str = "") -> Pro
     begin, end : float
         Shares of the whole work that are done when the part begins and ends.
     name : str
-        What the part is, where it does not say what is done.
+        What the part is; stands before what it says itself.
     """
 
     def part(done: float, what: str = "") -> None:
-        progress(begin + (end - begin) * done, what or name)
+        said = f"{name}: {what}" if name and what else what or name
+        progress(begin + (end - begin) * done, said)
 
     return part

@@ -13,7 +13,7 @@ from tests.trainer.fringed_bench import captured
 from tests.trainer.test_networks import disturbed
 from trainer.captures.capture_set import CaptureSet
 from trainer.cli import main
-from trainer.diagnosis.compare import compare
+from trainer.diagnosis.comparison import compare
 from trainer.diagnosis.error_budget import error_budget
 from trainer.model.model import Model
 from trainer.networks.approximator import write_approximator

@@ -278,8 +278,8 @@ def stand_ins(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[Any]]:
         ) -> Any:
             return functions["explain"](model, known, save)
 
-        monkeypatch.setitem(sys.modules, "trainer.diagnosis.diagnose", SimpleNamespace(diagnose=diagnose))
-        monkeypatch.setitem(sys.modules, "trainer.diagnosis.explain", SimpleNamespace(explain=explain))
+        monkeypatch.setitem(sys.modules, "trainer.diagnosis.diagnosis", SimpleNamespace(diagnose=diagnose))
+        monkeypatch.setitem(sys.modules, "trainer.diagnosis.explanation", SimpleNamespace(explain=explain))
         return seen
 
     return put

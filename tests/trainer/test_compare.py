@@ -1,4 +1,4 @@
-"""`trainer.diagnosis.compare` on small sets from a propagator of this file's own, with errors planted in them."""
+"""`trainer.diagnosis.comparison` on small sets from a propagator of this file's own, with errors planted in them."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from firmware_iface.errors import InputError
 from tests.trainer.made_sets import write_captures
 from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet, read_captures
-from trainer.diagnosis import compare as module
-from trainer.diagnosis.compare import Comparison, compare
+from trainer.diagnosis import comparison as module
+from trainer.diagnosis.comparison import Comparison, compare
 from trainer.effects import catalogue
 from trainer.fitting.gains import with_gains
 from trainer.fitting.predictor import evaluate

@@ -32,7 +32,7 @@ from trainer.cycle.phase_retrieval import (
 )
 from trainer.cycle.show_on_bench import BenchDisplay, headset_beside_zero_order
 from trainer.cycle.target_pictures import TargetVolume, in_depth, photographs
-from trainer.model.export import export_bundle
+from trainer.model.bundle_export import export_bundle
 from trainer.model.model import Model
 from trainer.networks.approximator import Approximator, Architecture
 from trainer.training.recipe import RECIPES
@@ -104,7 +104,7 @@ def run_shown(
     display: BenchDisplay, patterns: dict[str, np.ndarray], wanted: TargetVolume, folder: Path
 ) -> float:
     from trainer.cycle.show_on_bench import display_metrics, pairs_by_pattern
-    from trainer.diagnosis.compare import with_gains
+    from trainer.diagnosis.comparison import with_gains
 
     captures = display.show(patterns, wanted.planes_mm, folder)
     pairs = pairs_by_pattern(captures, with_gains(captures, display.model, captures.captures))

@@ -21,7 +21,7 @@ from tests.trainer.test_effects import HEIGHT, PLANE, WIDTH, bench, gray, presen
 from tests.trainer.test_networks import disturbed
 from trainer.captures.capture_set import read_captures
 from trainer.effects import catalogue
-from trainer.model.export import export_bundle
+from trainer.model.bundle_export import export_bundle
 from trainer.model.model import EffectInstance, Model, absent
 from trainer.model.model_stages import scene_for, stages_for
 from trainer.networks.approximator import write_approximator

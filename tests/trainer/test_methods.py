@@ -13,7 +13,7 @@ from runtime.lightpath.light_path import irradiance
 from runtime.lightpath.light_path_adjoint import irradiance_and_pullback
 from tests.trainer.hidden import BENCH
 from trainer.captures.bench_file import Bench, read_bench
-from trainer.model.export import export_bundle
+from trainer.model.bundle_export import export_bundle
 from trainer.model.model import Model
 from trainer.model.model_stages import scene_for, stages_for
 from trainer.prediction.predict import light_on_camera, light_path, trace

@@ -32,7 +32,7 @@ from trainer.diagnosis.error_budget import error_budget
 from trainer.diagnosis.separate import _difference
 from trainer.effects.effect_catalogue import catalogue
 from trainer.fitting.learned_field import learn_field
-from trainer.model.export import export_bundle
+from trainer.model.bundle_export import export_bundle
 from trainer.model.model import Model, absent
 from trainer.model.model_file import read_model, write_model
 from trainer.model.model_stages import scene_for, stages_for, stages_of

@@ -18,7 +18,7 @@ import pytest
 from firmware_iface.errors import InputError
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.cli import main
-from trainer.diagnosis.diagnose import diagnose
+from trainer.diagnosis.diagnosis import diagnose
 from trainer.effects import testing
 from trainer.effects.effect_catalogue import Catalogue, catalogue, load_effects
 from trainer.fitting import pool

@@ -14,8 +14,8 @@ from tests.trainer.hidden import bench_file
 from trainer.captures.acquire import acquire_from
 from trainer.captures.batches import in_view
 from trainer.captures.capture_set import CaptureSet, read_captures
-from trainer.diagnosis.compare import compare
-from trainer.diagnosis.diagnose import Diagnosis, diagnose
+from trainer.diagnosis.comparison import compare
+from trainer.diagnosis.diagnosis import Diagnosis, diagnose
 from trainer.effects.effect_catalogue import catalogue
 from trainer.fitting.pool import open_pool
 from trainer.model.model import Model

@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.errors import InputError, nearest
+from runtime.program.progress import Progress
 from trainer.captures.bench_file import Bench, Camera, read_bench
 from trainer.captures.capture_writer import CaptureWriter
 from trainer.captures.open_bench import open_bench
 from trainer.captures.patterns import Pattern, choose_patterns, default_count
 
-Progress = Callable[[float, str], None]
 PatternChooser = Callable[[str, float], list[Pattern]]
 
 SATURATED = 0.002  # of all pixels of a colour

@@ -7,7 +7,6 @@ every statistic.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -15,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from firmware_iface.errors import InputError
+from runtime.program.progress import Progress
 from trainer.captures.bench_file import Bench, read_bench
 from trainer.captures.camera_noise import RepeatNoise, compare_repeats
 from trainer.captures.capture_table import Capture, scan_rows
@@ -26,8 +26,6 @@ from trainer.captures.problems import Problem
 NOISE_FACTOR = 2.25  # measured noise variance over the camera model's
 FEWEST_PATTERNS = 4
 MOST_PAIRS = 12  # pairs of repeated pictures that are compared
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass
@@ -67,7 +65,7 @@ def check_captures(folder: Path | str, predict: Predict, progress: Progress | No
     predict : callable
         The ideal model, for the test of conventions: (bench, gray, channel, plane_mm) -> irradiance [h, w].
     progress : callable, optional
-        Called with the captures done and the captures in all.
+        Called with the share of the captures that is done.
 
     Returns
     -------
@@ -84,7 +82,7 @@ def check_captures(folder: Path | str, predict: Predict, progress: Progress | No
     for number, capture in enumerate(rows):
         problems += _one(bench, capture, statistics)
         if progress:
-            progress(number + 1, len(rows))
+            progress((number + 1) / len(rows))
     problems += _patterns(bench, statistics)
     problems += _camera(bench, statistics)
     problems += _convention(bench, statistics, predict)

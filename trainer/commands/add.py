@@ -30,7 +30,7 @@ def run(args: Namespace, screen: Screen) -> Result:
 
     effect = find_effect(catalogue(args.effects), args.effect)
     captures, known, model = inputs_of(args)
-    from trainer.diagnosis.explain import add
+    from trainer.diagnosis.explanation import add
     from trainer.model.model_file import write_model
 
     use_every_core()

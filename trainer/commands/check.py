@@ -24,9 +24,7 @@ def run(args: Namespace, screen: Screen) -> Result:
         raise InputError(f"{folder} is not a folder: name a capture set, with bench.toml and captures.csv")
     use_every_core()
     with screen.progress("checking the captures") as progress:
-        problems = check_captures(
-            folder, ideal_irradiance, lambda done, count: progress(done / max(1, count))
-        )
+        problems = check_captures(folder, ideal_irradiance, progress)
     try:
         rows, _ = scan_rows(folder, read_bench(folder / "bench.toml"))
     except InputError:

@@ -44,7 +44,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     captures, _, model = inputs_of(args)
     from dataclasses import replace
 
-    from trainer.diagnosis.compare import compare
+    from trainer.diagnosis.comparison import compare
     from trainer.diagnosis.error_budget import error_budget
     from trainer.networks.approximator import read_approximator
 

@@ -33,13 +33,13 @@ def run(args: Namespace, screen: Screen) -> Result:
     thresholds = thresholds_of(args)
     captures, known, model = inputs_of(args)
     refuse_misread(args.captures, screen)
-    from trainer.diagnosis.diagnose import diagnose
+    from trainer.diagnosis.diagnosis import diagnose
     from trainer.fitting.pool import open_pool
 
     with screen.progress("diagnosing") as progress, open_pool(workers_of(args), args.cluster) as pool:
         found = diagnose(captures, model, known, pool, thresholds, progress)
     if args.report:
-        from trainer.diagnosis.compare import compare
+        from trainer.diagnosis.comparison import compare
         from trainer.report import write_report
 
         write_report(

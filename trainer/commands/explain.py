@@ -44,7 +44,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     thresholds = thresholds_of(args)
     captures, known, model = inputs_of(args)
     refuse_misread(args.captures, screen)
-    from trainer.diagnosis.explain import explain
+    from trainer.diagnosis.explanation import explain
     from trainer.fitting.pool import open_pool
     from trainer.model.model_file import write_model
 
@@ -61,7 +61,7 @@ def run(args: Namespace, screen: Screen) -> Result:
             found = explain(captures, model, known, pool, thresholds, save, progress)
         save(found.model)
         if args.report:
-            from trainer.diagnosis.compare import compare
+            from trainer.diagnosis.comparison import compare
             from trainer.report import write_report
 
             write_report(

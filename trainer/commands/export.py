@@ -39,7 +39,7 @@ def run(args: Namespace, screen: Screen) -> Result:
         raise InputError(f"--out {args.out} is a file: give the name of a folder")
     from trainer.captures.capture_set import read_captures
     from trainer.effects.effect_catalogue import catalogue
-    from trainer.model.export import export_bundle
+    from trainer.model.bundle_export import export_bundle
     from trainer.model.model_file import read_model
 
     captures = read_captures(args.captures) if args.captures else None

@@ -30,7 +30,7 @@ from trainer.captures.bench_file import Bench
 from trainer.captures.open_bench import nominal_bench
 from trainer.effects.effect_catalogue import catalogue
 from trainer.formatting import listed
-from trainer.model.export import export_bundle
+from trainer.model.bundle_export import export_bundle
 from trainer.model.model import Model
 from trainer.report.display_section import DisplayedPicture, with_display
 from trainer.training.photographs import photograph
@@ -87,8 +87,8 @@ def run_demo(
     """
     from trainer.captures.acquire import acquire_captures
     from trainer.captures.capture_set import read_captures
-    from trainer.diagnosis.compare import compare
-    from trainer.diagnosis.explain import explain
+    from trainer.diagnosis.comparison import compare
+    from trainer.diagnosis.explanation import explain
     from trainer.fitting.pool import open_pool
     from trainer.model.model_file import write_model
     from trainer.report import write_report
@@ -101,7 +101,7 @@ def run_demo(
     captures_folder, model_path, report_path = (folder / n for n in ("captures", "model.toml", "report.html"))
     acquire_captures(
         headset, bench, captures_folder, patterns=9 if quick else None,
-        progress=lambda done, what: say(0.1 * done, f"capturing: {what}"),
+        progress=part_of(say, 0.0, 0.1, "capturing"),
     )  # fmt: skip
     captures = read_captures(captures_folder)
 
@@ -111,7 +111,7 @@ def run_demo(
     with open_pool(workers) as pool:
         found = explain(
             captures, Model(captures.bench), catalogue(), pool, save=keep,
-            progress=lambda done, what: say(0.1 + 0.5 * done, f"explaining: {what}"),
+            progress=part_of(say, 0.1, 0.6, "explaining"),
         )  # fmt: skip
     keep(found.model)
 

@@ -25,7 +25,7 @@ from trainer.cycle.show_on_bench import (
     pairs_by_pattern,
 )
 from trainer.cycle.target_pictures import TargetVolume, in_depth
-from trainer.diagnosis.compare import with_gains
+from trainer.diagnosis.comparison import with_gains
 from trainer.model.model import Model
 from trainer.networks.approximator import Approximator
 from trainer.training.image_metrics import ImageMetrics, mean_metrics, noise_floor, prediction_metrics

@@ -22,7 +22,7 @@ from trainer.cycle.hardware_in_the_loop import run_cycle
 from trainer.cycle.phase_retrieval import retrieve
 from trainer.cycle.show_on_bench import BenchDisplay
 from trainer.cycle.target_pictures import HELD_OUT, LEARNED, TargetVolume, photographs
-from trainer.diagnosis.compare import with_gains
+from trainer.diagnosis.comparison import with_gains
 from trainer.fitting.learned_field import with_learned_field
 from trainer.model.model import Model
 from trainer.networks.approximator import Approximator, read_approximator
@@ -119,7 +119,7 @@ class EvaluationBench:
             if (self.given.bench.panel, self.given.bench.channels) != (self.bench.panel, self.bench.channels):
                 raise InputError(f"--model is of another bench than {self.spec}: its panel or colours differ")
             return self.given
-        from trainer.diagnosis.explain import explain
+        from trainer.diagnosis.explanation import explain
         from trainer.effects.effect_catalogue import catalogue
         from trainer.fitting.pool import open_pool
 

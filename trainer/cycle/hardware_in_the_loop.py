@@ -30,7 +30,7 @@ from trainer.cycle.cycle_settings import CycleSettings
 from trainer.cycle.phase_retrieval import retrieve
 from trainer.cycle.show_on_bench import BenchDisplay, display_metrics, pairs_by_pattern, rows_of
 from trainer.cycle.target_pictures import TargetVolume
-from trainer.diagnosis.compare import with_gains
+from trainer.diagnosis.comparison import with_gains
 from trainer.fitting.learned_field import with_refined_field
 from trainer.model.model import Model
 from trainer.model.model_file import write_model

@@ -25,7 +25,7 @@ from runtime.program.progress import Progress
 from runtime.solver import DriveRange, solve
 from trainer.cycle.target_pictures import TargetVolume
 from trainer.effects.effect_catalogue import BUILT_IN
-from trainer.model.export import acting_on_display, baked_path
+from trainer.model.bundle_export import acting_on_display, baked_path
 from trainer.model.model import Model, absent
 from trainer.model.model_stages import scene_for, stages_of
 from trainer.networks.approximator import Approximator, penalty

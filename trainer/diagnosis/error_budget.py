@@ -7,7 +7,6 @@ are counted as `network`), the camera's noise, and the rest.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,6 +14,7 @@ from torch import Tensor
 
 from firmware_iface.errors import InputError
 from runtime.excess import PredictionErrors, joined
+from runtime.program.progress import Progress
 from trainer.captures.batches import Batch, load_batch
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import split
@@ -24,8 +24,6 @@ from trainer.model.model import Model
 from trainer.networks.approximator import Approximator
 from trainer.training.camera_to_panel import onto_camera
 from trainer.training.training_pairs import display_irradiance, expected_counts, stacked
-
-Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from runtime.excess import PredictionErrors, RemovedExcess, removed_excess
+from runtime.program.progress import Progress
 from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.candidate_fits import CandidateFit, try_effect, try_together
 from trainer.diagnosis.screen import ScreenResult
@@ -75,7 +76,7 @@ def try_all(
     before: PredictionErrors,
     screened: Sequence[ScreenResult],
     pool: Pool,
-    report: Callable[[float, str], None],
+    report: Progress,
     start: float,
     end: float,
 ) -> list[CandidateFit]:

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from runtime.program.progress import Progress
 from trainer.captures.batches import Batch
 from trainer.fitting.predictor import Predictor
 from trainer.model.model import Model
@@ -101,7 +102,7 @@ def descend(
     scale: float,
     iterations: int,
     rounds: int,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress | None = None,
 ) -> Tensors:
     """The maps of the descent that predict the stopping captures best.
 

@@ -8,7 +8,7 @@ always fitted too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from runtime.excess import PredictionErrors
+from runtime.program.progress import Progress
 from trainer.captures.batches import Batch
 from trainer.effects.definition import STAGES
 from trainer.effects.evidence import Evidence
@@ -53,7 +54,7 @@ def fit(
     batches: Sequence[Batch],
     iterations: int = 12,
     tolerance: float = 1e-3,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress | None = None,
 ) -> FitResult:
     """Fit the named effects of a model, and the gains, to batches.
 
@@ -77,7 +78,7 @@ def _fit(
     batches: Sequence[Batch],
     iterations: int,
     tolerance: float,
-    progress: Callable[[float], None] | None,
+    progress: Progress | None,
 ) -> FitResult:
     predictors = [Predictor(model, b) for b in batches]
     keys = keys_of(model, free)

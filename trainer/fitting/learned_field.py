@@ -8,13 +8,14 @@ does not use.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from runtime.excess import PredictionErrors
+from runtime.program.progress import Progress, no_progress, part_of
 from trainer.captures.batches import Batch, load
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.capture_table import Capture
@@ -69,9 +70,7 @@ class PanelFieldFit:
         return {"before": self.before.as_json(), "after": self.after.as_json(), "maps": maps}
 
 
-def learn_field(
-    captures: CaptureSet, model: Model, progress: Callable[[float], None] | None = None
-) -> PanelFieldFit:
+def learn_field(captures: CaptureSet, model: Model, progress: Progress | None = None) -> PanelFieldFit:
     """Learn a model's panel field from the captures that fits may use, and judge it on the others.
 
     A field that the model already has is replaced.
@@ -98,7 +97,7 @@ def with_learned_field(
     captures: CaptureSet,
     rows: Sequence[Capture],
     model: Model,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress | None = None,
 ) -> Model:
     """The model with a field learned from these captures.
 
@@ -113,13 +112,13 @@ def with_learned_field(
     progress : callable, optional
         Called with the share that is done, 0 .. 1.
     """
-    report = progress or (lambda done: None)
+    report = progress or no_progress
     last = list({(c.channel, c.plane_mm): c for c in rows}.values())
     first = [c for c in rows if c not in last] or list(rows)
 
     def learned(begin: Model, share: float) -> Model:
         fitted, stopping = (_in_noise_units(begin, load(captures, part)) for part in (first, last))
-        found = _descend(begin, SPREAD, fitted, stopping, ROUNDS, lambda done: report(share + 0.5 * done))
+        found = _descend(begin, SPREAD, fitted, stopping, ROUNDS, part_of(report, share, share + 0.5))
         return replace(begin, panel_field=found)
 
     once = learned(model, 0.0)
@@ -156,7 +155,7 @@ def _descend(
     fitted: Sequence[FreeFormBatch],
     stopping: Sequence[FreeFormBatch],
     rounds: int,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress | None = None,
 ) -> dict[str, np.ndarray]:
     """Most probable maps beyond the model; a unit of the optimiser's variables is a large change of the panel."""
     height, width = model.bench.panel.shape

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from trainer.diagnosis.compare import CapturePicture
+from trainer.diagnosis.comparison import CapturePicture
 from trainer.formatting import percent
 
 

@@ -11,10 +11,10 @@ from typing import Any
 
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.problems import Problem
-from trainer.diagnosis.compare import Comparison
-from trainer.diagnosis.compare import compare as compare_model
-from trainer.diagnosis.diagnose import Diagnosis
-from trainer.diagnosis.explain import Explanation
+from trainer.diagnosis.comparison import Comparison
+from trainer.diagnosis.comparison import compare as compare_model
+from trainer.diagnosis.diagnosis import Diagnosis
+from trainer.diagnosis.explanation import Explanation
 from trainer.formatting import number
 from trainer.model.model import Model
 from trainer.notebook.figures import NotebookFigure, comparison_figure, explanation_figure, image_tag

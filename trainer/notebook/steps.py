@@ -17,14 +17,14 @@ from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.check_set import check_captures
 from trainer.captures.problems import MISREAD
 from trainer.commands.inputs import origin
-from trainer.diagnosis.compare import compare as compare_model
-from trainer.diagnosis.diagnose import diagnose as diagnose_model
-from trainer.diagnosis.explain import explain as explain_captures
+from trainer.diagnosis.comparison import compare as compare_model
+from trainer.diagnosis.diagnosis import diagnose as diagnose_model
+from trainer.diagnosis.explanation import explain as explain_captures
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import Catalogue, catalogue
 from trainer.fitting.pool import open_pool
 from trainer.model import model_file
-from trainer.model.export import export_bundle
+from trainer.model.bundle_export import export_bundle
 from trainer.model.model import Model
 from trainer.model.model_stages import ideal_irradiance
 from trainer.notebook.results import CheckResult, ComparisonResult, DiagnosisResult, ExplanationResult

@@ -49,7 +49,7 @@ def write_report(
         The HTML file.
     title : str
         Of the page.
-    comparison : trainer.diagnosis.compare.Comparison or None
+    comparison : trainer.diagnosis.comparison.Comparison or None
         Or another object with its `as_json()` and, if known, `pictures`.
     diagnosis : object or None
         With `as_json()` (the object of `diagnose --json`, with `thresholds`, `ideal_excess` and `sentence` if known)

@@ -24,7 +24,7 @@ from trainer.captures.batches import Batch, load_batch
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.capture_table import Capture
 from trainer.fitting.predictor import Predictor
-from trainer.model.export import acting_on_display
+from trainer.model.bundle_export import acting_on_display
 from trainer.model.model import Model
 from trainer.model.model_stages import scene_for, stages_of
 from trainer.prediction.predict import counts, light_path

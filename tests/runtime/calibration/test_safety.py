@@ -11,7 +11,7 @@ import pytest
 from firmware_iface.errors import InputError
 from firmware_iface.virtual import VirtualHeadset
 from runtime.bundle.bundle_folder import read_bundle
-from runtime.calibration.calibrate import calibrate
+from runtime.calibration.self_calibration import calibrate
 from tests.runtime.calibration.drifting import drifted_bench, headset, ideal_bundle, opened
 
 

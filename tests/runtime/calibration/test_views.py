@@ -16,7 +16,7 @@ from firmware_iface.virtual.simulated_panel import panel_path_nm
 from runtime.bundle.bundle_folder import Bundle, read_bundle, write_bundle
 from runtime.bundle.light_path_arrays import load_light_path, pack_light_paths
 from runtime.calibration.bundle_replacement import replace_bundle
-from runtime.calibration.calibrate import calibrate
+from runtime.calibration.self_calibration import calibrate
 from runtime.calibration.summary import numbers, sentence_of
 from runtime.camera.registration import panel_points
 from runtime.camera.view import View, on_panel, sampler, view_of

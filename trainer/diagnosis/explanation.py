@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from runtime.excess import PredictionErrors, removed_excess
+from runtime.program.progress import Progress, no_progress, part_of
 from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import CaptureRoles, capture_roles
-from trainer.diagnosis.diagnose import Diagnosis, Progress, diagnose, ideal_errors
+from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors
 from trainer.diagnosis.screen import ScreenResult, screen_batches
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.definition import Effect
@@ -141,7 +142,7 @@ def add(
     progress : callable, optional
         Called with the share that is done and what is being done.
     """
-    report = progress or (lambda done, what: None)
+    report = progress or no_progress
     roles = capture_roles(captures)
     model = with_gains(captures, model, roles.fitted)
     before = evaluate_captures(captures, roles.held_out, model)
@@ -189,7 +190,7 @@ def explain(
         Called with the share that is done and what is being done.
     """
     thresholds = thresholds or Thresholds()
-    report = progress or (lambda done, what: None)
+    report = progress or no_progress
     roles = capture_roles(captures)
     model = with_gains(captures, model, roles.fitted)
     errors = evaluate_captures(captures, roles.held_out, model)
@@ -202,8 +203,7 @@ def explain(
     while True:
         done = len(steps) - 1
 
-        def report_share(share: float, what: str, done: int = done) -> None:
-            report(1 - 0.6**done * (1 - 0.4 * share), what)
+        report_share = part_of(report, 1 - 0.6**done, 1 - 0.6**done * 0.6)
 
         found = diagnose(captures, model, known, pool, thresholds, report_share, ideal, with_probes=False)
         diagnoses.append(found)

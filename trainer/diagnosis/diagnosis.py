@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from runtime.excess import PredictionErrors
+from runtime.program.progress import Progress, no_progress
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import CaptureRoles, capture_roles
 from trainer.diagnosis.probes import ProbeResult, probe
@@ -24,8 +25,6 @@ from trainer.fitting.predictor import evaluate_captures
 from trainer.formatting import number
 from trainer.model.model import Model
 from trainer.model.parameters import describe
-
-Progress = Callable[[float, str], None]
 
 FITTED_FIRST = 5  # candidates fitted after the screen; all of them when none of these explains anything
 
@@ -143,7 +142,7 @@ def diagnose(
         all of it for a complete model.
     """
     thresholds = thresholds or Thresholds()
-    report = progress or (lambda done, what: None)
+    report = progress or no_progress
     roles = capture_roles(captures)
     report(0.0, "comparing the model with held-out captures")
     model = with_gains(captures, model, roles.fitted)

@@ -28,7 +28,7 @@ from runtime.calibration.drift import Drift
 from runtime.calibration.drift_fit import fit
 from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, gain_of, predicted
 from runtime.calibration.held_out_errors import HeldOutErrors, held_out_errors
-from runtime.calibration.refit import Progress, refit, start_view
+from runtime.calibration.refit import Progress, part_of, refit, start_view
 from runtime.calibration.replacement_rule import LEAST_EXCESS, Verdict, is_certain, replacement_verdict
 from runtime.calibration.response import SWEEP, Sweep
 from runtime.calibration.shown_patterns import GRAINS, HELD_OUT
@@ -36,6 +36,7 @@ from runtime.calibration.taking import Taker
 from runtime.camera.view import View, sampler, view_of
 from runtime.excess import is_complete, removed_excess
 from runtime.headset.open_devices import Devices
+from runtime.program.progress import no_progress
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,7 @@ def calibrate(
     InputError
         Where the panel is not the bundle's, a colour has no laser, or the camera does not see what it should.
     """
-    say = progress or (lambda done, what: None)
+    say = progress or no_progress
     channels = bundle_channels(bundle)
     bases = {
         c: ColourLightPath(load_light_path(bundle, c, plane_mm), _wavelength(bundle, c)) for c in channels
@@ -151,7 +152,7 @@ def calibrate(
         captures = {c: colour_captures(taker, c, patterns[c], black, floor) for c in channels}
     captured = time.perf_counter()
     view, new = start_view(captures[channels[0]], view_of(bundle), shape, camera)
-    found, sweeps = refit(bases, captures, view, new, lambda d, w: say(0.25 + 0.6 * d, f"fitting: {w}"))
+    found, sweeps = refit(bases, captures, view, new, part_of(say, 0.25, 0.85, "fitting"))
     say(0.86, "checking against held-out patterns")
     heldout = [shot for one in captures.values() for shot in one.heldout]
     before, scale = _as_it_was(bases, heldout, found.estimate.view)

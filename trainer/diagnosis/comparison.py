@@ -6,7 +6,7 @@ One capture is in memory at a time. Saturated pixels are left out of every stati
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,7 @@ import torch
 
 from firmware_iface.errors import InputError
 from runtime.excess import PredictionErrors, joined
+from runtime.program.progress import Progress
 from trainer.captures.batches import load_batch
 from trainer.captures.camera_noise import compare_repeats
 from trainer.captures.capture_set import CaptureSet
@@ -28,8 +29,6 @@ from trainer.model.model import Model
 
 PICTURES = 3  # held-out captures whose pictures are kept for the report
 PAIRS = 12  # pairs of repeats that the noise is checked on
-
-Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
