@@ -20,7 +20,7 @@ from runtime.program.screen import Screen
 from trainer import cli
 from trainer.effects import testing
 from trainer.effects.effect_catalogue import catalogue
-from trainer.model.model import Model
+from trainer.model.model import Model, instance_with
 from trainer.model.model_file import read_model, write_model
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -315,7 +315,7 @@ def test_an_interrupted_explain_leaves_the_last_good_model_and_says_so(
 ) -> None:
     def explain(model: Model, known: Any, save: Callable[[Model], None]) -> None:
         save(model)
-        save(model.having(testing.instance_with(known["distance"], model.bench, {"offset": 0.2})))
+        save(model.having(instance_with(known["distance"], model.bench, {"offset": 0.2})))
         raise KeyboardInterrupt
 
     stand_ins(explain=explain)
@@ -342,7 +342,7 @@ def test_explain_shows_the_ladder_and_writes_the_model(
     captures: Path, tmp_path: Path, stand_ins: Callable[..., list[Any]], capsys: pytest.CaptureFixture[str]
 ) -> None:
     def explain(model: Model, known: Any, save: Callable[[Model], None]) -> Any:
-        better = model.having(testing.instance_with(known["distance"], model.bench, {"offset": 0.2}))
+        better = model.having(instance_with(known["distance"], model.bench, {"offset": 0.2}))
         save(better)
         steps = [
             {"added": None, "nrmse": 0.2, "excess": 0.04, "indistinguishable_from": []},

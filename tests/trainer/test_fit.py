@@ -11,10 +11,10 @@ from runtime.lightpath.legendre import legendre_count
 from trainer.captures.batches import Batch, load
 from trainer.captures.capture_set import CaptureSet
 from trainer.effects import catalogue
-from trainer.effects.testing import captures_with, instance_with
+from trainer.effects.testing import captures_with
 from trainer.fitting.gauss_newton import fit
 from trainer.fitting.refit import least_for_order, raise_order
-from trainer.model.model import EffectInstance, Model, absent
+from trainer.model.model import EffectInstance, Model, absent, instance_with
 
 KNOWN = catalogue()
 

@@ -9,15 +9,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from runtime.excess import joined
 from trainer.captures.batches import Batch, load
-from trainer.captures.bench_file import Bench
 from trainer.captures.capture_set import chosen, opened
 from trainer.effects.definition import Effect
 from trainer.effects.evidence import Evidence
@@ -25,7 +22,7 @@ from trainer.fitting.jacobian import keys_of, slopes_of, weighted_residuals
 from trainer.fitting.least_squares_gain import with_gain
 from trainer.fitting.predictor import Predictor
 from trainer.fitting.start_points import start_cost, start_points
-from trainer.model.model import EffectInstance, Model, absent
+from trainer.model.model import EffectInstance, Model, absent, instance_with
 from trainer.prediction.predict import Trace
 
 
@@ -106,7 +103,7 @@ def _start(effect: Effect, model: Model, predictors: list[Predictor], points: li
         for predictor, point in zip(predictors, points, strict=True):
             prediction = predictor.counts(model, predictor.light(model, point))
             evidence.append(Evidence(predictor.scene, predictor.batch, prediction))
-        starts += [placed(effect, model.bench, values) for values in effect.starts(evidence)]
+        starts += [instance_with(effect, model.bench, values) for values in effect.starts(evidence)]
     if len(starts) == 1:
         return starts[0]
     # A start need only be near: one colour and plane are enough.
@@ -116,16 +113,6 @@ def _start(effect: Effect, model: Model, predictors: list[Predictor], points: li
         # A period or a place changes nothing while the amplitude is zero: compare one step ahead.
         costs = [_one_step_ahead(model, few, there, start) for start in starts]
     return starts[costs.index(min(costs))]
-
-
-def placed(effect: Effect, bench: Bench, values: dict[str, Any]) -> EffectInstance:
-    """The effect with some values given, held within their physical range, and the others absent."""
-    base = absent(effect, bench)
-    full = dict(base.values)
-    for name, value in values.items():
-        p = effect.parameter(name)
-        full[name] = np.array(np.clip(value, p.low, p.high), dtype=float).reshape(base.values[name].shape)
-    return base.with_values(full)
 
 
 def _one_step_ahead(

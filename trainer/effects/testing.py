@@ -14,7 +14,7 @@ from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.capture_writer import CaptureWriter
 from trainer.captures.patterns import choose_patterns
 from trainer.effects.definition import Effect
-from trainer.model.model import EffectInstance, Model, absent
+from trainer.model.model import EffectInstance, Model, absent, instance_with
 from trainer.model.model_stages import scene_for, stages_for
 from trainer.prediction.predict import counts, light_on_camera, trace
 
@@ -27,17 +27,6 @@ def small_bench(rows: int = 72, columns: int = 96) -> Bench:
     """A green bench with a small panel, 6 mm from the camera."""
     camera = Camera(columns, rows, 8.0, True, 12, 64.0, 10500.0, 5.0)
     return Bench("small", Panel(columns, rows, 8.0), (Channel("green", 520.0),), 6.0, Iris(), camera)
-
-
-def instance_with(
-    effect: Effect, bench: Bench, values: ParameterValues, order: int | None = None
-) -> EffectInstance:
-    """The effect with these values, at its lowest order or a stated one; parameters not named stay absent."""
-    base = absent(effect, bench, order)
-    given = {
-        n: np.array(np.broadcast_to(values[n], v.shape), float) for n, v in base.values.items() if n in values
-    }
-    return base.with_values({**base.values, **given})
 
 
 def change_when_absent(effect: Effect) -> float:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from trainer.captures.bench_file import Bench
 from trainer.effects.definition import Effect
@@ -103,6 +105,29 @@ def absent(effect: Effect, bench: Bench, order: int | None = None) -> EffectInst
         for p in effect.parameters
     }
     return EffectInstance(effect, order, values)
+
+
+def instance_with(
+    effect: Effect, bench: Bench, values: Mapping[str, ArrayLike], order: int | None = None
+) -> EffectInstance:
+    """The effect with some values given, held within their physical range; parameters not named stay absent.
+
+    Parameters
+    ----------
+    values : mapping of str to number or array
+        By parameter name; one number stands for all of a parameter's numbers.
+    order : int, optional
+        The effect's lowest order without it.
+    """
+    base = absent(effect, bench, order)
+    full = dict(base.values)
+    for name, value in values.items():
+        p, shape = effect.parameter(name), base.values[name].shape
+        held = np.clip(np.asarray(value, dtype=float), p.low, p.high)
+        full[name] = np.array(
+            held.reshape(shape) if held.size == math.prod(shape) else np.broadcast_to(held, shape)
+        )
+    return base.with_values(full)
 
 
 def raised(present: EffectInstance, bench: Bench, order: int) -> EffectInstance:
