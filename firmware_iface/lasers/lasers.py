@@ -28,8 +28,8 @@ from firmware_iface.errors import DeviceError, InputError
 from firmware_iface.lasers.channels import LaserChannel
 from firmware_iface.lasers.i2c_transfers import open_bus
 from firmware_iface.lasers.laser_board import LaserBoard
-from firmware_iface.lasers.light_budget import LightBudget
 from firmware_iface.lasers.mcp4728 import VOLTS_PER_CODE
+from firmware_iface.lasers.pattern_power import LightBudget
 from firmware_iface.lasers.safety_controller import Command, Input, State
 
 if TYPE_CHECKING:
