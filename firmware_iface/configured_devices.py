@@ -229,14 +229,22 @@ def laser_channels(table: Table) -> Sequence[LaserChannel]:
     Raises
     ------
     InputError
-        Where there is none, or a value is out of range.
+        Where there is none, two have one name, or a value is out of range.
     """
     given = table.get("channel", [])
     if not given and str(table.get("bus")).startswith("virtual:"):
         return VIRTUAL_CHANNELS
     if not isinstance(given, list) or not given:
         raise InputError("[lasers] describes no laser: write [[lasers.channel]] for each")
-    return [read_table(LaserChannel, one, f"[[lasers.channel]] {k}") for k, one in enumerate(given)]
+    lasers = [read_table(LaserChannel, one, f"[[lasers.channel]] {k}") for k, one in enumerate(given)]
+    names = [laser.name for laser in lasers]
+    for k, name in enumerate(names):
+        if name in names[:k]:
+            raise InputError(
+                f"[[lasers.channel]] {names.index(name)} and {k} are both name = {name!r}: give each its own name, or "
+                "remove one"
+            )
+    return lasers
 
 
 def laser_power(table: Table) -> dict[str, float]:
