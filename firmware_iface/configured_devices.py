@@ -170,6 +170,12 @@ def open_camera(table: Table) -> Any:
     return camera
 
 
+def simulated(tables: Mapping[str, Any]) -> bool:
+    """Whether a device of [panel], [lasers] and [camera] is emulated, so that what is captured is simulated."""
+    found = (tables[name] for name in ("panel", "lasers", "camera") if name in tables)
+    return any(one.get("kind") == "virtual" or str(one.get("bus")).startswith("virtual:") for one in found)
+
+
 def check_tables(tables: Mapping[str, Table]) -> None:
     """Check [panel], [lasers] and [camera] without opening anything.
 

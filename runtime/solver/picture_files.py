@@ -132,8 +132,7 @@ def _read_jpeg(path: Path) -> np.ndarray:
 
 def _read_tiff(path: Path) -> np.ndarray:
     try:
-        with warnings.catch_warnings(), Image.open(path, formats=["TIFF"]) as image:
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"), Image.open(path, formats=["TIFF"]) as image:
             bits = max(image.tag_v2.get(BITS_PER_SAMPLE, (1,)))  # type: ignore[attr-defined]
     except UnidentifiedImageError:
         bits = 32  # of several floats, which Pillow does not read
@@ -157,8 +156,7 @@ def _read_tiff(path: Path) -> np.ndarray:
 def _read_8_bit(path: Path, kind: str) -> np.ndarray:
     """Pixels, uint8 [H, W] or [H, W, 4], the right way up."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             with Image.open(path, formats=[kind]) as image:
                 upright = ImageOps.exif_transpose(image)

@@ -29,6 +29,7 @@ class RealHeadset:
     """Real devices as `capture_set` wants them: lasers within their set powers, a clock, and a focus.
 
     power : fraction of full of each colour while it is lit. focus_mm : the plane that the camera is focused on
+    simulated : whether the devices are emulated
     """
 
     panel: Any
@@ -37,6 +38,7 @@ class RealHeadset:
     power: Mapping[str, float]
     focus_mm: float
     focus: Any = None
+    simulated: bool = False
     started: float = field(default_factory=time.monotonic)
 
     def __post_init__(self) -> None:
@@ -80,7 +82,7 @@ def open_bench(spec: str, seed: int = 0, known: Bench | None = None) -> Iterator
     Raises InputError, and DeviceError where a device fails.
     """
     from firmware_iface.virtual import open_headset
-    from runtime.headset.open_devices import configuration_of, open_devices
+    from runtime.headset.open_devices import configuration_of, is_simulated, open_devices
 
     if configuration_of(spec) is None:
         virtual = open_headset(spec, seed)
@@ -93,7 +95,13 @@ def open_bench(spec: str, seed: int = 0, known: Bench | None = None) -> Iterator
     with open_devices(spec, seed) as devices:
         _check(devices, known)
         headset = RealHeadset(
-            devices.panel, devices.lasers, devices.camera, devices.power, known.distance_mm, devices.focus
+            devices.panel,
+            devices.lasers,
+            devices.camera,
+            devices.power,
+            known.distance_mm,
+            devices.focus,
+            is_simulated(spec),
         )
         yield OpenedBench(headset, known, (known.distance_mm,))
 
