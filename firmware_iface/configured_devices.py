@@ -16,7 +16,8 @@ bus = "/dev/i2c-1"            or virtual:SOCKET
 power = { green = 0.5 }       fraction of full while something is shown; other lasers stay dark
 mrad_per_pixel = 0.5          angle of a pixel at the eye: patterns' bright spots are predicted and budgeted;
                               without it, all light is taken to be one spot
-[[lasers.channel]]            calibration of each, in the order of the DAC's outputs; virtual: may be left out
+[[lasers.channel]]            calibration of each, in the order of the DAC's outputs, none left out; virtual: may be
+                              left out as a whole
 name = "green"
 wavelength_nm = 520.0
 full_power_uw = 100.0

@@ -51,6 +51,8 @@ def answer(hardware: EmulatedHardware, request: dict[str, Any], data: bytes) -> 
             return at, b""
         case {"do": "light", "since": since}:
             return hardware.light_since(since), b""
+        case {"do": "lasers"}:
+            return [vars(diode) for diode in hardware.lasers.diodes], b""
         case {"do": "whole"}:
             return list(hardware.whole), b""
     raise InputError(f"{request!r} is no request to emulated hardware.")
