@@ -16,7 +16,8 @@ bus = "/dev/i2c-1"            or virtual:SOCKET
 power = { green = 0.5 }       fraction of full while something is shown; other lasers stay dark
 mrad_per_pixel = 0.5          angle of a pixel at the eye: patterns' bright spots are predicted and budgeted;
                               without it, all light is taken to be one spot
-[[lasers.channel]]            calibration of each, in the order of the DAC's outputs; virtual: may be left out
+[[lasers.channel]]            calibration of each, in the order of the DAC's outputs, none left out; virtual: may be
+                              left out as a whole
 name = "green"
 wavelength_nm = 520.0
 full_power_uw = 100.0
@@ -170,6 +171,12 @@ def open_camera(table: Table) -> Any:
     return camera
 
 
+def simulated(tables: Mapping[str, Any]) -> bool:
+    """Whether a device of [panel], [lasers] and [camera] is emulated, so that what is captured is simulated."""
+    found = (tables[name] for name in ("panel", "lasers", "camera") if name in tables)
+    return any(one.get("kind") == "virtual" or str(one.get("bus")).startswith("virtual:") for one in found)
+
+
 def check_tables(tables: Mapping[str, Table]) -> None:
     """Check [panel], [lasers] and [camera] without opening anything.
 
@@ -229,14 +236,22 @@ def laser_channels(table: Table) -> Sequence[LaserChannel]:
     Raises
     ------
     InputError
-        Where there is none, or a value is out of range.
+        Where there is none, two have one name, or a value is out of range.
     """
     given = table.get("channel", [])
     if not given and str(table.get("bus")).startswith("virtual:"):
         return VIRTUAL_CHANNELS
     if not isinstance(given, list) or not given:
         raise InputError("[lasers] describes no laser: write [[lasers.channel]] for each")
-    return [read_table(LaserChannel, one, f"[[lasers.channel]] {k}") for k, one in enumerate(given)]
+    lasers = [read_table(LaserChannel, one, f"[[lasers.channel]] {k}") for k, one in enumerate(given)]
+    names = [laser.name for laser in lasers]
+    for k, name in enumerate(names):
+        if name in names[:k]:
+            raise InputError(
+                f"[[lasers.channel]] {names.index(name)} and {k} are both name = {name!r}: give each its own name, or "
+                "remove one"
+            )
+    return lasers
 
 
 def laser_power(table: Table) -> dict[str, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
+from typing import Any
 
 from firmware_iface.errors import InputError
 from firmware_iface.virtual.bench_description import BenchDescription, read_bench
@@ -37,4 +38,17 @@ def load_bench(spec: str) -> BenchDescription:
             tables = tomllib.load(file)
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path.name} is not TOML ({error}); correct that place.") from error
+    if _is_data_sheet(tables):
+        raise InputError(
+            f"{spec} is the bench.toml of a capture set: it says what is known of a bench, not where its devices are. "
+            "Give the headset's configuration (hololoop-runtime serve --help; capture takes this file as --known), or "
+            "virtual:NAME; to simulate this bench, add the line [simulation] to a copy."
+        )
     return read_bench(tables, path.name)
+
+
+def _is_data_sheet(tables: dict[str, Any]) -> bool:
+    """Whether the tables are of a capture set's bench.toml, and neither of a simulation nor of a configuration."""
+    camera = tables.get("camera")
+    measured = "iris" in tables or (isinstance(camera, dict) and "full_well_e" in camera)
+    return "schema" in tables and measured and not {"defect", "simulation", "service"} & set(tables)

@@ -67,6 +67,10 @@ class RemoteHardware:
         """End the connection."""
         self._connection.close()
 
+    def built_in_lasers(self) -> list[dict[str, Any]]:
+        """The laser of each output of the board, with the keys of `laser_board.Diode`."""
+        return list(self.ask({"do": "lasers"})[0])
+
     # --- for tests
 
     def break_part(self, part: str, kind: str, count: int | None = 1, after: int = 0) -> float:

@@ -25,6 +25,7 @@ from firmware_iface.virtual.emulated_hardware import EmulatedHardware
 from firmware_iface.virtual.i2c.bus_server import BoardServer
 from firmware_iface.virtual.remote_hardware import LASERS
 
+BAD_INPUT = 2  # exit code
 SWITCH_S = 0.0002  # Python's 5 ms until another thread runs are long on a bus
 
 
@@ -50,6 +51,8 @@ def answer(hardware: EmulatedHardware, request: dict[str, Any], data: bytes) -> 
             return at, b""
         case {"do": "light", "since": since}:
             return hardware.light_since(since), b""
+        case {"do": "lasers"}:
+            return [vars(diode) for diode in hardware.lasers.diodes], b""
         case {"do": "whole"}:
             return list(hardware.whole), b""
     raise InputError(f"{request!r} is no request to emulated hardware.")
@@ -94,6 +97,18 @@ def _serve(hardware: EmulatedHardware, connection: Connection) -> None:
             connection.send_bytes(json.dumps(outcome).encode() + b"\n" + reply)
 
 
+def _listen(hardware: EmulatedHardware, socket: str, oak: str | None) -> Listener:
+    """The socket for the panel, and next to it the one of the laser board; an OAK camera where one is wanted."""
+    for path in (socket, socket + LASERS):
+        with suppress(FileNotFoundError):
+            os.unlink(path)
+    BoardServer(hardware.lasers, Path(socket + LASERS))
+    listener = Listener(socket, "AF_UNIX", backlog=16)
+    if oak:
+        hardware.attach_oak(oak)
+    return listener
+
+
 def main() -> None:
     """Serve until the parent dies or the process is ended."""
     parser = argparse.ArgumentParser(prog="python -m firmware_iface.virtual.served", description=__doc__)
@@ -104,14 +119,16 @@ def main() -> None:
     args = parser.parse_args()
     ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # emulated hardware ends with its test
     sys.setswitchinterval(SWITCH_S)
-    hardware = EmulatedHardware(args.bench, args.seed)
-    for path in (args.socket, args.socket + LASERS):
-        with suppress(FileNotFoundError):
-            os.unlink(path)
-    BoardServer(hardware.lasers, Path(args.socket + LASERS))
-    listener = Listener(args.socket, "AF_UNIX", backlog=16)
-    if args.oak:
-        hardware.attach_oak(args.oak)
+    try:
+        hardware = EmulatedHardware(args.bench, args.seed)
+        listener = _listen(hardware, args.socket, args.oak)
+    except InputError as error:
+        parser.exit(BAD_INPUT, f"{parser.prog}: {error}\n")
+    except OSError as error:
+        why = error.strerror or error
+        parser.exit(
+            BAD_INPUT, f"{parser.prog}: {args.socket} cannot be listened at ({why}): check its folder\n"
+        )
     threading.Thread(target=hardware.run, daemon=True).start()
     while True:
         connection = listener.accept()

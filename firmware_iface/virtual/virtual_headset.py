@@ -47,7 +47,11 @@ class VirtualHeadset:
         Clock; each capture advances it.
     captures : int
         How many were taken.
+    simulated : bool
+        True, as capture sets say.
     """
+
+    simulated = True
 
     def __init__(self, description: BenchDescription, seed: int = 0) -> None:
         self.description, self.seed = description, seed

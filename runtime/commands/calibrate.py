@@ -6,7 +6,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import Any
 
-from runtime.commands.inputs import bundle_argument, headset_option
+from runtime.commands.inputs import bundle_argument, headset_option, say_simulated
 from runtime.program.command import Command, Result
 from runtime.program.options import millimetres, seed_option
 from runtime.program.screen import Screen
@@ -43,7 +43,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     from runtime.calibration.calibration_report import write_report
     from runtime.calibration.self_calibration import calibrate
     from runtime.calibration.summary import numbers, sentence_of
-    from runtime.headset.open_devices import open_devices
+    from runtime.headset.open_devices import is_simulated, open_devices
 
     if args.restore:
         restore_bundle(args.bundle)
@@ -56,6 +56,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     replaced = found.verdict == "recalibrated" and not args.check
     result: dict[str, Any] = {
         "bundle": str(args.bundle),
+        "simulated": is_simulated(args.headset),
         "replaced": replaced,
         "previous": None,
         "report": None,
@@ -75,6 +76,7 @@ def show(result: Result, args: Namespace, screen: Screen) -> None:
             f"{result['bundle']} is again what it was; the calibrated one is now {result['previous']}."
         )
         return
+    say_simulated(result, screen)
     screen.say(result["sentence"])
     wavefront, distance = result["wavefront"], result["distance_mm"]
     screen.say(

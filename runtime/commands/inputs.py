@@ -5,6 +5,9 @@ from __future__ import annotations
 from argparse import ArgumentParser, _ActionsContainer
 from pathlib import Path
 
+from runtime.program.command import Result
+from runtime.program.screen import Screen
+
 
 def bundle_argument(parser: ArgumentParser, what: str = "folder that hololoop-trainer exported") -> None:
     """The bundle."""
@@ -19,3 +22,9 @@ def headset_option(parser: _ActionsContainer, required: bool) -> None:
         required=required,
         help="a service's configuration, virtual:NAME, or a virtual bench's TOML file",
     )
+
+
+def say_simulated(result: Result, screen: Screen) -> None:
+    """A line where the result is of a simulated bench."""
+    if result["simulated"]:
+        screen.say("Simulated: no real headset was used.", style="yellow")

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from firmware_iface.errors import InputError
-from runtime.commands.inputs import bundle_argument, headset_option
+from runtime.commands.inputs import bundle_argument, headset_option, say_simulated
 from runtime.program.command import Command, Result
 from runtime.program.screen import Screen
 
@@ -44,7 +44,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     from runtime.bundle.light_path_arrays import bundle_channels, load_light_path
     from runtime.calibration.taking import Taker
     from runtime.camera.view import View, view_of
-    from runtime.headset.open_devices import open_devices
+    from runtime.headset.open_devices import is_simulated, open_devices
     from runtime.networks.onnx_approximator import approximator_of
     from runtime.refinement.panel_and_camera import PanelAndCamera
     from runtime.refinement.picture_refinement import Refinement, refine
@@ -97,6 +97,7 @@ def run(args: Namespace, screen: Screen) -> Result:
         write_pattern(out, gray)
     return {
         "captures": len(steps),
+        "simulated": is_simulated(args.headset),
         "psnr_db": {"first": steps[0].psnr_db, "best": state.best_psnr_db},
         "heldout": {"first": steps[0].heldout, "last": steps[-1].heldout},
         "drift": steps[-1].drift,
@@ -108,6 +109,7 @@ def run(args: Namespace, screen: Screen) -> Result:
 
 def show(result: Result, args: Namespace, screen: Screen) -> None:
     """One line, and where the pattern is."""
+    say_simulated(result, screen)
     psnr = result["psnr_db"]
     screen.say(
         f"{psnr['first']:.1f} -> {psnr['best']:.1f} dB amplitude PSNR, seen by the camera, after {result['captures']} "

@@ -29,20 +29,21 @@ CONFIG is one TOML file:
   [lasers]
   bus = "/dev/i2c-1"
   power = { green = 0.5 }                # fraction of full while something is shown
-  [[lasers.channel]]                     # calibration of each, in the order of the DAC's outputs
-  name = "green"
-  wavelength_nm = 520.0
-  full_power_uw = 100.0
-  threshold_ma = 40.0
-  slope_uw_per_ma = 4.0
+  channel = [                            # calibration of each, in the order of the DAC's outputs
+    { name = "red", wavelength_nm = 638.0, full_power_uw = 120.0, threshold_ma = 45.0, slope_uw_per_ma = 4.0 },
+    { name = "green", wavelength_nm = 520.0, full_power_uw = 100.0, threshold_ma = 40.0, slope_uw_per_ma = 4.0 },
+    { name = "blue", wavelength_nm = 450.0, full_power_uw = 15.0, threshold_ma = 30.0, slope_uw_per_ma = 1.0 },
+  ]
   [camera]                               # may be left out
   kind = "oak"
 
-Without hardware: python -m firmware_iface.virtual.served SOCKET emulates it, and bus = "virtual:SOCKET" in [panel],
-[lasers] and (with kind = "virtual") [camera] leads there. firmware_iface/configured_devices.py lists all keys.
+Without hardware: python -m firmware_iface.virtual.served SOCKET --bench virtual:demo emulates it, with these three
+lasers, and bus = "virtual:SOCKET" in [panel], [lasers] and (with kind = "virtual") [camera] leads there. The bundle
+is one of the same bench. firmware_iface/configured_devices.py lists all keys.
 
-Programs connect as runtime.service.client does in Python; hololoop_service.h, next to it, is for C. The lasers are
-dark until a program clears and arms them, and after every fault until it does so again.
+A line on standard error says when programs may connect. They do so as runtime.service.client does in Python;
+hololoop_service.h, next to it, is for C. The lasers are dark until a program clears and arms them, and after every
+fault until it does so again.
 
 With --dark nothing is served: the lasers are switched off, for ExecStopPost= in the service's unit. Unit files are
 in the folder that `hololoop-runtime serve --units DIR` writes."""

@@ -50,7 +50,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     DeviceError
         Where a device fails.
     """
-    from runtime.headset.open_devices import emulated, open_devices
+    from runtime.headset.open_devices import emulated, is_simulated, open_devices
     from runtime.solver.pattern_files import read_pattern
 
     grays = [read_pattern(path) for path in args.patterns]
@@ -79,7 +79,13 @@ def run(args: Namespace, screen: Screen) -> Result:
                 }
             )
         exposure = devices.camera.exposure_ms
-    return {"headset": args.headset, "channel": channel, "exposure_ms": exposure, "shown": shown}
+    return {
+        "headset": args.headset,
+        "simulated": args.emulated or is_simulated(args.headset),
+        "channel": channel,
+        "exposure_ms": exposure,
+        "shown": shown,
+    }
 
 
 def _laser(asked: str | None, devices: Devices) -> str:
@@ -105,7 +111,8 @@ def _write_counts(counts: np.ndarray, folder: Path, pattern: Path) -> Path:
 
 def show(result: Result, args: Namespace, screen: Screen) -> None:
     """What was seen, a line a pattern."""
-    screen.say(f"{result['headset']}, {result['channel']}, {result['exposure_ms']:g} ms")
+    simulated = " (simulated)" if result["simulated"] else ""
+    screen.say(f"{result['headset']}{simulated}, {result['channel']}, {result['exposure_ms']:g} ms")
     for one in result["shown"]:
         saturated = f", {100 * one['saturated_share']:.2g} % saturated" if one["saturated_share"] else ""
         where = f" -> {one['seen']}" if one["seen"] else ""

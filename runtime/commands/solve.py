@@ -15,14 +15,15 @@ from runtime.program.screen import Screen
 
 DESCRIPTION = """Compute the panel pattern for each picture, through the light path of a bundle.
 
-TARGET is a PNG (taken as sRGB), an EXR or an NPY file (taken as linear light) of the panel's size, or of any
-size with --fit. The pattern is an 8-bit gray PNG, to be sent to the panel as it is. With several channels in
-the bundle, each gets a pattern of its own: NAME-red.png, NAME-green.png, NAME-blue.png; a gray picture is the
-same in all of them. With --channel, only that one is computed, under the name given.
+TARGET is a PNG, JPEG or TIFF file (taken as sRGB), an EXR or an NPY file (taken as linear light), of the panel's
+size, or of any size with --fit. Without one, hololoop's own test picture is shown, fitted to the panel. The
+pattern is an 8-bit gray PNG, to be sent to the panel as it is. With several channels in the bundle, each gets a
+pattern of its own: NAME-red.png, NAME-green.png, NAME-blue.png; a gray picture is the same in all of them. With
+--channel, only that one is computed, under the name given.
 
 Amplitude PSNR is of what the calibrated model says that the pattern shows, zero-padded and on a grid twice as fine
 as the panel's, whatever the solver computed on; more iterations or time never make it worse, and 20 iterations are
-usually within a few dB of what can be reached."""
+usually within a few dB of what can be reached. A solve that took longer than --deadline-ms says so."""
 
 IN_PYTHON = """in Python:
   from runtime.bundle.bundle_folder import read_bundle
@@ -44,7 +45,9 @@ PATIENT_ITERATIONS = 25  # from more than these on, seeing through the approxima
 def options(parser: ArgumentParser) -> None:
     """The options of `solve`."""
     bundle_argument(parser)
-    parser.add_argument("targets", metavar="TARGET", type=Path, nargs="+", help="pictures to show")
+    parser.add_argument(
+        "targets", metavar="TARGET", type=Path, nargs="*", help="pictures to show (default: a test picture)"
+    )
     parser.add_argument(
         "--out",
         metavar="PHASE.png|DIR",
@@ -109,15 +112,17 @@ def run(args: Namespace, screen: Screen) -> Result:
     from runtime.networks.onnx_approximator import approximator_of
     from runtime.solver import Solver, beside_zero_order
     from runtime.solver.pattern_files import pattern_files, write_pattern
-    from runtime.solver.targets import channel_targets
+    from runtime.solver.targets import TEST_PICTURE, channel_targets
 
+    targets: list[Path] = args.targets or [TEST_PICTURE]
+    fit = args.fit or not args.targets
     bundle = read_bundle(args.bundle)
     every = bundle_channels(bundle)
     channels = every if args.channel is None else [args.channel]
     paths = {c: load_light_path(bundle, c, args.plane) for c in channels}
     if args.beside_zero_order:
         paths = {c: beside_zero_order(path) for c, path in paths.items()}
-    files = pattern_files(args.targets, channels, args.out)
+    files = pattern_files(targets, channels, args.out)
     shape = next(iter(paths.values())).grid.shape
     approximator = approximator_of(bundle, (len(every), *shape))
     if approximator is not None and len(channels) < len(every):
@@ -141,11 +146,11 @@ def run(args: Namespace, screen: Screen) -> Result:
     out = {(file.target, file.channel): file.out for file in files}
     patterns = []
     with screen.progress("solving") as progress:
-        for number, target in enumerate(args.targets):
-            pictures = channel_targets(target, shape, channels, fit=args.fit, colour=len(every) > 1)
+        for number, target in enumerate(targets):
+            pictures = channel_targets(target, shape, channels, fit=fit, colour=len(every) > 1)
             for part, (solver, group) in enumerate(zip(solvers, groups, strict=True)):
                 names = [out[target, c] for c in group]
-                solves = (number * len(groups) + part, len(args.targets) * len(groups))
+                solves = (number * len(groups) + part, len(targets) * len(groups))
                 solution = solver.solve(
                     np.stack([pictures[c] for c in group]) if len(group) > 1 else pictures[group[0]],
                     iterations,
@@ -167,9 +172,11 @@ def run(args: Namespace, screen: Screen) -> Result:
                             "scale": quality.scale,
                             "iterations": solution.iterations,
                             "seconds": round(solution.milliseconds / 1e3, 4),
+                            "deadline_missed": args.deadline_ms is not None
+                            and solution.milliseconds > args.deadline_ms,
                         }
                     )
-    return {"bundle": str(args.bundle), "patterns": patterns}
+    return {"bundle": str(args.bundle), "test_picture": not args.targets, "patterns": patterns}
 
 
 def _iterations_of(
@@ -186,10 +193,13 @@ def _iterations_of(
 
 def show(result: Result, args: Namespace, screen: Screen) -> None:
     """One line a pattern."""
+    if result["test_picture"]:
+        screen.say("No picture is given: the patterns show hololoop's own test picture.")
     for p in result["patterns"]:
+        missed = f"; the deadline of {args.deadline_ms:g} ms was missed" if p["deadline_missed"] else ""
         screen.say(
             f"{p['phase']}: {p['channel']}, {p['plane_mm']:g} mm, amplitude PSNR {p['psnr_db']:.1f} dB "
-            f"after {p['iterations']} iterations, {p['seconds']:.1f} s"
+            f"after {p['iterations']} iterations, {p['seconds']:.1f} s{missed}"
         )
 
 
@@ -200,6 +210,7 @@ COMMAND = Command(
     run=run,
     show=show,
     examples=(
+        "solve bundle/ --out pattern.png",
         "solve bundle/ picture.png --out pattern.png",
         "solve bundle/ a.png b.png --out patterns/ --iterations 40",
         "solve bundle/ photo.png --fit --channel green --plane 30 --out pattern.png",

@@ -10,8 +10,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from firmware_iface.configured_devices import open_camera, open_lasers, open_panel
+from firmware_iface.configured_devices import (
+    laser_power,
+    open_camera,
+    open_lasers,
+    open_panel,
+)
 from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
+from firmware_iface.laser_board_findings import laser_problems
+from runtime.bundle.bundle_folder import read_bundle
+from runtime.bundle.light_path_arrays import bundle_channels
 from runtime.service.configuration import Configuration
 
 KNOWN_USB = {
@@ -67,7 +75,9 @@ def headset_findings(configuration: Configuration) -> list[Finding]:
     if (service := _service(configuration)) is not None:
         return [service]
     bundle, shape = _bundle(configuration)
-    found = [bundle, _panel(configuration.devices["panel"], shape), _lasers(configuration.devices["lasers"])]
+    lasers = _lasers(configuration.devices["lasers"])
+    lasers.problems += _unlit(configuration)
+    found = [bundle, _panel(configuration.devices["panel"], shape), lasers]
     if "camera" in configuration.devices:
         found.append(_camera(configuration.devices["camera"]))
     return found
@@ -202,7 +212,23 @@ def _lasers(table: dict[str, Any]) -> Finding:
                 f"latched: {latched}; find the cause, then clear and arm through the service"
             )
 
+        found.problems += laser_problems(table)
+
     return _opened(found, lambda: open_lasers(table), look)
+
+
+def _unlit(configuration: Configuration) -> list[str]:
+    """What is wrong where the colour that the service shows gets no light."""
+    try:
+        channels = bundle_channels(read_bundle(configuration.bundle))
+    except InputError:  # reported of the bundle
+        return []
+    shown = configuration.timing.channel or channels[0]
+    if shown not in channels or laser_power(configuration.devices["lasers"]).get(shown, 0.0) > 0:
+        return []
+    return [
+        f"the service shows {shown} and its laser gets no power: write power = {{ {shown} = 0.5 }} in [lasers]"
+    ]
 
 
 def _camera(table: dict[str, Any]) -> Finding:

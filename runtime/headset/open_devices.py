@@ -146,6 +146,20 @@ def emulated(bench: str, seed: int = 0) -> Iterator[Devices]:
                 yield devices
 
 
+def is_simulated(spec: str) -> bool:
+    """Whether `open_devices` opens a simulated bench, or hardware that is emulated.
+
+    Raises
+    ------
+    InputError
+        Where a configuration is wrong.
+    """
+    from firmware_iface.configured_devices import simulated
+
+    tables = configuration_of(spec)
+    return tables is None or simulated(tables)
+
+
 def configuration_of(spec: str) -> dict[str, Any] | None:
     """The tables of the devices in a service's configuration; None for a virtual bench."""
     if spec.startswith("virtual:") or not Path(spec).is_file():

@@ -43,6 +43,7 @@ class CameraClient:
         self._loop, self._faults, self._metrics = loop, faults, metrics
         self._receivers: dict[int, PictureReceiver] = {}  # by serial
         self._serials = count(1)
+        self._out = False  # it has delivered nothing since it was reported missing
 
     def turn(self, now_s: float) -> None:
         """Start the process when it is time."""
@@ -106,6 +107,7 @@ class CameraClient:
             case CameraMissing(text):
                 self._missing(text)
             case CameraPicture(exposure_us=exposure_us):
+                self._out = False
                 self.fresh_until_ns = time.monotonic_ns() + self._stale_ns + exposure_us * 1000
                 receiver = self._receivers.pop(serial, None)
                 if receiver is not None:
@@ -115,7 +117,8 @@ class CameraClient:
 
     def _missing(self, why: str) -> None:
         self.fresh_until_ns = 0
-        self._faults.note("camera", why)
+        self._faults.note("camera", why, ongoing=self._out)
+        self._out = True
         receivers, self._receivers = self._receivers, {}
         for receiver in receivers.values():
             receiver(None, None, why)

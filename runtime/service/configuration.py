@@ -97,6 +97,11 @@ def read_configuration(file: str | os.PathLike[str]) -> Configuration:
         raise InputError(f'{file} names no bundle: add bundle = "FOLDER" at its top')
     service = tables.get("service", {})
     timing = read_table(Timing, service, f"[service] of {file}", ignore=("users",))
+    if timing.solve_ms > timing.stale_limit_ms:
+        raise InputError(
+            f"solve_ms = {timing.solve_ms:g} in [service] of {file} is beyond stale_limit_ms = "
+            f"{timing.stale_limit_ms:g}, the age from which nothing is lit: lower solve_ms, or raise stale_limit_ms"
+        )
     users = service.get("users", [])
     if not isinstance(users, list) or not all(type(u) is int and u >= 0 for u in users):
         raise InputError(f"'users' in [service] of {file} is {users!r}; give a list of user numbers")

@@ -79,8 +79,8 @@ class DisplayEvents(Protocol):
     def dropped(self, pattern: DisplayPattern, reason: str) -> None:
         """A pattern will not be shown."""
 
-    def panel_fault(self, error: Exception) -> None:
-        """The panel failed to do something."""
+    def panel_fault(self, error: Exception, ongoing: bool) -> None:
+        """The panel failed to do something; `ongoing`: it was lost before and has not answered since."""
 
 
 class DisplayThread(threading.Thread):
@@ -119,6 +119,7 @@ class DisplayThread(threading.Thread):
         self._lock = threading.Lock()
         self._waiting: dict[int, DisplayPattern] = {}  # by job
         self._panel: Any = None
+        self._out = False  # it was lost, and has not answered since
         self._stopping = threading.Event()
         self.transfer_ns = clock.period_ns // 10
         self.taken_ns = 0
@@ -173,12 +174,13 @@ class DisplayThread(threading.Thread):
             elif time.monotonic_ns() - self.answered_ns > ASK_S * 1e9:
                 self._panel.status()
                 self.answered_ns = time.monotonic_ns()
+                self._out = False
         except DEVICE_ERRORS as error:
-            self._events.panel_fault(error)
+            self._events.panel_fault(error, self._out)
             if isinstance(error, DeviceGoneError | OSError):
                 with suppress(*DEVICE_ERRORS):
                     self._panel.close()
-                self._panel = None
+                self._panel, self._out = None, True
             if pattern is not None:
                 self._keep(pattern)
 
@@ -209,6 +211,7 @@ class DisplayThread(threading.Thread):
         took = now - began_ns
         self.transfer_ns = min(int(0.9 * self.transfer_ns + 0.1 * took), self._clock.period_ns // 2)
         self.answered_ns = now
+        self._out = False
         self.lit_until_ns = 0 if pattern.dark else pattern.display_ns + self._stale_ns
         self._events.shown(pattern, max(tick, now), took * 1e-9)
 
@@ -216,7 +219,8 @@ class DisplayThread(threading.Thread):
         try:
             self._panel = self._open()
         except DEVICE_ERRORS as error:
-            self._events.panel_fault(error)
+            self._events.panel_fault(error, self._out)
+            self._out = True
             return False
         self.answered_ns = time.monotonic_ns()
         return True

@@ -24,10 +24,19 @@ class FaultLog:
         self._metrics = metrics
         self._written: dict[str, tuple[str, float]] = {}  # text and time, by kind
 
-    def note(self, kind: str, text: str) -> None:
-        """Count a fault, and write it unless it was just written."""
-        self.count += 1
-        self._metrics.faults.labels(kind).inc()
+    def note(self, kind: str, text: str, ongoing: bool = False) -> None:
+        """Count a fault, and write it unless it was just written.
+
+        Parameters
+        ----------
+        kind, text : str
+            What failed, and a sentence.
+        ongoing : bool
+            The fault belongs to an outage that was counted when it began: it is written, but not counted.
+        """
+        if not ongoing:
+            self.count += 1
+            self._metrics.faults.labels(kind).inc()
         before, at = self._written.get(kind, ("", 0.0))
         now = time.monotonic()
         if text != before or now - at > REPEAT_S:

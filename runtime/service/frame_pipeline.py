@@ -232,9 +232,9 @@ class FramePipeline:
         """The display will not show a pattern."""
         self._loop.later(partial(self._dropped, pattern, reason))
 
-    def panel_fault(self, error: Exception) -> None:
+    def panel_fault(self, error: Exception, ongoing: bool) -> None:
         """The panel failed to do something."""
-        self._loop.later(partial(self._faults.note, "panel", str(error)))
+        self._loop.later(partial(self._faults.note, "panel", str(error), ongoing))
 
     def _open_panel(self) -> Any:
         panel = open_panel(self._configuration.devices["panel"])

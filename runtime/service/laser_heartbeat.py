@@ -88,6 +88,7 @@ class LaserHeartbeat(threading.Thread):
         self._requests: deque[LaserRequest] = deque()
         self._wake = threading.Event()
         self._stopping = False
+        self._out = False  # the board was lost, and has not told its state since
         self._cleared_at = -CLEAR_TO_ARM_S
         self._looked_at = 0.0
         self._risen_at = 0.0
@@ -248,14 +249,16 @@ class LaserHeartbeat(threading.Thread):
         self._ramp = None
         self._looked_at = time.monotonic()
         status = self._lasers.status()
+        self._out = False
         self.state = STATES[status["state"]]
         self.faults = sum(Fault[name.upper()] for name in status["faults"])
         self.level = dict(status["power"])
 
     def _lost(self, error: Exception) -> None:
         """The board does not answer: without a heartbeat it switches the lasers off by itself. Open it again."""
-        if self.state != LaserState.LOST:
+        if not self._out:
             self._fault("laser_bus", str(error))
+        self._out = True
         self.state, self.faults = LaserState.LOST, 0
         while self._requests:
             self._requests.popleft().answer(f"the lasers do not answer: {error}")

@@ -84,6 +84,7 @@ class SolverClient:
         self._stale_ns, self._events = stale_ns, events
         self._patterns: Ring | None = None
         self._pinged_ns = 0
+        self._out = False  # it has not been ready since it was lost
 
     @property
     def ready(self) -> bool:
@@ -138,11 +139,12 @@ class SolverClient:
             case process_messages.PatternRing(slots, channels, height, width) if fd is not None:
                 self._patterns = open_ring(fd, slots, (channels, height, width), np.uint8)
                 self.shape = self.shape or (channels, height, width)
+                self._out = False
                 self._events.solver_ready()
             case process_messages.FailedJob(0, _, text):
                 if self.shape is None:
                     raise InputError(text)
-                self._faults.note("solver", text)
+                self._fault(text)
             case process_messages.FailedJob(job, code, text):
                 self._events.job_failed(job, code, text)
             case process_messages.SolvedPattern():
@@ -159,13 +161,18 @@ class SolverClient:
         """It may be silent while it solves, until that frame is to be displayed."""
         self.fresh_until_ns = max(time.monotonic_ns(), self.busy_until_ns) + self._stale_ns
 
+    def _fault(self, text: str) -> None:
+        """Note that the solver is out; the same outage is counted once."""
+        self._faults.note("solver", text, ongoing=self._out)
+        self._out = True
+
     def _lost(self, why: str) -> None:
         self.fresh_until_ns = 0
         if self.process.link is not None:
             self._loop.forget(self.process.link)
         self.process.stop()
         self._metrics.restarts.labels("solver").inc()
-        self._faults.note("solver", f"{why} and is started again")
+        self._fault(f"{why} and is started again")
         if self._patterns is not None:
             self._patterns.close()
             self._patterns = None

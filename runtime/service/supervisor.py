@@ -10,6 +10,7 @@ import signal
 import socket
 import sys
 import time
+from contextlib import suppress
 from functools import partial
 
 from firmware_iface.configured_devices import laser_power, open_lasers
@@ -30,6 +31,7 @@ from runtime.service.systemd import Notifier
 
 TURN_S, TURN_WAITED_S = 0.010, 0.001  # of the loop; the shorter while a program waits for a frame
 SWITCH_S = 0.0005  # Python's default of 5 ms before it switches threads would make a frame late
+READY = "serving; the lasers are dark until a program clears and arms them"
 LOOPS_NS = 1_000_000_000  # while a thread has not turned for so long, the watchdog is not fed
 
 
@@ -80,7 +82,7 @@ class Supervisor:
             self.pipeline.display.start()
             listener.setblocking(False)
             self.loop.watch(listener, partial(self.programs.accept, listener))
-            self.notifier.ready("serving; the lasers are dark until a program clears and arms them")
+            self._ready()
             while not self.stopping:
                 self._turn()
         finally:
@@ -142,6 +144,12 @@ class Supervisor:
             self.metrics.lasers(self.published)
         for channel, power in self.lasers.level.items():
             self.metrics.laser_power.labels(channel).set(power)
+
+    def _ready(self) -> None:
+        """Say to systemd and on standard error that programs may connect."""
+        self.notifier.ready(READY)
+        with suppress(OSError):
+            print(f"ready at {self.configuration.socket}: {READY}", file=sys.stderr, flush=True)
 
     def _stop(self) -> None:
         self.stopping = True

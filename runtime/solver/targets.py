@@ -7,25 +7,29 @@ Everywhere in hololoop a target is linear: twice the number is twice the light. 
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from firmware_iface.errors import InputError
+from runtime.solver.picture_files import decode_srgb, encode_srgb, read_planes
+
+__all__ = [
+    "CHANNELS",
+    "LUMINANCE",
+    "channel_targets",
+    "decode_srgb",
+    "encode_srgb",
+    "fit_area",
+    "read_target",
+]
 
 CHANNELS = ("red", "green", "blue")
+TEST_PICTURE = Path(__file__).with_name(
+    "test_picture.png"
+)  # for a first pattern, where nobody gives a picture
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear sRGB
-
-_UNREADABLE = (
-    OSError,
-    SyntaxError,  # Pillow's word for a broken PNG
-    ValueError,
-    Image.DecompressionBombError,
-    Image.DecompressionBombWarning,
-)
 
 
 def read_target(
@@ -37,9 +41,8 @@ def read_target(
 ) -> np.ndarray:
     """Read a picture as linear irradiance.
 
-    PNG, 8 or 16 bits: sRGB (its colour profile is ignored), decoded to linear, white = 1.
-    EXR: linear as it is, from R, G, B or from Y. Needs the OpenEXR library.
-    NPY: linear as it is, [H, W] or [3, H, W].
+    PNG, JPEG and TIFF of 8 or 16 bits are sRGB and become linear, white = 1. EXR, NPY and TIFF of floats are linear
+    as they are. `picture_files.read_planes` says more.
 
     Parameters
     ----------
@@ -64,13 +67,7 @@ def read_target(
     """
     names = _channel_names(channels)
     path = Path(path)
-    readers = {".png": _read_png, ".exr": _read_exr, ".npy": _read_npy}
-    reader = readers.get(path.suffix.lower())
-    if reader is None:
-        raise InputError(f"{path} is not a type of picture that is read here; give PNG, EXR or NPY")
-    if not path.is_file():
-        raise InputError(f"{path} is missing" if not path.exists() else f"{path} is not a file")
-    planes = reader(path)  # [1, H, W] or [3, H, W], linear
+    planes = read_planes(path)
     if planes.size == 0:
         raise InputError(f"{path} is empty: its size is {_size_text(planes.shape[-2:])}")
     if not np.isfinite(planes).all():
@@ -133,17 +130,6 @@ def fit_area(picture: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     return _resize_axis(_resize_axis(picture, -2, shape[0], scale), -1, shape[1], scale)
 
 
-def encode_srgb(linear: np.ndarray) -> np.ndarray:
-    """Linear irradiance, clipped to 0..1, to sRGB in 0..1, as files and screens have it."""
-    linear = np.clip(linear, 0, 1)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.power(linear, 1 / 2.4) - 0.055)
-
-
-def decode_srgb(encoded: np.ndarray) -> np.ndarray:
-    """sRGB in 0..1 to linear irradiance in 0..1: the inverse of `encode_srgb`."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, np.power((encoded + 0.055) / 1.055, 2.4))
-
-
 def _channel_names(channels: int | Sequence[str]) -> Sequence[str] | None:
     """The planes to return, or None for one plane of luminance."""
     if isinstance(channels, int):
@@ -157,94 +143,6 @@ def _channel_names(channels: int | Sequence[str]) -> Sequence[str] | None:
             + (", ".join(map(repr, names)) or "nothing at all")
         )
     return names
-
-
-def _read_png(path: Path) -> np.ndarray:
-    with path.open("rb") as file:
-        header = file.read(26)
-    if len(header) < 26 or header[:8] != b"\x89PNG\r\n\x1a\n" or header[12:16] != b"IHDR":
-        raise InputError(f"{path} is not a PNG, although its name says so")
-    depth, colour_type = header[24], header[25]
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            with Image.open(path, formats=["PNG"]) as image:
-                image.load()
-                if depth == 16 and colour_type != 0:
-                    pixels = _read_png_16_bit_colour(path)
-                elif depth == 16:
-                    pixels = np.asarray(image)
-                elif image.mode in ("1", "L") and "transparency" not in image.info:
-                    pixels = np.asarray(image.convert("L"))
-                else:
-                    pixels = np.asarray(image.convert("RGBA"))
-    except InputError:
-        raise
-    except _UNREADABLE as error:
-        raise InputError(f"{path} cannot be read as PNG: {error}") from error
-    if pixels.ndim == 2:
-        pixels = pixels[..., None]
-    top = 65535 if depth == 16 else 255
-    if pixels.shape[-1] in (2, 4):
-        if (pixels[..., -1] != top).any():
-            raise InputError(f"{path} is partly transparent; flatten it onto a background first")
-        pixels = pixels[..., :-1]
-    table = decode_srgb(np.arange(top + 1) / top).astype(np.float32)
-    return table[np.moveaxis(pixels, -1, 0)]
-
-
-def _read_png_16_bit_colour(path: Path) -> np.ndarray:
-    """Pillow reads these as 8 bits."""
-    try:
-        import cv2
-    except ImportError as error:
-        raise InputError(
-            f"{path} is a 16-bit colour PNG, which needs OpenCV: pip install 'hololoop[trainer]', "
-            "or save it as 8-bit PNG or as NPY"
-        ) from error
-    pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
-    if pixels is None or pixels.dtype != np.uint16:
-        raise InputError(f"{path} cannot be read as a 16-bit PNG")
-    if pixels.ndim == 3:
-        pixels = pixels[..., [2, 1, 0, 3][: pixels.shape[-1]]]
-    return np.asarray(pixels)
-
-
-def _read_exr(path: Path) -> np.ndarray:
-    try:
-        import OpenEXR
-    except ImportError as error:
-        raise InputError(
-            f"{path} needs the OpenEXR library: pip install 'hololoop[trainer]' (or OpenEXR alone), "
-            "or save it as NPY"
-        ) from error
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            planes = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
-    except Exception as error:  # the library raises bare exceptions of its own
-        raise InputError(f"{path} cannot be read as EXR: {error}") from error
-    for wanted in (("R", "G", "B"), ("Y",)):
-        if all(name in planes for name in wanted):
-            if len({planes[name].shape for name in wanted}) > 1:
-                raise InputError(f"{path} has channels of different sizes; save it without subsampling")
-            return np.stack([planes[name] for name in wanted]).astype(np.float32)
-    found = ", ".join(sorted(planes)) or "none"
-    raise InputError(f"{path} has neither R, G, B nor Y; its channels are {found}")
-
-
-def _read_npy(path: Path) -> np.ndarray:
-    try:
-        array = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path} cannot be read as NPY: {error}") from error
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
-        raise InputError(f"{path} does not hold an array of real numbers")
-    if array.ndim == 2:
-        array = array[None]
-    if array.ndim != 3 or array.shape[0] not in (1, 3):
-        raise InputError(f"{path} has the shape {array.shape}; give [H, W] or [3, H, W]")
-    with np.errstate(over="ignore"):  # what is too large becomes infinite, and is refused as such
-        return array.astype(np.float32)
 
 
 def _resize_axis(picture: np.ndarray, axis: int, size: int, scale: float) -> np.ndarray:

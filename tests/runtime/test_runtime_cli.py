@@ -88,6 +88,33 @@ def test_one_picture_to_one_file(
     assert list(tmp_path.iterdir()) == [out]
 
 
+def test_without_a_picture_one_that_ships_is_shown_and_the_result_says_so(
+    green: Path, colour: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (pattern,) = solved(capsys, green, "--out", tmp_path / "p.png", "--iterations", 2)
+    assert (
+        Path(pattern["target"]).name == "test_picture.png" and Path(pattern["target"]).stat().st_size < 10_000
+    )
+    assert len(solved(capsys, colour, "--out", tmp_path / "c.png", "--iterations", 1)) == 3
+    code, out, _ = run(capsys, "solve", green, "--out", tmp_path / "q.png", "--iterations", 0)
+    assert code == 0 and "No picture is given: the patterns show hololoop's own test picture." in out
+    assert "test picture" in " ".join(run(capsys, "solve", "--help")[1].split())
+
+
+def test_a_missed_deadline_is_reported(
+    green: Path, picture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = (green, picture, "--out", tmp_path / "p.png", "--deadline-ms")
+    (missed,) = solved(capsys, *words, 0.001)
+    assert missed["deadline_missed"] is True
+    (met,) = solved(
+        capsys, green, picture, "--out", tmp_path / "n.png", "--deadline-ms", 60000, "--iterations", 1
+    )
+    assert met["deadline_missed"] is False
+    code, out, _ = run(capsys, "solve", green, picture, "--out", tmp_path / "m.png", "--deadline-ms", 0.001)
+    assert code == 0 and "the deadline of 0.001 ms was missed" in out
+
+
 def test_another_plane_gives_another_pattern(
     green: Path, picture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -181,7 +208,6 @@ def test_bad_input_is_one_line_and_exit_code_2(
         (("solve", tmp_path / "none", picture, *out), "no such folder"),
         (("solve", green, tmp_path / "none.png", *out), "none.png is missing"),
         (("solve", green, picture), "--out"),
-        (("solve", green, *out), "TARGET"),
         (("solve", green, picture, *out, "--iterations", "-1"), "'-1' is not a whole number from 0"),
         (("solve", green, picture, *out, "--plane", "near"), "'near' is not a distance in mm"),
         (("solve", green, picture, *out, "--plane", "5"), "no plane at 5 mm for green: use one of 4, 6"),

@@ -58,6 +58,7 @@ def test_each_pattern_is_seen_by_the_camera(
     words = ["show", *patterns, "--headset", bench, "--out", tmp_path / "seen", "--exposure-ms", 8, "--json"]
     code, result, err = run(capsys, *words, *(["--emulated"] if emulated else []))
     assert code == 0 and not err and result["exposure_ms"] == 8 and result["channel"] == "green"
+    assert result["simulated"] is True
     truth = open_headset(str(bench))
     for path, one in zip(patterns, result["shown"], strict=True):
         counts = seen(one["seen"])

@@ -118,6 +118,55 @@ def test_opaque_alpha_is_ignored_and_transparency_refused(tmp_path: Path) -> Non
         read_target(save_png(tmp_path / "a.png", pixels))
 
 
+@pytest.mark.parametrize("name", ["a.jpg", "a.tif", "a.png", "a.npy"])
+def test_a_file_is_read_as_what_it_is_under_any_name(tmp_path: Path, name: str) -> None:
+    expected = read_target(save_png(tmp_path / "rgb.png", RGB), channels=3)
+    gray = np.tile(np.arange(0, 256, 8, dtype=np.uint8), (32, 1))
+    smooth = read_target(save_png(tmp_path / "gray.png", gray))
+    for kind, options in (("PNG", {}), ("TIFF", {}), ("TIFF", {"compression": "tiff_lzw"})):
+        Image.fromarray(RGB).save(tmp_path / name, kind, **options)
+        np.testing.assert_array_equal(read_target(tmp_path / name, channels=3), expected)
+    Image.fromarray(gray).save(tmp_path / name, "JPEG", quality=98)
+    np.testing.assert_allclose(read_target(tmp_path / name), smooth, atol=0.03)
+    with (tmp_path / name).open("wb") as file:
+        np.save(file, expected)
+    np.testing.assert_array_equal(read_target(tmp_path / name, channels=3), expected)
+
+
+def test_a_tiff_of_16_bits_is_srgb_and_one_of_floats_is_linear(tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2")
+    gray = np.arange(30000, 30012, dtype=np.uint16).reshape(3, 4)
+    Image.fromarray(gray).save(tmp_path / "g.tif")
+    np.testing.assert_allclose(read_target(tmp_path / "g.tif"), decode_srgb(gray / 65535), rtol=1e-6)
+    colour = np.random.default_rng(0).integers(0, 65536, (4, 5, 3)).astype(np.uint16)
+    assert cv2.imwrite(str(tmp_path / "c.tif"), colour[..., ::-1])
+    planes = read_target(tmp_path / "c.tif", channels=3)
+    np.testing.assert_allclose(np.moveaxis(planes, 0, -1), decode_srgb(colour / 65535), atol=1e-6)
+    linear = np.random.default_rng(0).random((4, 5)).astype(np.float32)
+    Image.fromarray(linear).save(tmp_path / "f.tif")
+    np.testing.assert_array_equal(read_target(tmp_path / "f.tif"), linear)
+    (tmp_path / "c.tif").write_bytes((tmp_path / "c.tif").read_bytes()[:60])
+    with pytest.raises(InputError, match="cannot be read as TIFF"):
+        read_target(tmp_path / "c.tif")
+
+
+def test_a_photograph_is_the_right_way_up(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6  # a quarter turn
+    Image.fromarray(np.zeros((8, 16), np.uint8)).save(tmp_path / "a.jpg", exif=exif)
+    assert read_target(tmp_path / "a.jpg").shape == (16, 8)
+
+
+def test_an_array_that_is_too_large_is_refused_by_its_name(tmp_path: Path) -> None:
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "<f8", "fortran_order": False, "shape": (99999999, 99999999)}
+    )
+    (tmp_path / "a.npy").write_bytes(header.getvalue())
+    with pytest.raises(InputError, match="a.npy"):
+        read_target(tmp_path / "a.npy")
+
+
 def test_npy_is_linear_as_it_is(tmp_path: Path) -> None:
     planes = np.random.default_rng(0).random((3, 4, 5)) * 7
     np.save(tmp_path / "a.npy", planes)
@@ -162,11 +211,14 @@ def test_files_that_are_something_else_are_refused(tmp_path: Path) -> None:
         ("other.png", b"GIF89a" + bytes(40), "is not a PNG"),
         ("empty.png", b"", "is not a PNG"),
         ("empty.npy", b"", "cannot be read as NPY"),
-        ("a.jpg", whole, "give PNG, EXR or NPY"),
+        ("cut.jpg", b"\xff\xd8\xff" + bytes(40), "cannot be read as JPEG"),
+        ("cut.tif", b"II*\0" + bytes(40), "cannot be read as TIFF"),
+        ("a.gif", b"GIF89a" + bytes(40), "give PNG, JPEG, TIFF, EXR or NPY"),
     ]:
         (tmp_path / name).write_bytes(contents)
-        with pytest.raises(InputError, match=reason):
+        with pytest.raises(InputError, match=reason) as refused:
             read_target(tmp_path / name)
+        assert "0x" not in str(refused.value)
     archive = io.BytesIO()
     np.savez(archive, a=np.zeros((2, 2)))
     (tmp_path / "z.npy").write_bytes(archive.getvalue())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,23 @@ def test_set_tells_what_it_holds(made: CaptureSet) -> None:
     assert made.channels == ("green", "red") and made.planes == (5.0,) and len(made) == 6
     green = replace(made, captures=tuple(c for c in made.captures if c.channel == "green"))
     assert green.channels == ("green",) and green.bench is made.bench
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_a_table_of_many_rows_is_read_or_refused_in_seconds(copy: Path, there: bool) -> None:
+    header, first, *_ = (copy / "captures.csv").read_text().splitlines()
+    _, _, rest = first.partition(",")
+    if not there:
+        rest = rest.replace("image/0000", "image/lost")
+    rows = [f"{k},{rest}" for k in range(30000)]
+    (copy / "captures.csv").write_text("\n".join([header, *rows]) + "\n")
+    begin = time.process_time()
+    if there:
+        assert len(read_captures(copy)) == len(rows)
+    else:
+        with pytest.raises(InputError, match="'image/lost.png' is not there"):
+            read_captures(copy)
+    assert time.process_time() - begin < 6
 
 
 def test_signal_is_counts_above_black_without_saturated_pixels(made: CaptureSet, copy: Path) -> None:

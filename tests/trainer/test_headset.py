@@ -10,11 +10,13 @@ import tomlkit
 
 from firmware_iface.errors import InputError
 from firmware_iface.virtual import open_headset
+from runtime.headset.open_devices import open_devices
 from tests.campaigns.headset import hardware, write_configuration
 from tests.trainer.fringed_bench import SHAPE, fringed, known
 from tests.trainer.hidden import ran
 from trainer.captures.acquire import acquire_captures
 from trainer.captures.bench_file import bench_tables
+from trainer.captures.capture_set import read_captures
 from trainer.captures.open_bench import RealHeadset, nominal_bench, open_bench
 from trainer.cli import main
 
@@ -26,6 +28,8 @@ def test_real_lasers_stay_within_the_power_that_is_set(tmp_path: Path) -> None:
     real.lasers.set_power("green", 1.0)
     assert virtual.lasers.power("green") == 0.25
     taken = acquire_captures(real, known(virtual), tmp_path / "captures", patterns=2)
+    assert taken.simulated is False
+    assert {c.extra["simulated"] for c in read_captures(taken.folder).captures} == {"no"}
     assert taken.captures == 3 and taken.saturated < 0.02
     assert virtual.lasers.power("green") == 0
 
@@ -65,7 +69,8 @@ def test_a_set_is_captured_through_the_drivers(tmp_path: Path, capsys: pytest.Ca
         options = ["--known", described, "--out", captures, "--patterns", 4]
         taken = ran(capsys, "capture", "--bench", configuration, *options)
         light = [power for _, power in remote.light()]
-    assert taken["captures"] == 5
+    assert taken["captures"] == 5 and taken["simulated"] is True
+    assert {c.extra["simulated"] for c in read_captures(captures).captures} == {"yes"}
     assert light[-1] == 0 and max(light) == pytest.approx(
         50, rel=0.02
     )  # the configuration's half of full power
@@ -85,3 +90,24 @@ def test_a_headset_that_is_not_there_is_said_in_one_line(
     said = capsys.readouterr().err
     assert "there is no emulated hardware" in said and said.count("\n") == 1
     assert not (tmp_path / "captures").exists()
+
+
+def test_a_data_sheet_is_not_taken_for_a_bench(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The bench.toml of a set, where the configuration of a headset is meant."""
+    sheet = tmp_path / "bench.toml"
+    sheet.write_text(tomlkit.dumps(bench_tables(nominal_bench(fringed()))))
+    for spec in (str(sheet), f"{tmp_path}/./bench.toml"):
+        assert main(["capture", "--bench", spec, "--out", str(tmp_path / "captures")]) == 2
+        said = capsys.readouterr().err
+        assert "is the bench.toml of a capture set" in said and "--known" in said and said.count("\n") == 1
+    with pytest.raises(InputError, match="is the bench.toml of a capture set"), open_devices(str(sheet)):
+        pass
+    sheet.write_text(sheet.read_text() + "\n[simulation]\n")
+    assert ran(capsys, "capture", "--bench", sheet, "--out", tmp_path / "captures", "--patterns", 1)[
+        "simulated"
+    ]
+    assert (
+        main(["capture", "--bench", "virtual:demo", "--known", str(sheet), "--out", str(tmp_path / "none")])
+        == 2
+    )
+    assert "leave --known out" in capsys.readouterr().err

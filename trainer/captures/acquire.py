@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.errors import InputError, nearest
+from runtime.headset.open_devices import configuration_of
 from runtime.program.progress import Progress
 from trainer.captures.bench_file import Bench, Camera, read_bench
 from trainer.captures.capture_writer import CaptureWriter
@@ -55,6 +56,9 @@ class Headset(Protocol):
     @property
     def time_s(self) -> float: ...
 
+    @property
+    def simulated(self) -> bool: ...
+
     def move_to_plane(self, plane_mm: float) -> None:
         """Focus the camera on another plane."""
 
@@ -78,6 +82,7 @@ class CaptureSummary:
     captures: int
     exposure_ms: dict[str, float]
     saturated: float
+    simulated: bool = False
 
     def as_json(self) -> dict[str, Any]:
         """Keys `folder`, `captures`, `exposure_ms` and `saturated_share` of `capture --json`."""
@@ -86,6 +91,7 @@ class CaptureSummary:
             "captures": self.captures,
             "exposure_ms": self.exposure_ms,
             "saturated_share": self.saturated,
+            "simulated": self.simulated,
         }
 
 
@@ -119,10 +125,15 @@ def acquire_from(
     Raises
     ------
     InputError
-        For an unknown bench, channel or plane, or a folder that is not empty.
+        For an unknown bench, channel or plane, `known` with a virtual bench, or a folder that is not empty.
     DeviceError
         Where a device fails.
     """
+    if known is not None and configuration_of(spec) is None:
+        raise InputError(
+            f"--known {known} is for a real headset, and --bench {spec} is a virtual one, which knows its own numbers: "
+            "leave --known out, or give the headset's configuration as --bench"
+        )
     with open_bench(spec, seed, read_bench(known) if known else None) as opened:
         planes = tuple(planes_mm) if planes_mm else opened.planes_mm
         return acquire_captures(
@@ -222,12 +233,15 @@ def acquire_captures(
                             exposure_ms=exposures[channel],
                             time_s=round(time, 6),
                             kind=pattern.kind,
+                            simulated="yes" if headset.simulated else "no",
                         )
             finally:
                 headset.lasers.off()
     if progress:
         progress(1.0, "done")
-    return CaptureSummary(Path(folder), len(saturated), exposures, float(np.mean(saturated)))
+    return CaptureSummary(
+        Path(folder), len(saturated), exposures, float(np.mean(saturated)), headset.simulated
+    )
 
 
 def _with_repeat(patterns: list[Pattern]) -> list[tuple[int, Pattern]]:

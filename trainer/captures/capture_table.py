@@ -5,9 +5,10 @@ from __future__ import annotations
 import csv
 import io
 import math
+import os
 from dataclasses import dataclass, field
 from difflib import get_close_matches
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from trainer.captures.bench_file import Bench
 from trainer.captures.png_reader import reason
@@ -115,6 +116,7 @@ def scan_rows(folder: Path, bench: Bench) -> tuple[list[Capture], list[RowFault]
     captures: list[Capture] = []
     faults: list[RowFault] = []
     ids: set[str] = set()
+    files = _Files(folder)
     for number, row in numbered[1:]:
         cells = dict(zip(header, (cell.strip() for cell in row), strict=False))
         name = cells.get("capture", "")
@@ -129,7 +131,7 @@ def scan_rows(folder: Path, bench: Bench) -> tuple[list[Capture], list[RowFault]
                 )
             )
             continue
-        capture, wrong = _row(folder, bench, cells, where, len(captures))
+        capture, wrong = _row(files, bench, cells, where, len(captures))
         if name in ids:
             wrong.insert(
                 0,
@@ -164,8 +166,38 @@ def _header_fault(path: Path, header: list[str], rows: int) -> RowFault | None:
     return None
 
 
+class _Files:
+    """The files of a set: its folders are listed once, which is quicker than to ask for each of many files.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the set.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._names: dict[str, set[str]] = {}  # of files, by folder
+
+    def has(self, relative: str) -> bool:
+        """Whether there is such a file."""
+        parent, _, name = relative.rpartition("/")
+        if parent not in self._names:
+            try:
+                with os.scandir(self.folder / parent) as entries:
+                    self._names[parent] = {entry.name for entry in entries if entry.is_file()}
+            except OSError:
+                self._names[parent] = set()
+        if name in self._names[parent]:
+            return True
+        try:  # a disk may take other spellings for the same
+            return (self.folder / relative).is_file()
+        except OSError:
+            return False
+
+
 def _row(
-    folder: Path, bench: Bench, cells: dict[str, str], where: str, index: int
+    set_files: _Files, bench: Bench, cells: dict[str, str], where: str, index: int
 ) -> tuple[Capture | None, list[RowFault]]:
     """The capture that a row of cells describes (None where it cannot be known), and the row's faults."""
     faults: list[RowFault] = []
@@ -207,23 +239,19 @@ def _row(
     time = number("time_s", float(index), -1e9, 1e9, "a time in seconds")
     files: list[Path] = []
     for column in ("phase", "image"):
-        relative = PurePosixPath(cells[column].replace("\\", "/"))
-        if relative.is_absolute() or ".." in relative.parts or ":" in str(relative) or "\0" in str(relative):
+        relative = cells[column].replace("\\", "/")
+        if relative[:1] == "/" or ".." in relative.split("/") or ":" in relative or "\0" in relative:
             fault(
                 "missing_file",
-                f"{column} {str(relative)[:80]!r} is not inside the set; "
+                f"{column} {relative[:80]!r} is not inside the set; "
                 "copy the file into the folder and give its path from there",
             )
             continue
-        files.append(folder / relative)
-        try:
-            there = files[-1].is_file()
-        except OSError:
-            there = False
-        if cells[column] and not there:
+        files.append(set_files.folder / relative)
+        if relative and not set_files.has(relative):
             fault(
                 "missing_file",
-                f"{column} {str(relative)[:80]!r} is not there; put the file back or remove the row",
+                f"{column} {relative[:80]!r} is not there; put the file back or remove the row",
             )
     if faults:
         return None, faults

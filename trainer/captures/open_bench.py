@@ -47,6 +47,8 @@ class RealHeadset:
         The plane that the camera is focused on.
     focus : callable, optional
         Moves the focus to a plane, mm.
+    simulated : bool
+        Whether the devices are emulated.
     started : float, s
         Of the monotonic clock.
     """
@@ -57,6 +59,7 @@ class RealHeadset:
     power: Mapping[str, float]
     focus_mm: float
     focus: Any = None
+    simulated: bool = False
     started: float = field(default_factory=time.monotonic)
 
     def __post_init__(self) -> None:
@@ -123,7 +126,7 @@ def open_bench(spec: str, seed: int = 0, known: Bench | None = None) -> Iterator
         Where a device fails.
     """
     from firmware_iface.virtual import open_headset
-    from runtime.headset.open_devices import configuration_of, open_devices
+    from runtime.headset.open_devices import configuration_of, is_simulated, open_devices
 
     if configuration_of(spec) is None:
         virtual = open_headset(spec, seed)
@@ -136,7 +139,13 @@ def open_bench(spec: str, seed: int = 0, known: Bench | None = None) -> Iterator
     with open_devices(spec, seed) as devices:
         _check(devices, known)
         headset = RealHeadset(
-            devices.panel, devices.lasers, devices.camera, devices.power, known.distance_mm, devices.focus
+            devices.panel,
+            devices.lasers,
+            devices.camera,
+            devices.power,
+            known.distance_mm,
+            devices.focus,
+            is_simulated(spec),
         )
         yield OpenBench(headset, known, (known.distance_mm,))
 

@@ -7,7 +7,7 @@ import zlib
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from firmware_iface.errors import InputError
 
@@ -112,5 +112,7 @@ def read_picture(path: Path, shape: tuple[int, int], bits: int, what: str) -> np
 
 
 def reason(error: BaseException) -> str:
-    """What a library's error says, in one short line."""
+    """What a library's error says, in one short line and without its objects."""
+    if isinstance(error, UnidentifiedImageError):
+        return "it is something else, or damaged"
     return (str(error).splitlines() or [type(error).__name__])[0][:120]

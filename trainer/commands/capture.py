@@ -62,8 +62,9 @@ def run(args: Namespace, screen: Screen) -> Result:
 def show(result: Result, args: Namespace, screen: Screen) -> None:
     """What was taken."""
     exposures = ", ".join(f"{name} {ms:g} ms" for name, ms in result["exposure_ms"].items())
+    simulated = "simulated " if result["simulated"] else ""
     screen.say(
-        f"{result['captures']} captures in {result['folder']}; exposure {exposures}; "
+        f"{result['captures']} {simulated}captures in {result['folder']}; exposure {exposures}; "
         f"{100 * result['saturated_share']:.2g} % of the pixels saturated.",
         style="bold",
     )

@@ -12,6 +12,8 @@ from trainer.commands.command_line import command_line
 from trainer.commands.inputs import captures_argument
 from trainer.commands.workers import use_every_core
 
+MOST_SHOWN = 100  # problems in the table, the errors first
+
 
 def run(args: Namespace, screen: Screen) -> Result:
     """Everything that is wrong with a capture set."""
@@ -46,8 +48,10 @@ def show(result: Result, args: Namespace, screen: Screen) -> None:
         )
         screen.table(
             ("", "kind", "capture", "what to change"),
-            [(p["severity"], p["kind"], p["capture"], p["message"]) for p in problems],
+            [(p["severity"], p["kind"], p["capture"], p["message"]) for p in problems[:MOST_SHOWN]],
         )
+        if len(problems) > MOST_SHOWN:
+            screen.say(f"... and {len(problems) - MOST_SHOWN} more: --json lists all.")
     if errors:
         screen.next(command_line("check", args.captures), "Correct the errors, and check again")
     else:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from firmware_iface.errors import InputError
+from runtime.commands.inputs import say_simulated
 from runtime.program.command import Command, Result
 from runtime.program.options import distances, number, seed_option, whole
 from runtime.program.screen import Screen
@@ -96,6 +97,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     """The hardware-in-the-loop cycle on a bench, or with recorded captures."""
     from contextlib import ExitStack
 
+    from runtime.headset.open_devices import is_simulated
     from trainer.captures.capture_set import read_captures
     from trainer.captures.open_bench import open_bench
     from trainer.cycle.hardware_in_the_loop import run_cycle
@@ -139,6 +141,8 @@ def run(args: Namespace, screen: Screen) -> Result:
         "pictures": [one.name for one in wanted],
         "rounds": [{"round": k, "pictures": one, "mean": _mean(one)} for k, one in enumerate(rounds)],
         "good_enough": sorted(cycle.done),
+        "simulated": (args.bench is not None and is_simulated(args.bench))
+        or any(one.extra.get("simulated") == "yes" for captures in recorded for one in captures.captures),
         "left_out": left_out(settings.recipe, settings.pretrained),
     }
 
@@ -189,6 +193,7 @@ def _mean(found: dict[str, Result]) -> Result:
 
 def show(result: Result, args: Namespace, screen: Screen) -> None:
     """What the camera saw, round by round."""
+    say_simulated(result, screen)
     rounds = result["rounds"]
     if rounds:
         first, last = rounds[0]["mean"], rounds[-1]["mean"]

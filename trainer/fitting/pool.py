@@ -150,11 +150,9 @@ def _cluster(address: str) -> Iterator[Pool]:
     try:
         _greet(address)
         client = Client(address, timeout=ANSWER_S, set_as_default=False)
-    except Exception as error:  # anything may answer at that address
-        known = str(error) if isinstance(error, OSError | ValueError) else ""
+    except Exception as error:  # whatever a stranger at that address may have said
         raise InputError(
-            f"no Dask scheduler answers at {address!r} ({known or 'what is there does not speak Dask'}): "
-            "start one, or leave --cluster out"
+            f"no Dask scheduler answers at {address!r} ({_refusal(error)}): start one, or leave --cluster out"
         ) from error
     try:
         _prepare(client, address)
@@ -165,6 +163,21 @@ def _cluster(address: str) -> Iterator[Pool]:
         client.close(timeout=ANSWER_S)
 
 
+def _refusal(error: BaseException) -> str:
+    """Why there is no scheduler: nobody answers, or somebody else does."""
+    causes = []
+    cause: BaseException | None = error
+    while cause is not None and cause not in causes:
+        causes.append(cause)
+        cause = cause.__cause__ or cause.__context__
+    if any(isinstance(one, ConnectionRefusedError) or "refused" in str(one).lower() for one in causes):
+        return "nobody answers there: the connection was refused"
+    if isinstance(error, TimeoutError) and not str(error):
+        return f"nobody answers there within {ANSWER_S:g} s"
+    known = str(error) if isinstance(error, OSError | ValueError) else ""
+    return known or "what is there does not speak Dask"
+
+
 def _greet(address: str) -> None:
     """Waits for a scheduler's first message, for which a client alone would wait without limit."""
     import asyncio
@@ -172,7 +185,7 @@ def _greet(address: str) -> None:
     from distributed.comm import connect
 
     async def greeted() -> None:
-        comm = await connect(address, timeout=ANSWER_S)
+        comm = await connect(address, timeout=0.8 * ANSWER_S)  # it says why; the limit below does not
         comm.abort()
 
     with ThreadPoolExecutor(1) as thread:  # a notebook's own thread already runs a loop

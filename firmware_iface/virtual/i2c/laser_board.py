@@ -30,6 +30,7 @@ class Diode:
     Attributes
     ----------
     name : str
+    wavelength_nm : float, nm
     threshold_ma : float, mA
     slope_uw_per_ma : float, µW/mA
         Light at the exit pupil beyond the threshold.
@@ -41,6 +42,7 @@ class Diode:
     """
 
     name: str
+    wavelength_nm: float
     threshold_ma: float
     slope_uw_per_ma: float
     photodiode_v_per_uw: float
@@ -55,9 +57,9 @@ class Diode:
 def diodes() -> list[Diode]:
     """The three that the board is built with: 120, 100 and 15 µW at 1.5, 1.3 and 0.9 V."""
     return [
-        Diode("red", 45.0, 4.0, 1 / 120),
-        Diode("green", 40.0, 4.0, 1 / 100),
-        Diode("blue", 30.0, 1.0, 1 / 15),
+        Diode("red", 638.0, 45.0, 4.0, 1 / 120),
+        Diode("green", 520.0, 40.0, 4.0, 1 / 100),
+        Diode("blue", 450.0, 30.0, 1.0, 1 / 15),
     ]
 
 

@@ -12,6 +12,14 @@ from runtime.cli import main
 from runtime.service.configuration import read_configuration
 from tests.campaigns.headset import write_configuration
 
+GREEN = """[[lasers.channel]]
+name = "green"
+wavelength_nm = 520.0
+full_power_uw = 100.0
+threshold_ma = 40.0
+slope_uw_per_ma = 4.0
+"""
+
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:
     read = read_configuration(write_configuration(tmp_path, refresh_hz=72.0))
@@ -43,6 +51,12 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
             "1.28 of the Class 1 budget",  # 50 of 39 microwatts at 450 nm
         ),
         ("[panel]", "[panel", "is not TOML"),
+        ("solve_ms = 12.0", "solve_ms = 500.0", "solve_ms = 500 in [service]"),
+        (
+            "power = { green = 0.5 }",
+            "power = { green = 0.5 }\n" + 2 * GREEN,
+            "[[lasers.channel]] 0 and 1 are both name = 'green'",
+        ),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_2(

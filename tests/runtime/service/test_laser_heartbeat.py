@@ -170,6 +170,17 @@ def test_a_board_that_does_not_answer_is_opened_again(bench: Bench) -> None:
     bench.light_up()
 
 
+def test_a_missing_board_is_one_fault_until_it_is_back(bench: Bench) -> None:
+    until(lambda: bench.lasers.state == LaserState.OFF)
+    for outages in (1, 2):
+        bench.board.fails = "status"
+        until(lambda: bench.lasers.state == LaserState.LOST)
+        time.sleep(0.2)  # several attempts
+        assert bench.faults == outages * ["laser_bus"]
+        bench.board.fails = ""
+        until(lambda: bench.lasers.state == LaserState.OFF)
+
+
 def test_a_pattern_waits_for_the_power_that_its_bright_spots_allow(bench: Bench) -> None:
     bench.light_up()
     shown: list[str] = []

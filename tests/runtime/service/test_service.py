@@ -340,6 +340,18 @@ def test_frames_are_lit_by_all_lasers_when_the_light_of_each_pattern_is_predicte
         within_five_attempts(once)
 
 
+def test_missing_hardware_is_one_fault_a_part_and_the_log_says_what_is_missing(tmp_path: Path) -> None:
+    file = write_configuration(tmp_path)
+    with served(file) as process, connected(file) as client:
+        until(lambda: client.status().faults >= 3)
+        time.sleep(1.0)  # some fifty attempts for the panel, twenty for the lasers
+        assert client.status().faults == 3
+        process.send_signal(signal.SIGTERM)
+        _, log = process.communicate(timeout=10)
+    for kind in ("panel", "laser_bus", "camera"):
+        assert f"{kind}: there is no emulated hardware" in log or f"{kind}: the bus" in log, log
+
+
 def test_a_user_who_is_not_listed_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By the kernel's credentials, before anything is read."""
     supervisor = Supervisor(read_configuration(write_configuration(tmp_path)))
@@ -399,6 +411,8 @@ def test_sigterm_switches_the_lasers_off_and_ends_the_service(tmp_path: Path) ->
         notify.settimeout(20)
         with served(file, NOTIFY_SOCKET=str(tmp_path / "notify"), WATCHDOG_USEC="400000") as process:
             assert notify.recv(500).startswith(b"READY=1")
+            assert process.stderr is not None
+            assert process.stderr.readline().startswith(f"ready at {tmp_path / 'service.sock'}: serving")
             assert notify.recv(500) == b"WATCHDOG=1"
             with connected(file) as client:
                 until(
