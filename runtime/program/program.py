@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 from firmware_iface.errors import DeviceError, InputError
 from runtime.program.command import Command, Result
+from runtime.program.completion import complete
 from runtime.program.csv_tables import write_tables
 from runtime.program.interrupt import Interrupted
 from runtime.program.log_file import Log, open_log
@@ -94,6 +95,7 @@ class Program:
 
     def _main(self, arguments: list[str]) -> int:
         parser = self.parser()
+        complete(parser)
         with _output():
             try:
                 args = parser.parse(arguments)

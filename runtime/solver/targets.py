@@ -6,9 +6,11 @@ Everywhere in hololoop a target is linear: twice the number is twice the light. 
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,7 @@ from PIL import Image
 from firmware_iface.errors import InputError
 
 CHANNELS = ("red", "green", "blue")
+MOST_VALUES = 3 * 178_956_970  # of a picture: three times what Pillow reads of one colour
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear sRGB
 
 _UNREADABLE = (
@@ -64,7 +67,11 @@ def read_target(
     """
     names = _channel_names(channels)
     path = Path(path)
-    readers = {".png": _read_png, ".exr": _read_exr, ".npy": _read_npy}
+    readers: dict[str, Callable[[Path], np.ndarray]] = {
+        ".png": _read_png,
+        ".exr": _read_exr,
+        ".npy": partial(_read_npy, shape=None if fit else shape),
+    }
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise InputError(f"{path} is not a type of picture that is read here; give PNG, EXR or NPY")
@@ -83,10 +90,7 @@ def read_target(
         target = planes[[0 if len(planes) == 1 else CHANNELS.index(name) for name in names]]
     if shape is not None and target.shape[-2:] != tuple(shape):
         if not fit:
-            raise InputError(
-                f"{path} is {_size_text(target.shape[-2:])} and {_size_text(shape)} is needed; "
-                "resize it, or ask for it to be fitted"
-            )
+            raise _wrong_size(path, target.shape[-2:], shape)
         target = fit_area(target, shape)
     return np.ascontiguousarray(target, dtype=np.float32)
 
@@ -232,7 +236,37 @@ def _read_exr(path: Path) -> np.ndarray:
     raise InputError(f"{path} has neither R, G, B nor Y; its channels are {found}")
 
 
-def _read_npy(path: Path) -> np.ndarray:
+def _check_npy_size(path: Path, shape: tuple[int, int] | None) -> None:
+    """Look at the header of an NPY file, before memory is taken for what it says."""
+    with path.open("rb") as file:
+        try:
+            version = np.lib.format.read_magic(file)
+            reads = {
+                (1, 0): np.lib.format.read_array_header_1_0,
+                (2, 0): np.lib.format.read_array_header_2_0,
+            }
+            size, _, dtype = reads[version](file)
+        except (ValueError, KeyError, EOFError):
+            return  # what is wrong is said where it is read
+        begin = file.tell()
+    if shape is not None and len(size) in (2, 3) and 0 not in size and size[-2:] != tuple(shape):
+        raise _wrong_size(path, size[-2:], shape)
+    values = math.prod(size)
+    if not dtype.hasobject and begin + values * dtype.itemsize > path.stat().st_size:
+        raise InputError(f"{path} is cut off: it says that it holds {size} and has too few bytes for that")
+    if values > MOST_VALUES:
+        raise InputError(f"{path} is too large for a picture: {_size_text(size[-2:])}")
+
+
+def _wrong_size(path: Path, size: Sequence[int], shape: tuple[int, int]) -> InputError:
+    return InputError(
+        f"{path} is {_size_text(size)} and {_size_text(shape)} is needed; "
+        "resize it, or ask for it to be fitted"
+    )
+
+
+def _read_npy(path: Path, shape: tuple[int, int] | None = None) -> np.ndarray:
+    _check_npy_size(path, shape)
     try:
         array = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:

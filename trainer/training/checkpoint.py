@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,10 @@ def write_checkpoint(folder: Path, settings: dict[str, Any], state: dict[str, An
     state : dict
         Its step, and weights and optimiser of each network.
     """
+    data = io.BytesIO()  # since torch says of a full disk that it is an error of its own
+    torch.save({"settings": settings, **state}, data)
     with whole_file(folder / CHECKPOINT) as file:
-        torch.save({"settings": settings, **state}, file)
+        file.write(data.getbuffer())
 
 
 def read_checkpoint(folder: Path, settings: dict[str, Any], device: torch.device) -> dict[str, Any] | None:
