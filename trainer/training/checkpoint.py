@@ -52,7 +52,7 @@ def read_checkpoint(folder: Path, settings: dict[str, Any], device: torch.device
     if _plain(before) != _plain(settings):
         wrong = next(k for k in {**before, **settings} if _plain(before.get(k)) != _plain(settings.get(k)))
         raise InputError(
-            f"{folder} holds a training with another {wrong}: give another --out, or remove the folder"
+            f"{folder} holds a training with another {wrong}: give another --out, or --overwrite to begin anew"
         )
     return state
 
