@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -10,6 +11,11 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 PARALLEL = "PYTEST_XDIST_WORKER" in os.environ
+
+# A shell's script starts what runs in its background with Ctrl-C ignored, and programs pass that on to those that they
+# start; the tests send Ctrl-C to themselves and to programs of theirs, which then act on it as in a terminal.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 if PARALLEL:  # before NumPy and torch are imported: workers that each take every core slow each other down
     for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):

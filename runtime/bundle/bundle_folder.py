@@ -186,8 +186,9 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
     if not folder.is_dir():
         raise InputError(f"{folder} is not a bundle: there is no such folder")
     path = folder / MANIFEST
+    data = _read(path)
     try:
-        manifest = json.loads(_read(path).decode(), parse_constant=_no_constant)
+        manifest = json.loads(data.decode(), parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:  # JSONDecodeError and UnicodeDecodeError are ValueErrors
         raise InputError(f"{path} is not JSON: {error}; export the bundle again") from error
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:

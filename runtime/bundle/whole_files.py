@@ -15,9 +15,11 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeGuard
 
 from firmware_iface.errors import InputError
+
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @contextmanager
@@ -58,9 +60,11 @@ def whole_file(path: str | os.PathLike[str], mode: str = "wb") -> Iterator[IO[An
             os.replace(temporary, target)
         except OSError as error:
             raise _cannot_write(path, error) from error
-    except BaseException:
+    except BaseException as error:
         with suppress(OSError):
             temporary.unlink()
+        if _is_full(error):
+            raise _cannot_write(path, error) from error
         raise
     _sync(target.parent)
 
@@ -110,8 +114,10 @@ def whole_folder(
             if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
                 raise _taken(path) from error
             raise _cannot_write(path, error) from error
-    except BaseException:
+    except BaseException as error:
         shutil.rmtree(temporary, ignore_errors=True)
+        if _is_full(error):
+            raise _cannot_write(path, error) from error
         raise
     _sync(target.parent)
 
@@ -177,6 +183,11 @@ def _cannot_write(path: str | os.PathLike[str], error: OSError) -> InputError:
     if isinstance(error, FileNotFoundError) and not parent.exists():
         return InputError(f"{path} cannot be written: there is no folder {parent}; make it first")
     return InputError(f"{path} cannot be written: {error.strerror or error}")
+
+
+def _is_full(error: BaseException) -> TypeGuard[OSError]:
+    """Whether an error of writing says that there is no room, which it does without the file's name."""
+    return isinstance(error, OSError) and error.errno in NO_ROOM and not error.filename
 
 
 def _sync(path: Path) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 from runtime.commands.inputs import bundle_argument, headset_option, say_simulated
 from runtime.program.command import Command, Result
 from runtime.program.options import millimetres, seed_option
+from runtime.program.outputs import Output, files_written
 from runtime.program.screen import Screen
 
 DESCRIPTION = """Find out with the headset's own camera what has drifted, and put it into the bundle's light path.
@@ -69,6 +70,11 @@ def run(args: Namespace, screen: Screen) -> Result:
     return {**numbers(found), **result, "sentence": sentence_of(numbers(found), replaced)}
 
 
+def outputs(args: Namespace) -> list[Output]:
+    """The report; the bundle has a rule of its own, and its former one is kept."""
+    return files_written(report=args.report)
+
+
 def show(result: Result, args: Namespace, screen: Screen) -> None:
     """The verdict in words, and what drifted."""
     if result["verdict"] == "restored":
@@ -109,6 +115,7 @@ COMMAND = Command(
     options=options,
     run=run,
     show=show,
+    outputs=outputs,
     examples=(
         "calibrate bundle/ --headset virtual:panel_wavefront --report calibration.html",
         "calibrate bundle/ --headset my_bench.toml --check",

@@ -68,6 +68,7 @@ COMMAND = Command(
     options=options,
     run=run,
     show=show,
+    problems=lambda result: result.get("problems", 0) > 0,
     examples=("devices", "devices headset.toml"),
     after="Run the headset's service: serve headset.toml",
     description=DESCRIPTION,

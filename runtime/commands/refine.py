@@ -10,6 +10,7 @@ from pathlib import Path
 from firmware_iface.errors import InputError
 from runtime.commands.inputs import bundle_argument, headset_option, say_simulated
 from runtime.program.command import Command, Result
+from runtime.program.outputs import Output, check_outputs
 from runtime.program.screen import Screen
 
 DESCRIPTION = """Show a picture, look at it with the headset's camera, and make it better while it is displayed.
@@ -57,6 +58,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     bundle = read_bundle(args.bundle)
     channels = bundle_channels(bundle)
     outs = [file.out for file in pattern_files([args.target], channels, args.out)] if args.out else []
+    check_outputs([Output(out, makes_folders=True) for out in outs], args)
     paths = [load_light_path(bundle, c) for c in channels]
     shape = paths[0].grid.shape
     approximator = approximator_of(bundle, (len(paths), *shape))

@@ -12,6 +12,7 @@ from firmware_iface.errors import InputError
 from runtime.commands.inputs import headset_option
 from runtime.program.command import Command, Result
 from runtime.program.options import exposure_ms
+from runtime.program.outputs import Output
 from runtime.program.screen import Screen
 
 if TYPE_CHECKING:
@@ -88,6 +89,17 @@ def run(args: Namespace, screen: Screen) -> Result:
     }
 
 
+def outputs(args: Namespace) -> list[Output]:
+    """What the camera sees of each pattern."""
+    if args.out is None:
+        return []
+    return [Output(_seen_file(args.out, pattern), makes_folders=True) for pattern in args.patterns]
+
+
+def _seen_file(folder: Path, pattern: Path) -> Path:
+    return folder / f"{pattern.stem}-seen.png"
+
+
 def _laser(asked: str | None, devices: Devices) -> str:
     """The laser to light: the one that is asked for, or the first that has a power."""
     known = [c for c in devices.lasers.channels if not devices.power or c in devices.power]
@@ -103,7 +115,7 @@ def _write_counts(counts: np.ndarray, folder: Path, pattern: Path) -> Path:
     from runtime.bundle.whole_files import whole_file
 
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{pattern.stem}-seen.png"
+    path = _seen_file(folder, pattern)
     with whole_file(path) as file:
         Image.fromarray(counts).save(file, "PNG")
     return path
@@ -128,6 +140,7 @@ COMMAND = Command(
     options=options,
     run=run,
     show=show,
+    outputs=outputs,
     examples=(
         "show pattern.png --headset headset.toml --out seen/",
         "show pattern.png --headset virtual:demo --emulated",

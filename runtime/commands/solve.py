@@ -10,6 +10,7 @@ from firmware_iface.errors import InputError
 from runtime.commands.inputs import bundle_argument
 from runtime.program.command import Command, Result
 from runtime.program.options import millimetres, milliseconds, whole
+from runtime.program.outputs import Output, check_outputs
 from runtime.program.progress import Progress
 from runtime.program.screen import Screen
 
@@ -123,6 +124,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     if args.beside_zero_order:
         paths = {c: beside_zero_order(path) for c, path in paths.items()}
     files = pattern_files(targets, channels, args.out)
+    check_outputs([Output(file.out, makes_folders=True) for file in files], args)
     shape = next(iter(paths.values())).grid.shape
     approximator = approximator_of(bundle, (len(every), *shape))
     if approximator is not None and len(channels) < len(every):

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from runtime.program.outputs import Output
 from runtime.program.screen import Screen
 
 Result = dict[str, Any]
+
+
+def _no_outputs(args: Namespace) -> Sequence[Output]:
+    return ()
+
+
+def _no_problems(result: Result) -> bool:
+    return False
 
 
 @dataclass(frozen=True)
@@ -36,6 +45,10 @@ class Command:
         What the command's own help says in place of `about`.
     more : str
         What the help says after the examples.
+    outputs : callable
+        Says what it will write, which is checked before it runs.
+    problems : callable
+        Whether the result says that something examined is faulty, which is exit code 1.
     """
 
     name: str
@@ -47,6 +60,8 @@ class Command:
     after: str = ""
     description: str = ""
     more: str = ""
+    outputs: Callable[[Namespace], Sequence[Output]] = _no_outputs
+    problems: Callable[[Result], bool] = _no_problems
 
     def help_text(self, program: str) -> str:
         """The text at the head of the command's help."""

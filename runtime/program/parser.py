@@ -8,7 +8,9 @@ from typing import Any, NoReturn
 
 from firmware_iface.errors import InputError, nearest
 from runtime.program.command import Command
+from runtime.program.outputs import overwrite_option
 from runtime.program.screen import one_line
+from runtime.program.screen_options import option_names, screen_options
 
 HELP = "help"  # as a command word
 
@@ -23,10 +25,6 @@ class SentenceParser(ArgumentParser):
     def print_help(self, file: Any = None) -> None:
         """Print the help; unlike argparse's own, a closed stdout is not passed over in silence."""
         print(self.format_help(), end="", file=file)
-
-    def option_names(self) -> list[str]:
-        """The long names of its options."""
-        return [name for action in self._actions for name in action.option_strings if name.startswith("--")]
 
 
 class ProgramParser:
@@ -62,9 +60,8 @@ class ProgramParser:
                 allow_abbrev=False,
             )
             command.options(one)
-            one.add_argument(
-                "--json", action="store_true", help="print one JSON object on stdout and nothing else there"
-            )
+            overwrite_option(one)
+            screen_options(one)
             one.set_defaults(chosen=command)
             self.commands[command.name] = one
 
@@ -101,7 +98,7 @@ class ProgramParser:
 
     def _unknown_option(self, words: Sequence[str]) -> str:
         """What to say of the first option of a command's line that the command does not have; else nothing."""
-        options = self.commands[words[0]].option_names()
+        options = option_names(self.commands[words[0]])
         before_end = words[1 : words.index("--")] if "--" in words else words[1:]
         names = [word.split("=")[0] for word in before_end if word.startswith("--")]
         unknown = [name for name in names if name not in options]
@@ -114,7 +111,7 @@ class ProgramParser:
             return f"'{word[:60]}' is one argument too many for {command}; see: {line}"
         name = word.split("=")[0]
         parser = self.commands[command] if command else self.whole
-        return f"{command or self.program} has no option {name[:60]}: {nearest(name, parser.option_names())}"
+        return f"{command or self.program} has no option {name[:60]}: {nearest(name, option_names(parser))}"
 
 
 def help_as_option(arguments: Sequence[str]) -> list[str]:

@@ -1,11 +1,12 @@
 """A program with commands: runs one, prints its result, and turns what goes wrong into one line and an exit code.
 
-Exit codes: 0 done; 2 the input cannot be used (one line on stderr says what to change); 130 interrupted; 141 whoever
-read stdout has closed it.
+Exit codes: 0 done; 1 what was examined has faults (check, devices); 2 the input cannot be used (one line on stderr
+says what to change); 130 interrupted; 141 whoever read stdout has closed it.
 """
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from argparse import Namespace
@@ -14,13 +15,17 @@ from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass
 
 from firmware_iface.errors import DeviceError, InputError
-from runtime.program.command import Command
+from runtime.program.command import Command, Result
+from runtime.program.completion import complete
+from runtime.program.csv_tables import write_tables
 from runtime.program.interrupt import Interrupted
+from runtime.program.log_file import Log, open_log
+from runtime.program.outputs import check_outputs, files_written
 from runtime.program.parser import ProgramParser
 from runtime.program.screen import Screen, one_line
 from runtime.program.version import installed_version
 
-DONE, BAD_INPUT, INTERRUPTED, NO_READER = 0, 2, 130, 141
+DONE, PROBLEMS, BAD_INPUT, INTERRUPTED, NO_READER = 0, 1, 2, 130, 141
 OWN_PACKAGES = ("trainer", "runtime", "firmware_iface")
 
 
@@ -90,6 +95,7 @@ class Program:
 
     def _main(self, arguments: list[str]) -> int:
         parser = self.parser()
+        complete(parser)
         with _output():
             try:
                 args = parser.parse(arguments)
@@ -110,8 +116,21 @@ class Program:
 
 
 def run(command: Command, args: Namespace) -> int:
-    """Run a command and print its result; returns the exit code."""
-    screen = Screen()
+    """Check a command's outputs, run it and print its result; returns the exit code."""
+    check_outputs([*command.outputs(args), *files_written(csv=args.csv)], args)
+    with open_log(args.log_file) as log:
+        log(f"{command.name}: begins")
+        try:
+            code = _run(command, args, log)
+        except BaseException as error:
+            log(f"{command.name}: stopped by {type(error).__name__}: {error}")
+            raise
+        log(f"{command.name}: ends with exit code {code}")
+    return code
+
+
+def _run(command: Command, args: Namespace, log: Log) -> int:
+    screen = Screen(log=log, quiet=args.quiet, verbose=args.verbose)
     with redirect_stdout(sys.stderr):  # what a library prints is not the command's output
         result = command.run(args, screen)
     with _output():
@@ -120,7 +139,21 @@ def run(command: Command, args: Namespace) -> int:
         else:
             command.show(result, args, screen)
         screen.out.flush()
-    return DONE
+    if args.csv is not None:
+        _write_csv(command, result, args, screen)
+    return PROBLEMS if command.problems(result) else DONE
+
+
+def _write_csv(command: Command, result: Result, args: Namespace, screen: Screen) -> None:
+    """Write the tables that were printed, or that would have been without --json."""
+    printed = screen
+    if args.json:
+        printed = Screen(out=io.StringIO(), err=io.StringIO())
+        command.show(result, args, printed)
+    if printed.tables:
+        write_tables(args.csv, printed.tables)
+    else:
+        screen.note(f"{command.name} printed no table: {args.csv} was not written")
 
 
 class _NoReader(Exception):

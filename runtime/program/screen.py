@@ -6,15 +6,20 @@ Colour and moving bars are for terminals alone, and NO_COLOR turns colour off th
 from __future__ import annotations
 
 import io
+import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, TextIO
 
+from runtime.program.csv_tables import PrintedTable
+from runtime.program.log_file import Log, no_log
 from runtime.program.plain_values import json_line
-from runtime.program.progress import Progress, no_progress
+from runtime.program.progress import Progress
+from runtime.program.progress_lines import EVERY_S, ProgressLines
 
 PLAIN_WIDTH = 110  # columns where there is no terminal to ask
+ANSI = re.compile(r"\x1b\[[0-9;]*m")  # the codes of colours
 
 
 class Screen:
@@ -24,12 +29,32 @@ class Screen:
     ----------
     out, err : text stream
         Where to write; by default the process's own at that moment.
+    log : callable
+        Takes all that is said as well.
+    quiet : bool
+        Nothing is said of the progress.
+    verbose : bool
+        A line is said for every step of the progress.
+
+    Attributes
+    ----------
+    tables : list of PrintedTable
+        Those that were printed.
     """
 
-    def __init__(self, out: TextIO | None = None, err: TextIO | None = None) -> None:
+    def __init__(
+        self,
+        out: TextIO | None = None,
+        err: TextIO | None = None,
+        log: Log = no_log,
+        quiet: bool = False,
+        verbose: bool = False,
+    ) -> None:
         # A process may have been started without stdout or stderr: then what it says goes nowhere.
         self.out: TextIO = out or sys.stdout or io.StringIO()
         self.err: TextIO = err or sys.stderr or io.StringIO()
+        self.log, self.quiet, self.verbose = log, quiet, verbose
+        self.tables: list[PrintedTable] = []
 
     def say(self, text: str = "", style: str = "") -> None:
         """One paragraph, as wide as it is."""
@@ -50,6 +75,7 @@ class Screen:
 
         if not rows:
             return
+        self.tables.append(PrintedTable(columns, rows, title))
         table = Table(
             title=title or None,
             title_justify="left",
@@ -77,18 +103,38 @@ class Screen:
 
     def note(self, text: str) -> None:
         """A line on stderr; where nobody reads stderr any more, the work goes on."""
+        self.log(one_line(text))
+        self._note(text)
+
+    def _note(self, text: str) -> None:
+        """A line on stderr alone."""
         with suppress(BrokenPipeError):
             print(one_line(text), file=self.err)
 
     def json(self, value: Mapping[str, Any]) -> None:
         """One object on stdout, on one line."""
-        self.out.write(json_line(value) + "\n")
+        line = json_line(value)
+        self.log(line)
+        self.out.write(line + "\n")
 
     @contextmanager
     def progress(self, title: str) -> Iterator[Progress]:
-        """Give a callback that says how far the work is; a moving bar on stderr if that is a terminal."""
-        if not self.err.isatty():
-            yield no_progress
+        """Give a callback that says how far the work is.
+
+        It moves a bar on stderr if that is a terminal; elsewhere, and with `verbose`, it says a line now and then.
+        """
+        logged = ProgressLines(title, self.log, EVERY_S, each_step=True)
+        if self.quiet:
+            yield logged
+            return
+        if self.verbose or not self.err.isatty():
+            said = ProgressLines(title, self._note, EVERY_S, each_step=self.verbose)
+
+            def lines(done: float, what: str = "") -> None:
+                said(done, what)
+                logged(done, what)
+
+            yield lines
             return
         from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
         from rich.progress import Progress as Bars
@@ -105,6 +151,7 @@ class Screen:
             task = bars.add_task(title, total=1.0)
 
             def progress(done: float, what: str = "") -> None:
+                logged(done, what)
                 bars.update(task, completed=min(max(done, 0.0), 1.0), description=what or title)
 
             yield progress
@@ -114,7 +161,9 @@ class Screen:
         console = self._console(self.out)
         with console.capture() as text:
             console.print(what, soft_wrap=soft_wrap)
-        self.out.write(text.get())
+        printed = text.get()
+        self.log(ANSI.sub("", printed))
+        self.out.write(printed)
 
     def _console(self, stream: TextIO) -> Any:
         from rich.console import Console

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,7 +67,7 @@ def pattern_files(targets: Sequence[Path], channels: Sequence[str], out: Path) -
             raise InputError(
                 f"{owners[file.out]} and {file.target} would both be written to {file.out}: rename one"
             )
-        if file.out.resolve() == file.target.resolve():
+        if os.path.realpath(file.out) == os.path.realpath(file.target):
             raise InputError(f"{file.target} would be overwritten by its own pattern: give another --out")
         owners[file.out] = file.target
     if not single:

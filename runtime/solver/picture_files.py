@@ -5,8 +5,9 @@ What a file is, its content says, whatever its name.
 
 from __future__ import annotations
 
+import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +26,10 @@ _UNREADABLE = (
     Image.DecompressionBombWarning,
 )
 
+MOST_VALUES = 3 * 178_956_970  # of a picture: three times what Pillow reads of one colour
 
-def read_planes(path: Path) -> np.ndarray:
+
+def read_planes(path: Path, shape: tuple[int, int] | None = None) -> np.ndarray:
     """Read a picture's planes.
 
     PNG, JPEG and TIFF, 8 or 16 bits: sRGB (a colour profile is ignored), decoded to linear, white = 1.
@@ -37,6 +40,9 @@ def read_planes(path: Path) -> np.ndarray:
     Parameters
     ----------
     path : Path
+    shape : (int, int), pixels, optional
+        The size that the picture must have. An NPY file says its size before it is read, and so one of another size is
+        refused before it takes memory.
 
     Returns
     -------
@@ -49,7 +55,7 @@ def read_planes(path: Path) -> np.ndarray:
     """
     reader = _reader_of(path)
     try:
-        return reader(path)
+        return reader(path, shape) if reader is _read_npy else reader(path)
     except MemoryError:
         raise InputError(f"{path} does not fit into memory: give a smaller picture") from None
 
@@ -239,7 +245,37 @@ def _read_exr(path: Path) -> np.ndarray:
     raise InputError(f"{path} has neither R, G, B nor Y; its channels are {found}")
 
 
-def _read_npy(path: Path) -> np.ndarray:
+def _check_npy_size(path: Path, shape: tuple[int, int] | None) -> None:
+    """Look at the header of an NPY file, before memory is taken for what it says."""
+    with path.open("rb") as file:
+        try:
+            version = np.lib.format.read_magic(file)
+            reads = {
+                (1, 0): np.lib.format.read_array_header_1_0,
+                (2, 0): np.lib.format.read_array_header_2_0,
+            }
+            size, _, dtype = reads[version](file)
+        except (ValueError, KeyError, EOFError):
+            return  # what is wrong is said where it is read
+        begin = file.tell()
+    if shape is not None and len(size) in (2, 3) and 0 not in size and size[-2:] != tuple(shape):
+        raise wrong_size(path, size[-2:], shape)
+    values = math.prod(size)
+    if not dtype.hasobject and begin + values * dtype.itemsize > path.stat().st_size:
+        raise InputError(f"{path} is cut off: it says that it holds {size} and has too few bytes for that")
+    if values > MOST_VALUES:
+        raise InputError(f"{path} is too large for a picture: {size_text(size[-2:])}")
+
+
+def wrong_size(path: Path, size: Sequence[int], shape: tuple[int, int]) -> InputError:
+    """The error for a picture that is not of the needed size."""
+    return InputError(
+        f"{path} is {size_text(size)} and {size_text(shape)} is needed; resize it, or ask for it to be fitted"
+    )
+
+
+def _read_npy(path: Path, shape: tuple[int, int] | None = None) -> np.ndarray:
+    _check_npy_size(path, shape)
     try:
         array = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
@@ -252,3 +288,8 @@ def _read_npy(path: Path) -> np.ndarray:
         raise InputError(f"{path} has the shape {array.shape}; give [H, W] or [3, H, W]")
     with np.errstate(over="ignore"):  # what is too large becomes infinite, and is refused as such
         return array.astype(np.float32)
+
+
+def size_text(shape: Sequence[int]) -> str:
+    """A picture's size in words."""
+    return f"{shape[0]} high and {shape[1]} wide"

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from firmware_iface.errors import InputError
-from runtime.solver.picture_files import decode_srgb, encode_srgb, read_planes
+from runtime.solver.picture_files import decode_srgb, encode_srgb, read_planes, size_text, wrong_size
 
 __all__ = [
     "CHANNELS",
@@ -67,9 +67,9 @@ def read_target(
     """
     names = _channel_names(channels)
     path = Path(path)
-    planes = read_planes(path)
+    planes = read_planes(path, None if fit else shape)
     if planes.size == 0:
-        raise InputError(f"{path} is empty: its size is {_size_text(planes.shape[-2:])}")
+        raise InputError(f"{path} is empty: its size is {size_text(planes.shape[-2:])}")
     if not np.isfinite(planes).all():
         raise InputError(f"{path} has values that are not finite numbers (or too large for float32)")
     if (lowest := float(planes.min())) < 0:
@@ -80,10 +80,7 @@ def read_target(
         target = planes[[0 if len(planes) == 1 else CHANNELS.index(name) for name in names]]
     if shape is not None and target.shape[-2:] != tuple(shape):
         if not fit:
-            raise InputError(
-                f"{path} is {_size_text(target.shape[-2:])} and {_size_text(shape)} is needed; "
-                "resize it, or ask for it to be fitted"
-            )
+            raise wrong_size(path, target.shape[-2:], shape)
         target = fit_area(target, shape)
     return np.ascontiguousarray(target, dtype=np.float32)
 
@@ -156,7 +153,3 @@ def _resize_axis(picture: np.ndarray, axis: int, size: int, scale: float) -> np.
     at_edges = integral[..., whole] + (edges - whole) * picture[..., whole]
     means = np.maximum(np.diff(at_edges, axis=-1) / scale, 0)
     return np.moveaxis(means, -1, axis)
-
-
-def _size_text(shape: Sequence[int]) -> str:
-    return f"{shape[0]} high and {shape[1]} wide"

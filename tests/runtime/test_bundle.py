@@ -103,7 +103,7 @@ def test_any_changed_byte_is_noticed(tmp_path_factory: pytest.TempPathFactory, d
 @pytest.mark.parametrize("name", ["bundle.json", "lightpath.safetensors", "approximator.onnx"])
 def test_a_missing_file_is_named(folder: Path, name: str) -> None:
     (folder / name).unlink()
-    with pytest.raises(InputError, match=f"{name} is missing"):
+    with pytest.raises(InputError, match=f"{name} is missing; copy"):
         read_bundle(folder)
 
 

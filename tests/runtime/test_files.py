@@ -49,6 +49,34 @@ def test_after_an_error_the_old_file_stands_and_nothing_else(
     assert names(tmp_path) == ["a.bin"]
 
 
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG])
+def test_a_full_disk_names_the_file_or_the_folder(tmp_path: Path, number: int) -> None:
+    with (
+        pytest.raises(InputError, match=r"model.toml cannot be written: "),
+        whole_file(tmp_path / "model.toml"),
+    ):
+        raise OSError(number, os.strerror(number))
+    with pytest.raises(InputError, match=r"bundle cannot be written: "), whole_folder(tmp_path / "bundle"):
+        raise OSError(number, os.strerror(number))
+    with pytest.raises(OSError, match="elsewhere"), whole_file(tmp_path / "model.toml"):
+        raise OSError(number, os.strerror(number), "elsewhere")
+    assert not names(tmp_path)
+
+
+def test_a_file_that_is_too_large_for_the_disk_is_one_line(tmp_path: Path) -> None:
+    """With the limit that a process has for its files, which is met as a full disk is."""
+    script = (
+        "import resource, sys; from runtime.bundle.whole_files import whole_file\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
+        f"with whole_file({str(tmp_path / 'a.bin')!r}) as file: file.write(bytes(100000))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.stderr.splitlines()[-1].startswith(
+        f"firmware_iface.errors.InputError: {tmp_path / 'a.bin'} cannot be written: "
+    )
+    assert not names(tmp_path)
+
+
 def test_a_file_has_the_permissions_that_open_would_give(tmp_path: Path) -> None:
     with whole_file(tmp_path / "a"):
         pass

@@ -62,7 +62,7 @@ def run(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, s
 
 
 def solved(capsys: pytest.CaptureFixture[str], *words: object) -> list[dict[str, Any]]:
-    code, out, err = run(capsys, "solve", *words, "--json")
+    code, out, err = run(capsys, "solve", *words, "--json", "--overwrite")
     assert (code, err) == (0, "")
     result = json.loads(out)
     assert out.count("\n") == 1

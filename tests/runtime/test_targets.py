@@ -302,3 +302,23 @@ def test_what_to_install_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         read_target(tmp_path / "a.exr")
     with pytest.raises(InputError, match=r"pip install 'hololoop\[trainer\]'"):
         read_target(save_png(tmp_path / "a.png", RGB.astype(np.uint16)), channels=3)
+
+
+def test_an_npy_file_is_judged_by_its_header_first(tmp_path: Path) -> None:
+    def with_header(shape: tuple[int, ...], size: int) -> Path:
+        path = tmp_path / "picture.npy"
+        with path.open("wb") as file:
+            np.lib.format.write_array_header_1_0(
+                file, {"descr": "<f8", "fortran_order": False, "shape": shape}
+            )
+            file.truncate(size)  # a sparse file, as a tool may leave it
+        return path
+
+    huge = 128 + 8 * 99999**2
+    for size in (1000, huge):
+        with pytest.raises(InputError, match="99999 high and 99999 wide and 4 high and 6 wide is needed"):
+            read_target(with_header((99999, 99999), size), (4, 6))
+    with pytest.raises(InputError, match="too large for a picture: 99999 high"):
+        read_target(with_header((99999, 99999), huge), (4, 6), fit=True)
+    with pytest.raises(InputError, match="cut off"):
+        read_target(with_header((4, 6), 200), (4, 6))

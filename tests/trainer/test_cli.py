@@ -160,7 +160,7 @@ def test_check_gives_its_object_and_its_page(captures: Path, capsys: pytest.Capt
 def test_check_of_a_folder_without_a_bench_is_a_problem_not_an_error(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli.main(["check", str(tmp_path), "--json"]) == 0
+    assert cli.main(["check", str(tmp_path), "--json"]) == 1
     found = one_object(capsys)
     assert found["captures"] == 0
     assert found["problems"][0]["kind"] == "unreadable"
@@ -368,7 +368,7 @@ def test_explain_shows_the_ladder_and_writes_the_model(
     assert f"hololoop-trainer export --out bundle --model {out}" in page
     about = out.read_text(encoding="utf-8")
     assert "captures_sha256" in about
-    assert cli.main([*arguments, "--json"]) == 0
+    assert cli.main([*arguments, "--json", "--overwrite"]) == 0
     assert one_object(capsys)["model"] == str(out)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -41,8 +42,9 @@ from trainer.training.losses import (
     where_measured,
 )
 from trainer.training.recipe import RECIPES, Recipe, recipe_named
+from trainer.training.run_lock import RUNNING, only_run
 from trainer.training.training_pairs import measured_on_panel, pairs_of, stacked
-from trainer.training.training_run import NETWORK, train
+from trainer.training.training_run import NETWORK, _TrainingRun, train
 from trainer.training.training_sets import TrainingSets, training_sets
 
 SMALL = replace(RECIPES["compact"], filters=2)
@@ -324,6 +326,67 @@ def test_weights_that_are_named_are_used(
 
 
 @pytest.mark.slow
+def test_a_second_training_in_a_folder_is_refused_and_a_dead_ones_lock_is_not(
+    captures: CaptureSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    out.mkdir()
+    words = train_words(captures, out, "--steps", "2")
+    with only_run(out):
+        assert (out / RUNNING).read_text() == f"{os.getpid()}\n"
+        assert main(words) == 2
+        assert f"another training runs in {out} (process {os.getpid()})" in capsys.readouterr().err
+    assert not (out / RUNNING).exists()
+    (out / RUNNING).write_text("1\n")  # of a process that was killed; another has its number now
+    assert main(words) == 0
+    assert not (out / RUNNING).exists()
+
+
+def test_a_folder_of_something_else_is_refused_and_a_run_of_other_settings_replaced_on_request(
+    captures: CaptureSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / "thesis.tex").write_text("")
+    words = train_words(captures, out, "--steps", "2", "--every", "1")
+    assert main(words) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert main([*words, "--overwrite"]) == 2
+    assert "thesis.tex" in capsys.readouterr().err
+    (out / "thesis.tex").unlink()
+    assert main(words) == 0
+    assert main([*words, "--l1", "3"]) == 2
+    assert "another recipe: give another --out, or --overwrite" in capsys.readouterr().err
+    assert main([*words, "--l1", "3", "--overwrite"]) == 0
+
+
+def test_ctrl_c_says_where_the_checkpoint_is(
+    captures: CaptureSet, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(step: int) -> None:
+        step_of = _TrainingRun._step
+
+        def step_or_stop(run: _TrainingRun) -> dict[str, float]:
+            if run.step == step:
+                raise KeyboardInterrupt
+            return step_of(run)
+
+        monkeypatch.setattr(_TrainingRun, "_step", step_or_stop)
+
+    out = tmp_path / "run"
+    words = train_words(captures, out, "--steps", "8", "--every", "2")
+    interrupted(1)
+    assert main(words) == 130
+    assert f"interrupted before the first checkpoint; there is no network in {out}" in capsys.readouterr().err
+    monkeypatch.undo()
+    interrupted(5)
+    assert main(words) == 130
+    said = capsys.readouterr().err
+    assert f"the checkpoint at step 4 is {out / CHECKPOINT}, and the same command goes on from there" in said
+    monkeypatch.undo()
+    assert main(words) == 0
+
+
 def test_two_processes_train_one_network(captures: CaptureSet, tmp_path: Path) -> None:
     """The same command under torchrun."""
     out = tmp_path / "run"

@@ -9,7 +9,7 @@ from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
 from trainer.commands.inputs import captures_argument, inputs_of, model_options, origin
 from trainer.commands.number_text import sizes_text, small_text
-from trainer.commands.outputs import out_option, refuse_folder
+from trainer.commands.outputs import model_out, out_option
 from trainer.commands.workers import use_every_core
 
 
@@ -25,7 +25,6 @@ def options(parser: ArgumentParser) -> None:
 
 def run(args: Namespace, screen: Screen) -> Result:
     """One effect more."""
-    refuse_folder(args.out, "--out")
     from trainer.effects.effect_catalogue import catalogue, find_effect
 
     effect = find_effect(catalogue(args.effects), args.effect)
@@ -70,6 +69,7 @@ COMMAND = Command(
     options=options,
     run=run,
     show=show,
+    outputs=model_out,
     examples=("add zero_order captures/ --out better.toml",),
     after="See what is still missing: diagnose captures/ --model better.toml",
 )

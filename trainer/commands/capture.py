@@ -7,9 +7,10 @@ from pathlib import Path
 
 from runtime.program.command import Command, Result
 from runtime.program.options import comma_list, distances, seed_option, whole
+from runtime.program.outputs import Output
 from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
-from trainer.commands.outputs import out_option
+from trainer.commands.outputs import CAPTURES, out_option
 
 
 def options(parser: ArgumentParser) -> None:
@@ -50,13 +51,25 @@ def options(parser: ArgumentParser) -> None:
 
 def run(args: Namespace, screen: Screen) -> Result:
     """Patterns shown on a bench and captured."""
+    from runtime.bundle.whole_files import whole_folder
     from trainer.captures.acquire import acquire_from
 
-    with screen.progress("capturing") as progress:
+    def capture(folder: Path) -> Result:
         taken = acquire_from(
-            args.bench, args.out, args.patterns, args.planes, args.channels, args.seed, progress, args.known
+            args.bench, folder, args.patterns, args.planes, args.channels, args.seed, progress, args.known
         )
-    return taken.as_json()
+        return taken.as_json()
+
+    with screen.progress("capturing") as progress:
+        if not args.overwrite:
+            return capture(args.out)
+        with whole_folder(args.out, replace=True) as new:
+            return {**capture(new), "folder": str(args.out)}
+
+
+def outputs(args: Namespace) -> list[Output]:
+    """The capture set."""
+    return [Output(args.out, contents=CAPTURES, makes_folders=True)]
 
 
 def show(result: Result, args: Namespace, screen: Screen) -> None:
@@ -77,6 +90,7 @@ COMMAND = Command(
     options=options,
     run=run,
     show=show,
+    outputs=outputs,
     examples=("capture --bench virtual:demo --out captures/",),
     after="See that the set is sound: check captures/",
 )

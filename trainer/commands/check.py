@@ -68,6 +68,7 @@ COMMAND = Command(
     options=captures_argument,
     run=run,
     show=show,
+    problems=lambda result: any(p["severity"] == "error" for p in result.get("problems", ())),
     examples=("check captures/",),
     after="Correct what it names, then see how far the ideal model is off: compare captures/",
 )

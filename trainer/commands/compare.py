@@ -13,7 +13,7 @@ from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
 from trainer.commands.inputs import captures_argument, inputs_of, model_options
 from trainer.commands.number_text import percent_text, small_text
-from trainer.commands.outputs import refuse_folder, report_option
+from trainer.commands.outputs import report_option, report_out
 from trainer.commands.workers import use_every_core
 
 MOST_ROWS = 12
@@ -40,7 +40,6 @@ def options(parser: ArgumentParser) -> None:
 
 def run(args: Namespace, screen: Screen) -> Result:
     """How far a model is from the captures."""
-    refuse_folder(args.report, "--report")
     captures, _, model = inputs_of(args)
     from dataclasses import replace
 
@@ -114,6 +113,7 @@ COMMAND = Command(
     options=options,
     run=run,
     show=show,
+    outputs=report_out,
     examples=("compare captures/ --model model.toml --report compare.html",),
     after="Ask what is missing: diagnose captures/ --model model.toml",
 )

@@ -7,7 +7,10 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from runtime.program.command import Command, Result
+from runtime.program.interrupt import Interrupted
+from runtime.program.outputs import Output, emptied
 from runtime.program.screen import Screen
+from trainer.commands.outputs import DEMO
 from trainer.commands.workers import worker_options
 
 
@@ -24,12 +27,38 @@ def options(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace, screen: Screen) -> Result:
-    """The whole way on a virtual bench."""
+    """The whole way on a virtual bench.
+
+    Raises
+    ------
+    Interrupted
+        After Ctrl-C, with a sentence on what is in the folder.
+    """
     from trainer.cycle.demo_run import run_demo
 
     folder = args.out or first_free(Path("hololoop-demo"))
-    with screen.progress("demo") as progress:
-        return dict(run_demo(folder, quick=args.quick, workers=args.workers, progress=progress))
+    if args.overwrite:
+        emptied(folder)
+    try:
+        with screen.progress("demo") as progress:
+            return dict(run_demo(folder, quick=args.quick, workers=args.workers, progress=progress))
+    except KeyboardInterrupt:
+        raise Interrupted(_interrupted(folder)) from None
+
+
+def _interrupted(folder: Path) -> str:
+    """What is left of a demo after Ctrl-C."""
+    from trainer.formatting import listed
+
+    there = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
+    if not there:
+        return "interrupted before anything was written"
+    return f"interrupted; {folder} holds {listed(there)}"
+
+
+def outputs(args: Namespace) -> list[Output]:
+    """The folder that was named; without one, a new name is found."""
+    return [Output(args.out, contents=DEMO, makes_folders=True)] if args.out else []
 
 
 def first_free(folder: Path) -> Path:
@@ -50,6 +79,7 @@ COMMAND = Command(
     options=options,
     run=run,
     show=show,
+    outputs=outputs,
     examples=("demo --quick",),
     after="Do the same with your own captures: check captures/",
 )

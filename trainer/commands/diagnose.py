@@ -10,7 +10,7 @@ from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
 from trainer.commands.inputs import captures_argument, inputs_of, model_options, refuse_misread
 from trainer.commands.number_text import sizes_text, small_text
-from trainer.commands.outputs import refuse_folder, report_option
+from trainer.commands.outputs import report_option, report_out
 from trainer.commands.thresholds import threshold_options, thresholds_of
 from trainer.commands.verdict_page import say_suggested, say_verdict, then_export, then_write_or_learn
 from trainer.commands.workers import worker_options, workers_of
@@ -29,7 +29,6 @@ def options(parser: ArgumentParser) -> None:
 
 def run(args: Namespace, screen: Screen) -> Result:
     """What is missing from a model."""
-    refuse_folder(args.report, "--report")
     thresholds = thresholds_of(args)
     captures, known, model = inputs_of(args)
     refuse_misread(args.captures, screen)
@@ -105,6 +104,7 @@ COMMAND = Command(
     options=options,
     run=run,
     show=show,
+    outputs=report_out,
     examples=("diagnose captures/ --model model.toml --report diagnosis.html",),
     after="Put in what is missing: add zero_order captures/ --out better.toml; or let explain do it.",
 )

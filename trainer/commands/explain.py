@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
+from firmware_iface.errors import InputError
 from runtime.program.command import Command, Result
 from runtime.program.interrupt import Interrupted, ctrl_c_waits
 from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
 from trainer.commands.inputs import captures_argument, inputs_of, model_options, origin, refuse_misread
 from trainer.commands.number_text import small_text
-from trainer.commands.outputs import out_option, refuse_folder, report_option
+from trainer.commands.outputs import model_out, out_option, report_option
 from trainer.commands.thresholds import threshold_options, thresholds_of
 from trainer.commands.verdict_page import say_suggested, say_verdict, then_export, then_write_or_learn
 from trainer.commands.workers import worker_options, workers_of
 
 if TYPE_CHECKING:
+    from trainer.effects.effect_catalogue import Catalogue
     from trainer.model.model import Model
 
 
@@ -25,7 +26,12 @@ def options(parser: ArgumentParser) -> None:
     """The options of `explain`."""
     captures_argument(parser)
     model_options(parser)
-    out_option(parser, "NEW.toml", "where the model goes; it is written after every effect that is added")
+    out_option(
+        parser,
+        "NEW.toml",
+        "where the model goes; it is written after every effect that is added, so that after Ctrl-C the work goes on "
+        "with the same command and --model NEW.toml --overwrite",
+    )
     report_option(parser)
     worker_options(parser)
     threshold_options(parser)
@@ -39,8 +45,6 @@ def run(args: Namespace, screen: Screen) -> Result:
     Interrupted
         After Ctrl-C, with a sentence on the model that is left.
     """
-    refuse_folder(args.out, "--out")
-    refuse_folder(args.report, "--report")
     thresholds = thresholds_of(args)
     captures, known, model = inputs_of(args)
     refuse_misread(args.captures, screen)
@@ -50,8 +54,14 @@ def run(args: Namespace, screen: Screen) -> Result:
 
     source = origin(captures)
     saved: list[tuple[str, ...]] = []
+    replaced = _excess_there(args, known)
 
-    def save(better: Model) -> None:
+    def save(better: Model, is_last: bool = False) -> None:
+        # The first one is the model that is started from, and another's may be better than the first of this.
+        excess = better.history[-1].get("excess") if better.history else None
+        worse = replaced is not None and isinstance(excess, float) and excess >= replaced
+        if not is_last and (better.names == model.names or worse):
+            return
         with ctrl_c_waits():
             write_model(args.out, better, source)
             saved.append(better.names)
@@ -59,7 +69,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     try:
         with screen.progress("explaining") as progress, open_pool(workers_of(args), args.cluster) as pool:
             found = explain(captures, model, known, pool, thresholds, save, progress)
-        save(found.model)
+        save(found.model, is_last=True)
         if args.report:
             from trainer.diagnosis.comparison import compare
             from trainer.report import write_report
@@ -73,7 +83,7 @@ def run(args: Namespace, screen: Screen) -> Result:
                 model=found.model,
             )
     except KeyboardInterrupt:
-        raise Interrupted(_interrupted(saved, model.names, args.out)) from None
+        raise Interrupted(_interrupted(saved, model.names, args)) from None
     return {**found.as_json(args.out), "effects": _sizes(found.model)}
 
 
@@ -92,14 +102,30 @@ def _sizes(model: Model) -> list[Result]:
     ]
 
 
-def _interrupted(saved: list[tuple[str, ...]], before: tuple[str, ...], out: Path) -> str:
+def _excess_there(args: Namespace, known: Catalogue) -> float | None:
+    """Held-out excess of the model that is replaced, where it is not the one that is started from and can be read."""
+    from trainer.model.model_file import read_model
+
+    if not args.out.is_file() or (args.model and args.out.samefile(args.model)):
+        return None
+    try:
+        history = read_model(args.out, known).history
+    except InputError:
+        return None
+    excess = history[-1].get("excess") if history else None
+    return excess if isinstance(excess, float) else None
+
+
+def _interrupted(saved: list[tuple[str, ...]], before: tuple[str, ...], args: Namespace) -> str:
     """What is left of an `explain` after Ctrl-C: `saved` are the effects of each model that was written."""
-    added = [name for name in saved[-1] if name not in before] if saved else []
-    if added:
-        return f"interrupted after adding {', '.join(added)}; the model so far is in {out}"
-    if saved:
-        return f"interrupted before anything was added; the model as it was is in {out}"
-    return "interrupted before anything was added; nothing was written"
+    out = args.out
+    if not saved:
+        kept = f"{out} is as it was" if out.exists() else "nothing was written"
+        return f"interrupted before anything was added; {kept}"
+    added = [name for name in saved[-1] if name not in before]
+    begin = f"interrupted after adding {', '.join(added)}" if added else "interrupted"
+    line = command_line("explain", args.captures, "--out", out, "--overwrite", args=args, model=out)
+    return f"{begin}; the model so far is in {out}; go on with: {line}"
 
 
 def show(result: Result, args: Namespace, screen: Screen) -> None:
@@ -143,6 +169,7 @@ COMMAND = Command(
     options=options,
     run=run,
     show=show,
+    outputs=model_out,
     examples=("explain captures/ --out model.toml --report explanation.html",),
     after="Give the model to the headset: export --model model.toml --out bundle/",
 )

@@ -6,11 +6,11 @@ import shlex
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from firmware_iface.errors import InputError
 from runtime.program.command import Command, Result
+from runtime.program.outputs import Output
 from runtime.program.screen import Screen
 from trainer.commands.inputs import effects_option
-from trainer.commands.outputs import out_option
+from trainer.commands.outputs import BUNDLE, out_option
 from trainer.commands.workers import use_every_core
 
 
@@ -35,8 +35,6 @@ def options(parser: ArgumentParser) -> None:
 
 def run(args: Namespace, screen: Screen) -> Result:
     """A model as a bundle for the headset."""
-    if args.out.exists() and not args.out.is_dir():
-        raise InputError(f"--out {args.out} is a file: give the name of a folder")
     from trainer.captures.capture_set import read_captures
     from trainer.effects.effect_catalogue import catalogue
     from trainer.model.bundle_export import export_bundle
@@ -45,7 +43,12 @@ def run(args: Namespace, screen: Screen) -> Result:
     captures = read_captures(args.captures) if args.captures else None
     model = read_model(args.model, catalogue(args.effects), captures.bench if captures else None)
     use_every_core()
-    return dict(export_bundle(model, captures, args.out, network=args.network))
+    return dict(export_bundle(model, captures, args.out, network=args.network, replace_folder=args.overwrite))
+
+
+def outputs(args: Namespace) -> list[Output]:
+    """The bundle."""
+    return [Output(args.out, contents=BUNDLE)]
 
 
 def show(result: Result, args: Namespace, screen: Screen) -> None:
@@ -64,6 +67,7 @@ COMMAND = Command(
     options=options,
     run=run,
     show=show,
+    outputs=outputs,
     examples=("export --model model.toml --out bundle/",),
     after="On the headset: hololoop-runtime solve bundle/ picture.png --out phase.png",
 )

@@ -8,7 +8,7 @@ from runtime.program.command import Command, Result
 from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
 from trainer.commands.inputs import captures_argument, inputs_of, model_options, origin
-from trainer.commands.outputs import out_option, refuse_folder
+from trainer.commands.outputs import model_out, out_option
 from trainer.commands.workers import use_every_core
 
 
@@ -21,7 +21,6 @@ def options(parser: ArgumentParser) -> None:
 
 def run(args: Namespace, screen: Screen) -> Result:
     """A field learned at the panel, in a model."""
-    refuse_folder(args.out, "--out")
     captures, _, model = inputs_of(args)
     from trainer.fitting.learned_field import learn_field
     from trainer.model.model_file import write_model
@@ -57,6 +56,7 @@ COMMAND = Command(
     options=options,
     run=run,
     show=show,
+    outputs=model_out,
     examples=("field captures/ --model model.toml --out learned.toml",),
     after="Learn what is left: train captures/ --model learned.toml --out run/; or export --model learned.toml",
 )

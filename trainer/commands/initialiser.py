@@ -7,8 +7,9 @@ from pathlib import Path
 
 from runtime.program.command import Command, Result
 from runtime.program.options import seed_option, whole
+from runtime.program.outputs import Output
 from runtime.program.screen import Screen
-from trainer.commands.outputs import out_option
+from trainer.commands.outputs import BUNDLE, out_option
 from trainer.commands.workers import use_every_core
 
 
@@ -34,8 +35,13 @@ def run(args: Namespace, screen: Screen) -> Result:
 
     use_every_core()
     with screen.progress("solving") as progress:
-        found = with_initialiser(args.bundle, args.steps, args.out, progress, args.seed)
+        found = with_initialiser(args.bundle, args.steps, args.out, progress, args.seed, args.overwrite)
     return {"bundle": str(args.out), "steps": args.steps, "heldout_psnr_db": found}
+
+
+def outputs(args: Namespace) -> list[Output]:
+    """The new bundle."""
+    return [Output(args.out, contents=BUNDLE)]
 
 
 def show(result: Result, args: Namespace, screen: Screen) -> None:
@@ -61,6 +67,7 @@ COMMAND = Command(
     options=options,
     run=run,
     show=show,
+    outputs=outputs,
     examples=("initialiser bundle/ --out bundle-started/",),
     after="Solve with it: hololoop-runtime solve bundle-started/ picture.png --iterations 3 --out pattern.png",
 )

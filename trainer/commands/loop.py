@@ -10,12 +10,13 @@ from firmware_iface.errors import InputError
 from runtime.commands.inputs import say_simulated
 from runtime.program.command import Command, Result
 from runtime.program.options import distances, number, seed_option, whole
+from runtime.program.outputs import Output, emptied
 from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
 from trainer.commands.inputs import model_options
 from trainer.commands.network_options import judge_options, size_options
 from trainer.commands.number_text import LIKENESS
-from trainer.commands.outputs import out_option
+from trainer.commands.outputs import ROUNDS, out_option
 from trainer.commands.workers import workers_of
 
 if TYPE_CHECKING:
@@ -112,8 +113,6 @@ def run(args: Namespace, screen: Screen) -> Result:
     recorded = [read_captures(folder) for folder in args.recorded]
     if args.bench is None and not recorded:
         raise InputError("there is nothing to learn from: give --bench BENCH, or --recorded CAPTURES")
-    if args.out.exists() and (not args.out.is_dir() or any(args.out.iterdir())):
-        raise InputError(f"--out {args.out} is there already and is not empty: give another folder")
     settings = _settings(args)
     known = recorded[0].bench if recorded else None
     model = read_model(args.model, catalogue(args.effects), known) if args.model else None
@@ -134,6 +133,7 @@ def run(args: Namespace, screen: Screen) -> Result:
             wanted = [in_depth(one, args.planes, depth) for one, depth in zip(wanted, depths, strict=True)]
         stage = None if headset is None else BenchDisplay(headset, bench, Model(bench))
         progress = stack.enter_context(screen.progress("the cycle"))
+        emptied(args.out)
         cycle = run_cycle(model, wanted, settings, args.out, stage, recorded, progress=progress)
     rounds = [{name: found.as_json() for name, found in one.items()} for one in cycle.history]
     return {
@@ -145,6 +145,11 @@ def run(args: Namespace, screen: Screen) -> Result:
         or any(one.extra.get("simulated") == "yes" for captures in recorded for one in captures.captures),
         "left_out": left_out(settings.recipe, settings.pretrained),
     }
+
+
+def outputs(args: Namespace) -> list[Output]:
+    """The folder of the rounds."""
+    return [Output(args.out, contents=ROUNDS, makes_folders=True)]
 
 
 def _depths(args: Namespace, bench: Bench, count: int) -> list[np.ndarray | None]:
@@ -222,6 +227,7 @@ COMMAND = Command(
     options=options,
     run=run,
     show=show,
+    outputs=outputs,
     examples=("loop --bench virtual:demo --rounds 2 --model model.toml --out loop/",),
     after="Give it to the headset: export --model model.toml --network loop/round-1/network.safetensors --out b/",
 )

@@ -1,11 +1,18 @@
-"""Where several commands write: --out and --report."""
+"""Where several commands write: --out and --report, and what the folders hold that they write."""
 
 from __future__ import annotations
 
-from argparse import ArgumentParser
+from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from firmware_iface.errors import InputError
+from runtime.program.outputs import Output, files_written
+
+BUNDLE = ("bundle.json", "*.safetensors", "*.onnx")
+CAPTURES = ("bench.toml", "captures.csv", "phase", "image")
+ROUNDS = ("round-*",)
+RUN = ("checkpoint.pt", "network.safetensors", "curves", "running")
+UNFINISHED_RUN = ("checkpoint.pt", "curves", "running")
+DEMO = ("captures", "model.toml", "model*.safetensors", "report.html", "bundle", "bundle-ideal", "patterns")
 
 
 def out_option(parser: ArgumentParser, metavar: str, what: str, required: bool = True) -> None:
@@ -20,17 +27,12 @@ def report_option(parser: ArgumentParser) -> None:
     )
 
 
-def refuse_folder(path: Path | None, option: str) -> None:
-    """Say early that an output cannot be written, before the work is done.
+def model_out(args: Namespace) -> list[Output]:
+    """The model that goes to --out, which may replace the one that it goes on from, and a report."""
+    model = Output(args.out, goes_on_from=args.model)
+    return [model, *files_written(report=getattr(args, "report", None))]
 
-    Raises
-    ------
-    InputError
-        Where the path is a folder, or is in a folder that is not there.
-    """
-    if path is None:
-        return
-    if path.is_dir():
-        raise InputError(f"{option} {path} is a folder: give the name of a file")
-    if not path.absolute().parent.is_dir():
-        raise InputError(f"{option} {path}: there is no folder {path.absolute().parent}; make it first")
+
+def report_out(args: Namespace) -> list[Output]:
+    """The report."""
+    return files_written(report=args.report)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from firmware_iface.errors import InputError
 from runtime.program.command import Command, Result
 from runtime.program.options import millimetres
+from runtime.program.outputs import Output, files_written
 from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
 from trainer.commands.outputs import out_option
@@ -70,6 +71,11 @@ def run(args: Namespace, screen: Screen) -> Result:
     return {"homography": found.tolist(), "bench": str(path), "spacing_px": args.spacing, "channel": channel}
 
 
+def outputs(args: Namespace) -> list[Output]:
+    """The pattern to show."""
+    return files_written(out=args.out)
+
+
 def _tables(path: Path) -> dict[str, Any]:
     try:
         return copy.deepcopy(tomllib.loads(path.read_text(encoding="utf-8")))
@@ -110,6 +116,7 @@ COMMAND = Command(
     options=options,
     run=run,
     show=show,
+    outputs=outputs,
     examples=("register captures/bench.toml --spacing 32 --out dots.png",),
     after="Show dots.png, take a picture of it, and give that: register captures/bench.toml picture.png",
 )

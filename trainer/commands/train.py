@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import os
 from argparse import ArgumentParser, Namespace
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from runtime.program.command import Command, Result
+from runtime.program.interrupt import Interrupted
 from runtime.program.options import number, seed_option, whole
+from runtime.program.outputs import Output, emptied
 from runtime.program.progress import part_of
 from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
 from trainer.commands.inputs import captures_argument, inputs_of, model_options
 from trainer.commands.network_options import judge_options, size_options
 from trainer.commands.number_text import LIKENESS
-from trainer.commands.outputs import out_option
+from trainer.commands.outputs import RUN, UNFINISHED_RUN, out_option
 from trainer.commands.workers import use_every_core
 
 if TYPE_CHECKING:
@@ -63,12 +66,58 @@ def options(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace, screen: Screen) -> Result:
-    """A network trained on a capture set, beyond what the model explains."""
+    """A network trained on a capture set, beyond what the model explains.
+
+    Raises
+    ------
+    Interrupted
+        After Ctrl-C, with a sentence on what is in the folder of the run.
+    """
+    from contextlib import nullcontext
+
+    from trainer.training.run_lock import only_run
+
+    args.out.mkdir(parents=True, exist_ok=True)
+    first = not int(os.environ.get("RANK", "0"))  # of several processes, the first one writes
+    steps_done = 0
+
+    def stepped(step: int) -> None:
+        nonlocal steps_done
+        steps_done = step
+
+    try:
+        with only_run(args.out) if first else nullcontext():
+            result = _train(args, screen, first, stepped)
+    except KeyboardInterrupt:
+        raise Interrupted(_interrupted(args.out, steps_done // args.every * args.every)) from None
+    if not first:
+        raise SystemExit(0)  # the first one reports
+    return result
+
+
+def outputs(args: Namespace) -> list[Output]:
+    """The folder of the run; an unfinished run of the same settings is continued."""
+    return [Output(args.out, contents=RUN, resumed_by=UNFINISHED_RUN, makes_folders=True)]
+
+
+def _interrupted(folder: Path, saved: int) -> str:
+    """What is left of a training after Ctrl-C; `saved` is the step of the last checkpoint, 0 where none is known."""
+    from trainer.training.checkpoint import CHECKPOINT
+
+    if not (folder / CHECKPOINT).is_file():
+        return f"interrupted before the first checkpoint; there is no network in {folder} yet"
+    where = f" at step {saved}" if saved else ""
+    return f"interrupted; the checkpoint{where} is {folder / CHECKPOINT}, and the same command goes on from there"
+
+
+def _train(args: Namespace, screen: Screen, first: bool, stepped: Callable[[int], None]) -> Result:
+    """Train, and compare with what the camera saw; the later processes of several return nothing."""
     from dataclasses import asdict
 
     from trainer.networks.approximator import read_approximator
     from trainer.training.image_metrics import noise_floor, prediction_metrics
     from trainer.training.pretrained_networks import left_out, read_pretrained
+    from trainer.training.run_lock import RUNNING
     from trainer.training.training_run import NETWORK, train
     from trainer.training.training_sets import training_sets
 
@@ -76,20 +125,25 @@ def run(args: Namespace, screen: Screen) -> Result:
     judges = read_pretrained(args.vgg, args.lpips)
     captures, _, model = inputs_of(args)
     use_every_core()
-    args.out.mkdir(parents=True, exist_ok=True)
     with screen.progress("predicting") as progress:
         sets = training_sets(
             captures, model, args.ideal, part_of(progress, 0, 1, "predicting what the model says")
         )
     teacher = read_approximator(args.distill)[0] if args.distill else None
+    if args.overwrite and first:
+        emptied(args.out, keep=RUNNING)
     with screen.progress("training") as progress:
+
+        def say(step: int, loss: float) -> None:
+            stepped(step)
+            progress(step / args.steps, f"step {step} of {args.steps}, loss {loss:.3g}")
+
         network = train(
             sets.fitted, recipe, args.steps, args.out, sets.held_out, judges, teacher=teacher, seed=args.seed,
-            every=args.every, about=sets.about,
-            progress=lambda step, loss: progress(step / args.steps, f"step {step} of {args.steps}, loss {loss:.3g}"),
+            every=args.every, about=sets.about, progress=say,
         )  # fmt: skip
-    if int(os.environ.get("RANK", "0")):
-        raise SystemExit(0)  # of several processes, the first one reports
+    if not first:
+        return {}
     return {
         "network": str(args.out / NETWORK),
         "recipe": asdict(recipe),
@@ -146,6 +200,7 @@ COMMAND = Command(
     options=options,
     run=run,
     show=show,
+    outputs=outputs,
     examples=("train captures/ --model model.toml --out run/",),
     after="See where it helps: compare captures/ --model model.toml --network run/network.safetensors",
 )

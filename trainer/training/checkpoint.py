@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,10 @@ def write_checkpoint(folder: Path, settings: dict[str, Any], state: dict[str, An
     state : dict
         Its step, and weights and optimiser of each network.
     """
+    data = io.BytesIO()  # since torch says of a full disk that it is an error of its own
+    torch.save({"settings": settings, **state}, data)
     with whole_file(folder / CHECKPOINT) as file:
-        torch.save({"settings": settings, **state}, file)
+        file.write(data.getbuffer())
 
 
 def read_checkpoint(folder: Path, settings: dict[str, Any], device: torch.device) -> dict[str, Any] | None:
@@ -49,7 +52,7 @@ def read_checkpoint(folder: Path, settings: dict[str, Any], device: torch.device
     if _plain(before) != _plain(settings):
         wrong = next(k for k in {**before, **settings} if _plain(before.get(k)) != _plain(settings.get(k)))
         raise InputError(
-            f"{folder} holds a training with another {wrong}: give another --out, or remove the folder"
+            f"{folder} holds a training with another {wrong}: give another --out, or --overwrite to begin anew"
         )
     return state
 

@@ -86,7 +86,7 @@ def train_initialiser(
 
 
 def with_initialiser(
-    folder: Path, steps: int, out: Path, progress: Progress, seed: int = 0
+    folder: Path, steps: int, out: Path, progress: Progress, seed: int = 0, replace: bool = False
 ) -> dict[str, list[float]]:
     """Train for a bundle and write the bundle again with the network in it.
 
@@ -96,6 +96,8 @@ def with_initialiser(
         Of the bundle, and of the new one.
     steps, progress, seed
         As of `train_initialiser`.
+    replace : bool
+        Replace a folder that is not empty.
 
     Returns
     -------
@@ -107,7 +109,7 @@ def with_initialiser(
     files = dict(bundle.networks) | {
         INITIALISER: initialiser_onnx(network, load_light_path(bundle).grid.shape)
     }
-    write_bundle(out, bundle.arrays, bundle.description, bundle.provenance, networks=files)
+    write_bundle(out, bundle.arrays, bundle.description, bundle.provenance, networks=files, replace=replace)
     return psnr_db
 
 

@@ -244,7 +244,7 @@ def test_the_command_refines_a_picture_and_changes_neither_bundle_nor_lasers(
     assert {p.name: p.read_bytes() for p in bundle.iterdir()} == before
 
     write_bundle(bundle, arrays, {"paths": records, "distance_mm": DISTANCE_MM}, {}, replace=True)
-    assert main(["refine", *map(str, words)]) == 2
+    assert main(["refine", *map(str, words), "--overwrite"]) == 2
     assert "no approximator" in capsys.readouterr().err
 
 

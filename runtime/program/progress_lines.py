@@ -1,0 +1,57 @@
+"""Progress as lines, where no bar can move: one now and then."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+EVERY_S = 10.0  # seconds between two lines
+EVERY_STEP_S = 1.0  # seconds between two lines of `--verbose` and `--log`, where steps are fast
+
+
+class ProgressLines:
+    """A progress callback that says how far the work is, in lines.
+
+    Parameters
+    ----------
+    title : str
+        What is said where the work does not say what it does.
+    say : callable
+        Takes each line.
+    every_s : float, s
+        Time between two lines; nothing is said of what takes less.
+    each_step : bool
+        A line also when something else is done than before.
+    clock : callable
+        Gives a time in seconds.
+    """
+
+    def __init__(
+        self,
+        title: str,
+        say: Callable[[str], None],
+        every_s: float = EVERY_S,
+        each_step: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._title, self._say, self._every_s, self._each_step, self._clock = (
+            title,
+            say,
+            every_s,
+            each_step,
+            clock,
+        )
+        self._begin = self._last = clock()
+        self._what = ""
+
+    def __call__(self, done: float, what: str = "") -> None:
+        """Say how far the work is, if it is time to."""
+        now = self._clock()
+        changed = (
+            self._each_step and what != self._what and (not self._what or now - self._last >= EVERY_STEP_S)
+        )
+        if now - self._last < self._every_s and not changed:
+            return
+        self._last, self._what = now, what
+        share = min(max(done, 0.0), 1.0)
+        self._say(f"{100 * share:.0f} % {what or self._title} ({now - self._begin:.0f} s)")
