@@ -54,9 +54,9 @@ def repaint(folder: Path, change: object, names: str = "*") -> None:
 
 
 def test_a_sound_set_has_no_problems(made: CaptureSet) -> None:
-    steps: list[tuple[int, int]] = []
-    assert check_captures(made.folder, ideal_irradiance, lambda done, of: steps.append((done, of))) == []
-    assert steps == [(n, 6) for n in range(1, 7)]
+    shares: list[float] = []
+    assert check_captures(made.folder, ideal_irradiance, lambda done, what="": shares.append(done)) == []
+    assert shares == [n / 6 for n in range(1, 7)]
 
 
 @pytest.mark.parametrize(
