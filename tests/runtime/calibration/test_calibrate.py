@@ -40,7 +40,7 @@ class CommandRun:
 
 def run(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, Any]:
     capsys.readouterr()
-    code = main(["calibrate", *map(str, words), "--json"])
+    code = main(["calibrate", *map(str, words), "--json", "--quiet"])
     out, err = capsys.readouterr()
     assert (code, err) == (0, "")
     result: dict[str, Any] = json.loads(out)
