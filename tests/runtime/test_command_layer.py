@@ -314,5 +314,5 @@ def test_a_part_of_the_work_says_its_share_of_the_whole() -> None:
     said: list[tuple[float, str]] = []
     part = part_of(lambda done, what="": said.append((done, what)), 0.6, 1.0, "the rest")
     part(0)
-    part(0.5, "half of the rest")
-    assert said == [(pytest.approx(0.6), "the rest"), (pytest.approx(0.8), "half of the rest")]
+    part(0.5, "half of it")
+    assert said == [(pytest.approx(0.6), "the rest"), (pytest.approx(0.8), "the rest: half of it")]

@@ -240,3 +240,33 @@ def test_nothing_in_the_files_raises(made: CaptureSet, copy: Path, data: st.Data
 def test_practice_sets_are_clean(shared: Path) -> None:
     for folder in sorted((shared / "practice").iterdir()):
         assert check_captures(folder, ideal_irradiance) == []
+
+
+def test_images_beside_the_wrong_patterns_are_named_with_the_pattern_they_fit(
+    made: CaptureSet, tmp_path: Path
+) -> None:
+    folder = tmp_path / "swapped"
+    shutil.copytree(made.folder, folder)
+    images = sorted((folder / "image").glob("*.png"))
+    one, other = images[1], images[4]
+    first, second = one.read_bytes(), other.read_bytes()
+    one.write_bytes(second)
+    other.write_bytes(first)
+    found = [p for p in check_captures(folder, ideal_irradiance) if p.kind == "mismatched"]
+    ids = {c.image.name: c.capture for c in made.captures}
+    assert {p.capture for p in found} == {ids[one.name], ids[other.name]}
+    assert all(p.severity == "error" for p in found)
+    assert f"fits the pattern of capture {ids[other.name]}" in next(
+        p.message for p in found if p.capture == ids[one.name]
+    )
+
+
+def test_noise_in_place_of_all_images_fits_no_pattern(made: CaptureSet, tmp_path: Path) -> None:
+    folder = tmp_path / "noise"
+    shutil.copytree(made.folder, folder)
+    rng = np.random.default_rng(0)
+    for path in (folder / "image").glob("*.png"):
+        shape = np.asarray(Image.open(path)).shape
+        Image.fromarray(rng.integers(100, 3000, shape).astype(np.uint16)).save(path)
+    kinds = {p.kind for p in check_captures(folder, ideal_irradiance)}
+    assert "no_correlation" in kinds and "mismatched" not in kinds

@@ -20,6 +20,7 @@ from trainer.captures.camera_noise import RepeatNoise, compare_repeats
 from trainer.captures.capture_table import Capture, scan_rows
 from trainer.captures.check_counts import check_bits, check_black_level, check_brightness
 from trainer.captures.conventions import Predict, Sample, compare_conventions
+from trainer.captures.mismatches import mismatched
 from trainer.captures.png_reader import PictureError, read_picture
 from trainer.captures.problems import Problem
 
@@ -196,16 +197,26 @@ def _convention(bench: Bench, statistics: _SetStatistics, predict: Predict) -> l
     samples = []
     for place in sorted({round(i) for i in np.linspace(0, len(distinct) - 1, min(3, len(distinct)))}):
         capture = distinct[place]
-        gray, counts = _load(capture, bench, statistics)
-        samples.append(
-            Sample(
-                capture.capture,
-                gray,
-                counts.astype(np.float32) - bench.camera.black_level,
-                counts < bench.camera.saturation,
-                capture.channel,
-                capture.plane_mm,
-            )
-        )
+        samples.append(_sample(capture, bench, statistics))
     found = compare_conventions(bench, samples, predict, quick=True)
-    return [Problem("error", "convention", "", found.change)] if found.decisive else []
+    if found.decisive:
+        return [Problem("error", "convention", "", found.change)]
+    return _mismatches(bench, statistics, distinct, predict)
+
+
+def _mismatches(
+    bench: Bench, statistics: _SetStatistics, distinct: list[Capture], predict: Predict
+) -> list[Problem]:
+    """Images that stand next to the wrong patterns, a colour and plane at a time."""
+    problems = []
+    for channel, plane in dict.fromkeys((c.channel, c.plane_mm) for c in distinct):
+        rows = [c for c in distinct if (c.channel, c.plane_mm) == (channel, plane)]
+        samples = (_sample(capture, bench, statistics) for capture in rows)
+        problems += mismatched(bench, samples, predict)
+    return problems
+
+
+def _sample(capture: Capture, bench: Bench, statistics: _SetStatistics) -> Sample:
+    gray, counts = _load(capture, bench, statistics)
+    signal, valid = counts.astype(np.float32) - bench.camera.black_level, counts < bench.camera.saturation
+    return Sample(capture.capture, gray, signal, valid, capture.channel, capture.plane_mm)

@@ -139,16 +139,16 @@ def compare_conventions(
     tiles: dict[tuple[str, int], list[np.ndarray]] = {}
     shifts: dict[tuple[str, int], list[tuple[int, int]]] = {}
     for sample in samples:
-        near, gray, image, valid, core = _central(bench, sample)
+        near, gray, image, valid, core = central_part(bench, sample)
         for sign in (stated_sign, -stated_sign):
             model = replace(near, panel=replace(near.panel, phase_sign=sign))
             made = np.asarray(predict(model, gray, sample.channel, sample.plane_mm), dtype=np.float32)[core]
-            flat = _flattened(made, np.ones(made.shape, bool))
+            flat = flattened(made, np.ones(made.shape, bool))
             for turn in TURNS:
                 observed, good = turned(image, turn), turned(valid, turn)
                 if observed.shape != made.shape:
                     continue
-                values, shift = _tile_correlations(_flattened(observed, good), good, flat)
+                values, shift = tile_correlations(flattened(observed, good), good, flat)
                 tiles.setdefault((turn, sign), []).append(values)
                 shifts.setdefault((turn, sign), []).append(shift)
             if quick and R_RATIO * float(np.mean(tiles["as_stated", stated_sign][0])) > 1:
@@ -164,7 +164,7 @@ def _conclude(
     joined = {key: np.concatenate(values) for key, values in tiles.items()}
     reference = joined["as_stated", stated_sign]
     scores = [
-        Score(turn, sign, float(np.mean(values)), tuple(shifts[turn, sign]), _paired_t(values, reference))
+        Score(turn, sign, float(np.mean(values)), tuple(shifts[turn, sign]), paired_t(values, reference))
         for (turn, sign), values in joined.items()
     ]
     scores.sort(key=lambda score: -score.correlation)
@@ -181,7 +181,7 @@ def _conclude(
         for s in scores[1:]
         if decisive
         and s.correlation * R_RATIO > best.correlation
-        and _paired_t(joined[best.turn, best.phase_sign], joined[s.turn, s.phase_sign]) < T_LEVEL
+        and paired_t(joined[best.turn, best.phase_sign], joined[s.turn, s.phase_sign]) < T_LEVEL
     )
     change = _change(best, stated, alike) if decisive else ""
     return Convention(best, stated, decisive, change, tuple(scores), alike)
@@ -213,7 +213,7 @@ def _steps(score: Score, stated: Score) -> str:
     return " and ".join(steps) or "leave everything as stated"
 
 
-def _central(
+def central_part(
     bench: Bench, sample: Sample
 ) -> tuple[Bench, np.ndarray, np.ndarray, np.ndarray, tuple[slice, slice]]:
     """A large registered capture, cut to its centre and what diffracts into it.
@@ -253,7 +253,7 @@ def _central(
     )
 
 
-def _flattened(image: np.ndarray, valid: np.ndarray) -> np.ndarray:
+def flattened(image: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Amplitude without its slow variation, slightly blurred, zero where not valid; float32 [h, w]."""
     amplitude = np.sqrt(np.maximum(image, 0)).astype(np.float32)
     amplitude = gaussian_filter(amplitude, 0.7, mode="nearest")
@@ -264,7 +264,7 @@ def _flattened(image: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return np.where(valid, detail / (spread + floor), 0).astype(np.float32)
 
 
-def _tile_correlations(
+def tile_correlations(
     image: np.ndarray, valid: np.ndarray, model: np.ndarray
 ) -> tuple[np.ndarray, tuple[int, int]]:
     """Correlation of each tile, at the shift (row, column) within WINDOW that fits the whole best."""
@@ -293,7 +293,7 @@ def _tile_correlations(
     return np.asarray(values), shift
 
 
-def _paired_t(values: np.ndarray, reference: np.ndarray) -> float:
+def paired_t(values: np.ndarray, reference: np.ndarray) -> float:
     """t-statistic of the mean difference of Fisher's z over tiles; 0 with fewer than four tiles."""
     if len(values) != len(reference) or len(values) < 4:
         return 0.0

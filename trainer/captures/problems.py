@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-MISREAD = ("convention", "left_justified", "bit_depth")  # kinds of problem after which every number is wrong
+MISREAD = (
+    "convention",
+    "left_justified",
+    "bit_depth",
+    "mismatched",
+)  # kinds of problem after which every number is wrong
 
 
 @dataclass(frozen=True)
@@ -17,7 +22,7 @@ class Problem:
         "error" or "warning".
     kind : str
         missing_file, wrong_size, saturated, left_justified, black_level, duplicate, too_few, unknown_channel,
-        unreadable, bit_depth, not_a_number, noise, pattern, no_signal or convention.
+        unreadable, bit_depth, not_a_number, noise, pattern, no_signal, convention, mismatched or no_correlation.
     capture : str
         The capture's id; "" for the whole set.
     message : str
