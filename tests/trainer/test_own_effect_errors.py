@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from trainer.cli import main
-from trainer.effects import testing
+from trainer.effects import effect_catalogue, testing
 from trainer.effects.effect_catalogue import load_effects
 
 HEAD = """import math
@@ -184,8 +184,14 @@ def test_what_starts_and_measure_did_is_said_with_the_line(
     "text", [effect_text("raise ValueError('odd')"), starting("raise ValueError('odd')")]
 )
 def test_diagnose_ends_with_it_wherever_it_happens(
-    text: str, workers: int, captures: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    text: str,
+    workers: int,
+    captures: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
+    monkeypatch.setattr(effect_catalogue, "BUILT_IN", effect_catalogue.BUILT_IN[:1])  # to be quick
     own = tmp_path / "own.py"
     own.write_text(text)
     said = refusal(capfd, "diagnose", captures, "--effects", own, "--workers", workers)
