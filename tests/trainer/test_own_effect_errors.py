@@ -233,6 +233,16 @@ def test_a_file_that_cannot_be_run_is_said_with_its_line(
     assert says in said
 
 
+@pytest.mark.parametrize("wrong", ["absent=lambda bench: bench.nothing", "count=lambda order: order / 0"])
+def test_a_parameters_function_is_said_with_its_line(
+    wrong: str, captures: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    own, text = tmp_path / "own.py", effect_text().replace("low=-1", f"{wrong}, low=-1")
+    own.write_text(text)
+    said = refusal(capfd, "add", "odd", captures, "--effects", own, "--out", tmp_path / "model.toml")
+    assert f"a Parameter of effect 'odd' ({own}, line {line_with(text, wrong)}): " in said
+
+
 def test_forms_that_broadcast_are_taken(captures: Path, tmp_path: Path) -> None:
     own, out = tmp_path / "own.py", tmp_path / "model.toml"
     own.write_text(

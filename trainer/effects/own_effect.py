@@ -118,6 +118,22 @@ def line_in_file(error: BaseException, file: str) -> int | None:
 
 
 @contextmanager
+def parameters_of(effect: Effect) -> Iterator[None]:
+    """A block that computes the shapes and absent values of the effect's parameters.
+
+    Raises
+    ------
+    OwnEffectError
+        Where a function in a user's Parameter fails.
+    """
+    if effect.source == BUILT_IN:
+        yield
+        return
+    with _located(effect, effect.apply, "a Parameter"):
+        yield
+
+
+@contextmanager
 def _located(effect: Effect, function: Callable[..., Any], role: str = "") -> Iterator[None]:
     """A block that calls a user's function: its errors name the effect, the file and the line."""
     try:
