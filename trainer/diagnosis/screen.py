@@ -18,6 +18,7 @@ from trainer.captures.batches import Batch, load
 from trainer.captures.capture_set import chosen, opened
 from trainer.effects.definition import Effect
 from trainer.effects.evidence import Evidence
+from trainer.effects.own_effect import starts_of
 from trainer.fitting.jacobian import keys_of, slopes_of, weighted_residuals
 from trainer.fitting.least_squares_gain import with_gain
 from trainer.fitting.predictor import Predictor
@@ -103,7 +104,7 @@ def _start(effect: Effect, model: Model, predictors: list[Predictor], points: li
         for predictor, point in zip(predictors, points, strict=True):
             prediction = predictor.counts(model, predictor.light(model, point))
             evidence.append(Evidence(predictor.scene, predictor.batch, prediction))
-        starts += [instance_with(effect, model.bench, values) for values in effect.starts(evidence)]
+        starts += [instance_with(effect, model.bench, values) for values in starts_of(effect, evidence)]
     if len(starts) == 1:
         return starts[0]
     # A start need only be near: one colour and plane are enough.

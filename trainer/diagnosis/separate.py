@@ -9,6 +9,7 @@ import torch
 from firmware_iface.errors import InputError
 from trainer.captures.batches import Batch, load_batch
 from trainer.captures.held_out import CaptureRoles
+from trainer.effects.own_effect import OwnEffectError
 from trainer.fitting.predictor import Predictor
 from trainer.model.model import Model
 
@@ -47,6 +48,8 @@ def captures_that_separate(
     for words, moved in proposals:
         try:
             there = _difference(one[1], other[1], moved)
+        except OwnEffectError:
+            raise
         except InputError:  # the sampling does not reach this plane
             continue
         if there > max(3 * here, 1e-4):

@@ -7,7 +7,6 @@ import difflib
 import hashlib
 import importlib.util
 import sys
-import traceback
 from collections.abc import Iterable
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -16,6 +15,7 @@ from types import ModuleType
 from firmware_iface.errors import InputError
 from trainer.effects import drive, panel, pupil, sensor
 from trainer.effects.definition import Effect
+from trainer.effects.own_effect import line_in_file
 
 ENTRY_POINTS = "hololoop.effects"
 
@@ -115,8 +115,12 @@ def _of_entry_point(point: EntryPoint) -> list[Effect]:
     where = f"entry point '{point.name}' ({point.value})"
     try:
         loaded = point.load()
-    except Exception as error:
-        raise InputError(f"{where} cannot be loaded ({error}): repair or uninstall its package") from error
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # SystemExit, too
+        raise InputError(
+            f"{where} cannot be loaded ({type(error).__name__}: {error}): repair or uninstall its package"
+        ) from error
     found = _defined_in(loaded) if isinstance(loaded, ModuleType) else loaded
     if isinstance(found, Effect):
         return [found]
@@ -152,13 +156,18 @@ def load_effects(path: Path) -> list[Effect]:
         sys.modules.setdefault(former, importlib.import_module(present))
     try:
         spec.loader.exec_module(module)
-    except InputError as error:
-        raise InputError(f"effects file {path}: {error}") from error
-    except Exception as error:
-        inside = [f for f in traceback.extract_tb(error.__traceback__) if f.filename == str(path)]
-        line = f", line {inside[-1].lineno}" if inside else ""
-        line = f", line {error.lineno}" if isinstance(error, SyntaxError) else line
-        raise InputError(f"effects file {path}{line}: {type(error).__name__}: {error}") from error
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # SystemExit, too: the file does not end this program
+        line = line_in_file(error, spec.origin or str(path))
+        where = f"effects file {path}" + ("" if line is None else f", line {line}")
+        if isinstance(error, InputError):
+            raise InputError(f"{where}: {error}") from error
+        if isinstance(error, SystemExit):
+            raise InputError(
+                f"{where}: it ends the program (SystemExit): let the file define effects and nothing else"
+            ) from error
+        raise InputError(f"{where}: {type(error).__name__}: {error}") from error
     own = _defined_in(module)
     if not own:
         raise InputError(

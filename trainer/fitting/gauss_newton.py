@@ -20,6 +20,7 @@ from runtime.program.progress import Progress
 from trainer.captures.batches import Batch
 from trainer.effects.definition import STAGES
 from trainer.effects.evidence import Evidence
+from trainer.effects.own_effect import measured_by
 from trainer.fitting.jacobian import keys_of, slopes_of, stepped, weighted_residuals
 from trainer.fitting.least_squares_gain import with_gain
 from trainer.fitting.predictor import Predictor
@@ -134,7 +135,7 @@ def _measured(model: Model, free: Sequence[str], batches: Sequence[Batch]) -> Mo
         evidence = [
             Evidence(p.scene, p.batch, p.predict(without)) for p in (Predictor(without, b) for b in batches)
         ]
-        read = present.effect.measure(evidence)
+        read = measured_by(present.effect, evidence, present.order)
         values = {n: np.full_like(v, read[n]) if n in read else v for n, v in present.values.items()}
         model = model.having(replace(present, values=values))
     return model

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from trainer.captures.bench_file import Bench
 from trainer.effects.definition import Effect
+from trainer.effects.own_effect import parameters_of
 from trainer.prediction.panel_field import NAME
 
 Values = dict[str, np.ndarray]
@@ -100,10 +101,11 @@ def absent(effect: Effect, bench: Bench, order: int | None = None) -> EffectInst
     """The effect at the values at which it changes nothing, at its lowest order unless another is given."""
     order = effect.orders[0] if order is None else order
     channels = len(bench.channels)
-    values = {
-        p.name: np.full(p.shape(order, channels), p.absent_value(bench), dtype=np.float64)
-        for p in effect.parameters
-    }
+    with parameters_of(effect):
+        values = {
+            p.name: np.full(p.shape(order, channels), p.absent_value(bench), dtype=np.float64)
+            for p in effect.parameters
+        }
     return EffectInstance(effect, order, values)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from trainer.captures.bench_file import Bench
+from trainer.effects.own_effect import applied
 from trainer.model.model import EffectInstance, Model
 from trainer.prediction.panel_field import with_field
 from trainer.prediction.predict import light_on_camera, trace
@@ -38,6 +39,11 @@ def stages_for(scene: Scene, present: tuple[EffectInstance, ...], tensors: Any =
     ----------
     tensors : mapping, optional
         {effect name: {parameter: tensor}} of values to differentiate; the others are taken from `present`.
+
+    Raises
+    ------
+    InputError
+        Where an effect of the user's own fails: with its file and line.
     """
     stages = bare_stages(scene)
     row = scene.channel_row()
@@ -52,7 +58,7 @@ def stages_for(scene: Scene, present: tuple[EffectInstance, ...], tensors: Any =
         if one.effect.takes_order:
             arguments["order"] = one.order
         stage = one.effect.stage
-        stages = replace(stages, **{stage: one.effect.apply(getattr(stages, stage), **arguments)})
+        stages = replace(stages, **{stage: applied(one.effect, getattr(stages, stage), arguments)})
     return stages
 
 
