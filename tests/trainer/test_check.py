@@ -248,7 +248,7 @@ def test_images_beside_the_wrong_patterns_are_named_with_the_pattern_they_fit(
     folder = tmp_path / "swapped"
     shutil.copytree(made.folder, folder)
     images = sorted((folder / "image").glob("*.png"))
-    one, other = images[1], images[4]
+    one, other = images[2], images[4]
     first, second = one.read_bytes(), other.read_bytes()
     one.write_bytes(second)
     other.write_bytes(first)

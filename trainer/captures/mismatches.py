@@ -58,8 +58,10 @@ def mismatched(bench: Bench, samples: Iterable[Sample], predict: Predict) -> lis
     own = [tile_correlations(*images[k], predictions[k])[0] for k in range(count)]
     means = [float(np.mean(values)) for values in own]
     best = max(means, default=0.0)
-    suspects = [k for k in range(count) if means[k] < max(SUSPECT * best, R_LEAST)][:MOST_SUSPECTS]
-    found, fits_some = [], best >= R_LEAST
+    # A few pixels correlate by chance, at the best of many shifts: with about one independent sample in four pixels.
+    least = max(R_LEAST, 5 * float(np.sqrt(4 / max(predictions[0].size, 1)))) if predictions else R_LEAST
+    suspects = [k for k in range(count) if means[k] < max(SUSPECT * best, least)][:MOST_SUSPECTS]
+    found, fits_some = [], best >= least
     for k in suspects:
         others = [j for j in range(count) if j != k]
         values = {j: tile_correlations(*images[k], predictions[j])[0] for j in others}
@@ -67,7 +69,7 @@ def mismatched(bench: Bench, samples: Iterable[Sample], predict: Predict) -> lis
         if nearest is None:
             continue
         there = float(np.mean(values[nearest]))
-        decisive = there >= R_LEAST and there >= R_RATIO * max(means[k], 0.0)
+        decisive = there >= least and there >= R_RATIO * max(means[k], 0.0)
         if decisive and paired_t(values[nearest], own[k]) > T_LEVEL:
             fits_some = True
             found.append(_problem(names[k], names[nearest], means[k], there))
