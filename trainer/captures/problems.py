@@ -17,7 +17,7 @@ class Problem:
         "error" or "warning".
     kind : str
         missing_file, wrong_size, saturated, left_justified, black_level, duplicate, too_few, unknown_channel,
-        unreadable, bit_depth, not_a_number, noise, pattern, no_signal or convention.
+        unreadable, bit_depth, not_a_number, noise, pattern, dark, no_signal or convention.
     capture : str
         The capture's id; "" for the whole set.
     message : str
