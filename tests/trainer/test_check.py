@@ -204,6 +204,12 @@ def test_noisy_repeats_and_a_repeat_that_is_none(copy: Path, made: CaptureSet) -
 def test_a_dark_picture_is_noticed(copy: Path) -> None:
     rng = np.random.default_rng(5)
     repaint(copy, lambda a: np.round(rng.normal(64, 1.9, a.shape)).astype(np.uint16), "0003")
+    assert found(copy) == [("error", "dark", "0003")]
+
+
+def test_a_flat_picture_with_some_light_is_not_dark(copy: Path) -> None:
+    rng = np.random.default_rng(5)
+    repaint(copy, lambda a: np.round(rng.normal(74, 1.9, a.shape)).astype(np.uint16), "0003")
     assert found(copy) == [("warning", "no_signal", "0003")]
 
 

@@ -23,6 +23,7 @@ from firmware_iface.errors import InputError
 from trainer.captures.bench_file import Bench, read_bench
 from trainer.captures.camera_noise import noise_variance
 from trainer.captures.capture_table import Capture, scan_rows
+from trainer.captures.equal_patterns import one_name_each
 from trainer.captures.png_reader import read_picture
 
 
@@ -155,7 +156,9 @@ class CaptureSet:
 
 
 def read_captures(folder: Path | str) -> CaptureSet:
-    """The capture set in a folder; its pictures must exist but are not opened.
+    """The capture set in a folder; its pictures must exist but are not decoded.
+
+    Captures of one channel that show the same gray levels are of one pattern, whatever captures.csv calls them.
 
     Parameters
     ----------
@@ -177,7 +180,7 @@ def read_captures(folder: Path | str) -> CaptureSet:
     captures, faults = scan_rows(folder, bench)
     if faults:
         raise InputError(faults[0].message)
-    return CaptureSet(folder, bench, tuple(captures))
+    return CaptureSet(folder, bench, tuple(one_name_each(captures)))
 
 
 def opened(folder: Path) -> CaptureSet:

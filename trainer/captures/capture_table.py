@@ -30,7 +30,7 @@ class Capture:
     plane_mm : float, mm
         Panel to image plane, as set on the bench.
     pattern : str
-        Rows of one pattern show the same gray levels.
+        Rows of one pattern show the same gray levels. `read_captures` gives rows with the same gray levels one name.
     phase, image : Path
         The panel's pattern and the camera's picture, absolute.
     exposure_ms : float, ms

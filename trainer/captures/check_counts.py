@@ -9,6 +9,7 @@ import numpy as np
 from trainer.captures.bench_file import Camera
 from trainer.captures.camera_noise import RepeatNoise, black_estimate, noise_variance
 from trainer.captures.problems import Problem
+from trainer.captures.signal_present import DARK, fault_of
 
 SATURATED_SHARE = 0.03  # of the pixels at the top count
 DARK_SHARE = 1e-3  # of the pixels that lie well below the stated black level
@@ -77,7 +78,7 @@ def check_bits(counts: np.ndarray, camera: Camera, name: str) -> tuple[int, list
 
 
 def check_brightness(counts: np.ndarray, camera: Camera, name: str) -> list[Problem]:
-    """What is wrong with the brightness of one picture, uint16 [h, w]: saturated, or without any signal."""
+    """What is wrong with the brightness of one picture, uint16 [h, w]: saturated, dark, or without contrast."""
     top = int(counts.max())
     share = float((counts == camera.saturation).mean())
     if share > SATURATED_SHARE:
@@ -102,6 +103,16 @@ def check_brightness(counts: np.ndarray, camera: Camera, name: str) -> list[Prob
                 f"{100 * share:.1f} % of the pixels of capture {name} "
                 f"pile up at {top}, below camera.bit_depth's top count {camera.saturation}: take it "
                 "again with less light, or correct bit_depth if that is the camera's top",
+            )
+        ]
+    if fault_of(counts, camera) == DARK:
+        return [
+            Problem(
+                "error",
+                "dark",
+                name,
+                f"the image of capture {name} shows no light above the camera's noise: check that the laser was on "
+                "and the exposure long enough, then take it again or remove its row; fits leave it out",
             )
         ]
     if float(counts[counts < camera.saturation].std()) < 2 * _dark_noise(camera):

@@ -44,7 +44,7 @@ class _SetStatistics:
     dark : int array [65536]
         How many unsaturated pixels have each count.
     good : list of Capture
-        Those whose counts can be used.
+        Those whose counts can be used, and show light.
     shift : dict
         By capture id: bits by which its counts are shifted down.
     """
@@ -130,8 +130,11 @@ def _one(bench: Bench, capture: Capture, statistics: _SetStatistics) -> list[Pro
         counts = counts >> shift
     if int(counts.max()) > camera.saturation:
         return problems
-    problems += check_brightness(counts, camera, capture.capture)
+    brightness = check_brightness(counts, camera, capture.capture)
+    problems += brightness
     statistics.dark += np.bincount(counts[counts < camera.saturation].ravel(), minlength=65536)
+    if any(p.kind == "dark" for p in brightness):
+        return problems
     statistics.good.append(capture)
     key = (capture.channel, capture.plane_mm, digest, capture.exposure_ms)
     statistics.repeats.setdefault(key, []).append(capture)

@@ -7,11 +7,12 @@ side.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.capture_table import Capture
+from trainer.captures.signal_present import with_signal
 
 FIT_PIXELS = 4 * 240 * 320  # about four small pictures hold a few dozen parameters to far below the noise
 FIT_CAPTURES = 4
@@ -21,15 +22,21 @@ HELD_PIXELS = 24 * 480 * 640  # held-out pixels that a candidate is judged on
 
 @dataclass(frozen=True)
 class CaptureSplit:
-    """Captures for fitting and captures held out, as a partition of the set.
+    """Captures for fitting and captures held out, as a partition of the captures that show any light.
 
     Attributes
     ----------
     fitted, held_out : tuple of Capture
+    is_held_out : bool
+        False where there is only one pattern, so that what is judged is what was fitted.
+    left_out : dict
+        By the id of each capture that is used for nothing: why, as `trainer.captures.signal_present` says.
     """
 
     fitted: tuple[Capture, ...]
     held_out: tuple[Capture, ...]
+    is_held_out: bool = True
+    left_out: dict[str, str] = field(default_factory=dict)
 
 
 def split(captures: CaptureSet) -> CaptureSplit:
@@ -37,19 +44,24 @@ def split(captures: CaptureSet) -> CaptureSplit:
 
     The choice depends only on the order of the captures, so every command holds out the same ones. A colour and plane
     with a single pattern is fitted. Only where every colour and plane has a single pattern, the last capture is both
-    fitted and held out.
+    fitted and judged. Captures without light, or with nothing but saturated pixels, are in neither part.
+
+    Raises
+    ------
+    InputError
+        Where no capture shows any light, or all are saturated.
     """
     fitted: list[Capture] = []
     held: list[Capture] = []
-    for channel, plane in scenes(captures.captures):
-        rows = [c for c in captures.captures if (c.channel, c.plane_mm) == (channel, plane)]
+    used, left_out = with_signal(captures)
+    for channel, plane in scenes(used):
+        rows = [c for c in used if (c.channel, c.plane_mm) == (channel, plane)]
         patterns = list(dict.fromkeys(c.pattern for c in rows))
         out = set(patterns[1::3])
         for c in rows:
             (held if c.pattern in out else fitted).append(c)
-    if not held:
-        held = fitted[-1:]
-    return CaptureSplit(tuple(fitted), tuple(held))
+    is_held_out = bool(held)
+    return CaptureSplit(tuple(fitted), tuple(held or fitted[-1:]), is_held_out, left_out)
 
 
 def scenes(captures: Iterable[Capture]) -> list[tuple[str, float]]:
@@ -109,6 +121,8 @@ class CaptureRoles:
         For the probes.
     held_out : tuple of Capture
         For the judgement.
+    is_held_out : bool
+        False where there is only one pattern, so that what is judged is what was fitted.
     """
 
     captures: CaptureSet
@@ -116,6 +130,7 @@ class CaptureRoles:
     screened: tuple[Capture, ...]
     probed: tuple[Capture, ...]
     held_out: tuple[Capture, ...]
+    is_held_out: bool = True
 
     @property
     def folder(self) -> Path:
@@ -124,7 +139,13 @@ class CaptureRoles:
 
 
 def capture_roles(captures: CaptureSet) -> CaptureRoles:
-    """Choose captures for fits, the screen, the probes and the judgement."""
+    """Choose captures for fits, the screen, the probes and the judgement.
+
+    Raises
+    ------
+    InputError
+        As `split` does.
+    """
     divided = split(captures)
     height, width = captures.bench.panel.shape
     pixels = height * width
@@ -136,4 +157,6 @@ def capture_roles(captures: CaptureSet) -> CaptureRoles:
     held_out = list(divided.held_out)
     if len(held_out) > most:
         held_out = held_out[:: -(-len(held_out) // most)]
-    return CaptureRoles(captures, tuple(fitted), tuple(screened), tuple(probed), tuple(held_out))
+    return CaptureRoles(
+        captures, tuple(fitted), tuple(screened), tuple(probed), tuple(held_out), divided.is_held_out
+    )

@@ -11,7 +11,7 @@ from runtime.program.command import Command, Result
 from runtime.program.progress import part_of
 from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
-from trainer.commands.inputs import captures_argument, inputs_of, model_options
+from trainer.commands.inputs import ONE_PATTERN, captures_argument, inputs_of, model_options, note_left_out
 from trainer.commands.number_text import percent_text, small_text
 from trainer.commands.outputs import report_option, report_out
 from trainer.commands.workers import use_every_core
@@ -41,6 +41,7 @@ def options(parser: ArgumentParser) -> None:
 def run(args: Namespace, screen: Screen) -> Result:
     """How far a model is from the captures."""
     captures, _, model = inputs_of(args)
+    note_left_out(captures, screen)
     from dataclasses import replace
 
     from trainer.diagnosis.comparison import compare
@@ -64,12 +65,16 @@ def run(args: Namespace, screen: Screen) -> Result:
 def show(result: Result, args: Namespace, screen: Screen) -> None:
     """The error in one sentence, then by channel and by capture."""
     held = result["heldout"]
+    is_held_out = result.get("held_out", True)
+    judged = "On captures that no fit saw" if is_held_out else "On the last capture"
     screen.say(
-        f"On captures that no fit saw, the model's error is {percent_text(held['nrmse'])} of the signal's "
+        f"{judged}, the model's error is {percent_text(held['nrmse'])} of the signal's "
         f"contrast; the camera's noise alone would be {percent_text(held['noise_nrmse'])}; "
         f"the excess is {small_text(held['excess'])}.",
         style="bold",
     )
+    if not is_held_out:
+        screen.say(ONE_PATTERN, style="yellow")
     if result.get("psnr_db") is not None:
         screen.say(f"Peak signal to noise: {result['psnr_db']:.1f} dB (peak: full scale; no free scale).")
     if result.get("budget"):

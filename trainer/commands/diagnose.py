@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from runtime.program.command import Command, Result
 from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
-from trainer.commands.inputs import captures_argument, inputs_of, model_options, refuse_misread
+from trainer.commands.inputs import captures_argument, inputs_of, model_options, note_left_out, refuse_misread
 from trainer.commands.number_text import sizes_text, small_text
 from trainer.commands.outputs import report_option, report_out
 from trainer.commands.thresholds import threshold_options, thresholds_of
@@ -31,6 +31,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     """What is missing from a model."""
     thresholds = thresholds_of(args)
     captures, known, model = inputs_of(args)
+    note_left_out(captures, screen)
     refuse_misread(args.captures, screen)
     from trainer.diagnosis.diagnosis import diagnose
     from trainer.fitting.pool import open_pool
@@ -52,7 +53,7 @@ def run(args: Namespace, screen: Screen) -> Result:
 
 def show(result: Result, args: Namespace, screen: Screen) -> None:
     """The verdict, the stages, the ranking, and the command that does something about it."""
-    say_verdict(result["verdict"], str(result.get("sentence", "")), screen)
+    say_verdict(result, str(result.get("sentence", "")), screen)
     stages = sorted(result.get("stages") or [], key=lambda s: -s["excess_removed"])
     screen.table(
         ("stage", "excess its free-form probe removes"), [(s["stage"], s["excess_removed"]) for s in stages]

@@ -10,7 +10,14 @@ from runtime.program.command import Command, Result
 from runtime.program.interrupt import Interrupted, ctrl_c_waits
 from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
-from trainer.commands.inputs import captures_argument, inputs_of, model_options, origin, refuse_misread
+from trainer.commands.inputs import (
+    captures_argument,
+    inputs_of,
+    model_options,
+    note_left_out,
+    origin,
+    refuse_misread,
+)
 from trainer.commands.number_text import small_text
 from trainer.commands.outputs import model_out, out_option, report_option
 from trainer.commands.thresholds import threshold_options, thresholds_of
@@ -47,6 +54,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     """
     thresholds = thresholds_of(args)
     captures, known, model = inputs_of(args)
+    note_left_out(captures, screen)
     refuse_misread(args.captures, screen)
     from trainer.diagnosis.explanation import explain
     from trainer.fitting.pool import open_pool
@@ -130,7 +138,7 @@ def _interrupted(saved: list[tuple[str, ...]], before: tuple[str, ...], args: Na
 
 def show(result: Result, args: Namespace, screen: Screen) -> None:
     """The ladder of effects, the verdict, and what comes next."""
-    say_verdict(result["verdict"], _explained(result), screen)
+    say_verdict(result, _explained(result), screen)
     rows = []
     first = args.model.name if args.model else "ideal model"
     for step in result["steps"]:

@@ -16,6 +16,12 @@ if TYPE_CHECKING:
     from trainer.effects.effect_catalogue import Catalogue
     from trainer.model.model import Model
 
+ONE_PATTERN = (
+    "Nothing is held out: these captures hold one pattern, so the error is of the very captures that were fitted. "
+    "Capture more patterns."
+)
+MOST_NAMED = 6  # captures that a warning names
+
 
 def captures_argument(parser: ArgumentParser) -> None:
     """The capture set."""
@@ -75,10 +81,31 @@ def origin(captures: CaptureSet) -> dict[str, Any]:
     }
 
 
+def note_left_out(captures: CaptureSet, screen: Screen) -> None:
+    """Warn on stderr of captures that say nothing and are used for nothing.
+
+    Raises
+    ------
+    InputError
+        Where that is so of every capture.
+    """
+    from trainer.captures.signal_present import with_signal
+
+    _, left_out = with_signal(captures)
+    for why in dict.fromkeys(left_out.values()):
+        ids = [name for name, other in left_out.items() if other == why]
+        more = f" and {len(ids) - MOST_NAMED} more" if len(ids) > MOST_NAMED else ""
+        plural = "s" if len(ids) > 1 else ""
+        screen.note(
+            f"warning: left out capture{plural} {', '.join(ids[:MOST_NAMED])}{more} ({why}); "
+            f"see: {command_line('check', captures.folder)}"
+        )
+
+
 def refuse_misread(folder: Path, screen: Screen) -> None:
     """Refuse captures that are not what bench.toml says, and warn on stderr of other errors of the set.
 
-    Other errors may be what is to be explained.
+    Other errors may be what is to be explained. Dark captures are those that `note_left_out` warns of.
 
     Raises
     ------
@@ -93,6 +120,7 @@ def refuse_misread(folder: Path, screen: Screen) -> None:
     for problem in errors:
         if problem.kind in MISREAD:
             raise InputError(problem.message)
+    errors = [p for p in errors if p.kind != "dark"]
     if errors:
         more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
         screen.note(f"warning: {errors[0].message}{more}; see: {command_line('check', folder)}")

@@ -9,13 +9,17 @@ from typing import Any
 from runtime.program.command import Result
 from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
+from trainer.commands.inputs import ONE_PATTERN
 
 STYLES = {"complete": "bold green", "missing": "bold yellow", "outside_catalogue": "bold magenta"}
 
 
-def say_verdict(verdict: str, sentence: str, screen: Screen) -> None:
-    """The verdict's sentence, in its colour."""
+def say_verdict(result: Result, sentence: str, screen: Screen) -> None:
+    """The verdict's sentence, in its colour, and where nothing was held out, that."""
+    verdict = result["verdict"]
     screen.say(sentence or f"The verdict is {verdict}.", style=STYLES.get(verdict, "bold"))
+    if not result.get("held_out", True):
+        screen.say(ONE_PATTERN, style="yellow")
 
 
 def say_suggested(result: Result, screen: Screen) -> None:

@@ -85,6 +85,8 @@ class Comparison:
         A few of the captures, for the report.
     budget : ErrorBudget or None
         Where the ideal model's error goes; None where it was not computed, or there is no contrast.
+    is_held_out : bool
+        False where there is only one pattern, so that what is judged is what was fitted.
     """
 
     model: Model
@@ -99,6 +101,7 @@ class Comparison:
     noise_from_repeats: float | None
     pictures: tuple[CapturePicture, ...] = ()
     budget: ErrorBudget | None = None
+    is_held_out: bool = True
 
     def by_capture(self) -> list[dict[str, Any]]:
         """One row a held-out capture, in the order of the set."""
@@ -116,7 +119,8 @@ class Comparison:
     def as_json(self) -> dict[str, Any]:
         """The object that `compare --json` prints; None where there is no such number.
 
-        Keys `heldout`, `psnr_db`, `by_channel`, `by_plane`, `by_capture`, `budget`, `noise_from_repeats` and `where`,
+        Keys `heldout`, `held_out` (false where the captures hold one pattern), `psnr_db`, `by_channel`,
+        `by_plane`, `by_capture`, `budget`, `noise_from_repeats` and `where`,
         which has `field`, `tile_px`, `frequency`, `brightness` and `time`.
         """
         rows = self.by_capture()
@@ -125,6 +129,7 @@ class Comparison:
         planes = [f"{c.plane_mm:g}" for c in self.captures]
         return {
             "heldout": summary(self.errors),
+            "held_out": self.is_held_out,
             "psnr_db": self.psnr_db,
             "by_channel": self._by(channels),
             "by_plane": self._by(planes),
@@ -177,7 +182,7 @@ def compare(captures: CaptureSet, model: Model, progress: Progress | None = None
     Raises
     ------
     InputError
-        Where a picture cannot be read or every held-out picture is saturated.
+        Where a picture cannot be read, or no picture can be used: all without light, or saturated.
     """
     divided = split(captures)
     without_gain = {c.channel for c in divided.held_out} - set(model.gain)
@@ -199,7 +204,7 @@ def compare(captures: CaptureSet, model: Model, progress: Progress | None = None
         raise InputError(
             f"every held-out picture of {captures.folder} is saturated: lower the exposure and capture again"
         )
-    return sums.finish(captures, model)
+    return sums.finish(captures, model, divided.is_held_out)
 
 
 class _Sums:
@@ -246,7 +251,7 @@ class _Sums:
                 )
             )
 
-    def finish(self, captures: CaptureSet, model: Model) -> Comparison:
+    def finish(self, captures: CaptureSet, model: Model, is_held_out: bool) -> Comparison:
         """The comparison that the sums give."""
         errors = joined(self.errors)
         pixels = float(errors.pixels.sum())
@@ -264,6 +269,7 @@ class _Sums:
             self.brightness.rows(),
             noise_from_repeats(captures),
             tuple(self.pictures),
+            is_held_out=is_held_out,
         )
 
 

@@ -49,6 +49,8 @@ class Diagnosis:
         Fitted candidates, best first.
     screened : tuple of ScreenResult
         All candidates by what the screen expects of them, best first.
+    is_held_out : bool
+        False where there is only one pattern, so that what is judged is what was fitted.
     """
 
     model: Model
@@ -61,6 +63,7 @@ class Diagnosis:
     suggested_captures: tuple[str, ...]
     thresholds: Thresholds
     screened: tuple[ScreenResult, ...] = field(default=())
+    is_held_out: bool = True
 
     @property
     def best(self) -> RankedEffect | None:
@@ -94,11 +97,13 @@ class Diagnosis:
     def as_json(self) -> dict[str, Any]:
         """The object that `diagnose --json` prints.
 
-        Keys `heldout`, `verdict`, `stage`, `stages`, `ranking`, `suggested_captures`, `ideal_excess`, `thresholds`,
+        Keys `heldout`, `held_out` (false where the captures hold one pattern), `verdict`, `stage`, `stages`,
+        `ranking`, `suggested_captures`, `ideal_excess`, `thresholds`,
         `screen` and `sentence`.
         """
         return {
             "heldout": self.held_out.as_json(),
+            "held_out": self.is_held_out,
             "verdict": self.verdict,
             "stage": self.stage,
             "stages": [p.as_json() for p in self.probes],
@@ -151,7 +156,18 @@ def diagnose(
     complete = thresholds.complete(before.excess, ideal_excess)
 
     if complete and not with_probes:
-        return Diagnosis(model, before, ideal_excess, "complete", None, (), (), (), thresholds)
+        return Diagnosis(
+            model,
+            before,
+            ideal_excess,
+            "complete",
+            None,
+            (),
+            (),
+            (),
+            thresholds,
+            is_held_out=roles.is_held_out,
+        )
 
     candidates = [e for e in known.values() if e.name not in model.names]
     screened = screen_all(roles, model, candidates, pool, report)
@@ -198,6 +214,7 @@ def diagnose(
         tuple(suggestions),
         thresholds,
         tuple(order),
+        roles.is_held_out,
     )
 
 

@@ -115,7 +115,8 @@ class Explanation:
     def as_json(self, model_path: Path) -> dict[str, Any]:
         """The object that `explain --json` prints.
 
-        Keys `steps`, `verdict`, `stage`, `noise_nrmse`, `model`, `sentence` and `suggested_captures`.
+        Keys `steps`, `verdict`, `stage`, `noise_nrmse`, `model`, `sentence`, `held_out` (false where the captures
+        hold one pattern) and `suggested_captures`.
         """
         return {
             "steps": [s.as_json() for s in self.steps],
@@ -124,6 +125,7 @@ class Explanation:
             "noise_nrmse": self.diagnosis.held_out.noise_nrmse,
             "model": str(model_path),
             "sentence": self.diagnosis.sentence,
+            "held_out": self.diagnosis.is_held_out,
             "suggested_captures": [s for d in self.diagnoses for s in d.suggested_captures],
         }
 

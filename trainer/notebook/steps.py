@@ -70,7 +70,7 @@ def compare(
     Raises
     ------
     InputError
-        Where a file cannot be read, or every held-out picture is saturated.
+        Where a file cannot be read, or no picture can be used: all without light, or saturated.
     """
     taken, _, start = _inputs(captures, model, effects)
     return ComparisonResult(taken, compare_model(taken, start))

@@ -32,6 +32,8 @@ def headline(compared: Any, found: Any, steps: Sequence[Mapping[str, Any]]) -> d
         heldout, count = compared["heldout"], len(compared.get("by_capture") or [])
         excess, nrmse, noise = heldout["excess"], heldout["nrmse"], heldout["noise_nrmse"]
         on = f"On {count} held-out capture{'s' if count != 1 else ''}"
+        if not compared.get("held_out", True):
+            on = "Nothing is held out (one pattern): on the capture that was fitted"
         if excess is None:
             text = f"{on} there is no contrast to compare with."
             return {"tone": "bad", "label": "No contrast", "sentence": text}
