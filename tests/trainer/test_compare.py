@@ -12,6 +12,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from firmware_iface.errors import InputError
+from runtime.excess import joined
 from tests.trainer.made_sets import write_captures
 from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet, read_captures
@@ -19,7 +20,7 @@ from trainer.diagnosis import comparison as module
 from trainer.diagnosis.comparison import Comparison, compare
 from trainer.effects import catalogue
 from trainer.fitting.gains import with_gains
-from trainer.fitting.predictor import evaluate
+from trainer.fitting.predictor import Predictor
 from trainer.model.model import Model, absent
 
 HEIGHT, WIDTH, PITCH, DISTANCE = 96, 128, 8e-6, 10e-3
@@ -231,7 +232,8 @@ def test_the_gain_of_a_curved_response_is_fitted(ideal: CaptureSet) -> None:
     batches = load(ideal, rows)
 
     def excess(factor: float) -> float:
-        return evaluate(replace(found, gain={"green": found.gain["green"] * factor}), batches).excess
+        trial = replace(found, gain={"green": found.gain["green"] * factor})
+        return joined([b.errors(Predictor(trial, b).predict(trial)) for b in batches]).excess
 
     assert excess(1.0) < min(excess(0.98), excess(1.02))
 

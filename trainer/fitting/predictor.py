@@ -62,12 +62,6 @@ class Predictor:
         return self.counts(model, self.light(model, self.trace(model, start, before)))
 
 
-def evaluate(model: Model, batches: Sequence[Batch]) -> PredictionErrors:
-    """Errors of a model, with the gains it has, on batches."""
-    with torch.no_grad():
-        return joined([b.errors(Predictor(model, b).predict(model)) for b in batches])
-
-
 def evaluate_captures(captures: CaptureSet, rows: Sequence[Capture], model: Model) -> PredictionErrors:
     """Errors of a model on captures, one in memory at a time."""
     with torch.no_grad():
