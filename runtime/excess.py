@@ -32,10 +32,10 @@ class PredictionErrors:
     ----------
     ids : tuple of str
         The captures, in the order of the arrays' first axis.
-    squared : float64 array [captures, tiles], counts^2
-        Squared error, summed over the pixels of each tile that count.
-    noise, variance : float64 array [captures], counts^2
-        Expected variance of the camera's noise and variance of the signal, both summed over the pixels that count.
+    squared, noise : float64 array [captures, tiles], counts^2
+        Squared error and expected variance of the camera's noise, both summed over the pixels of each tile that count.
+    variance : float64 array [captures], counts^2
+        Variance of the signal, summed over the pixels that count.
     pixels : float64 array [captures]
         Number of pixels that count.
     """
@@ -61,9 +61,18 @@ class PredictionErrors:
         """What `nrmse` would be with the camera's noise alone."""
         return math.sqrt(float(self.noise.sum() / self.variance.sum()))
 
+    def interval(self, confidence: float = CONFIDENCE) -> tuple[float, float]:
+        """Two-sided interval of the excess, from the spread of the tiles' excess about its mean."""
+        beyond = self.squared - self.noise
+        if beyond.size < 2:
+            return -math.inf, math.inf
+        error = math.sqrt(beyond.size) * float(beyond.std(ddof=1)) / float(self.variance.sum())
+        z = NormalDist().inv_cdf(0.5 + confidence / 2)
+        return self.excess - z * error, self.excess + z * error
+
     def by_capture(self) -> list[float]:
         """Excess of each capture."""
-        return [float(e) for e in (self.squared.sum(-1) - self.noise) / self.variance]
+        return [float(e) for e in (self.squared - self.noise).sum(-1) / self.variance]
 
     def part(self, which: Sequence[int]) -> PredictionErrors:
         """The errors of some of the captures, by their place."""
@@ -128,7 +137,7 @@ def prediction_errors(
     return PredictionErrors(
         tuple(ids),
         squared.reshape(len(squared), -1),
-        (mask * noise).sum((-2, -1), dtype=np.float64),
+        tile_sums(mask * noise).reshape(len(squared), -1),
         variance,
         count,
     )

@@ -112,6 +112,8 @@ class Camera:
     full_well_e : float, electrons
         At full scale above black.
     read_noise_e : float, electrons
+    noise_stated : bool
+        False where bench.toml leaves out full_well_e and read_noise_e, so that these are typical values.
     homography : 3 x 3 rows or None
         From a camera pixel's centre (x, y, 1) to panel pixels (x, y, 1); None when registered.
     """
@@ -125,6 +127,7 @@ class Camera:
     full_well_e: float
     read_noise_e: float
     homography: Matrix | None = None
+    noise_stated: bool = True
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -252,6 +255,8 @@ def bench_tables(bench: Bench) -> dict[str, Any]:
         del camera["homography"]
     else:
         camera["homography"] = [list(row) for row in camera["homography"]]
+    if not camera.pop("noise_stated"):
+        del camera["full_well_e"], camera["read_noise_e"]
     return {
         "schema": 1,
         "name": bench.name,
@@ -284,11 +289,18 @@ def _bench(tables: Mapping[str, Any]) -> Bench:
             raise InputError(f"channel.name {channel!r} is given twice: give every channel its own name")
     distance = checked_table("propagation", tables.get("propagation"))["distance_mm"]
     iris = Iris(**checked_table("iris", tables.get("iris", {})))
-    camera = _camera(checked_table("camera", tables.get("camera")), panel)
+    camera = _camera(checked_table("camera", tables.get("camera")), tables["camera"], panel)
     return Bench(name, panel, channels, distance, iris, camera)
 
 
-def _camera(values: dict[str, Any], panel: Panel) -> Camera:
+def _camera(values: dict[str, Any], given_table: Mapping[str, Any], panel: Panel) -> Camera:
+    noise = [key for key in ("full_well_e", "read_noise_e") if key in given_table]
+    if len(noise) == 1:
+        raise InputError(
+            f"camera.{noise[0]} is given alone: write full_well_e and read_noise_e, both in electrons, or neither to "
+            "have them measured from repeated captures"
+        )
+    values["noise_stated"] = bool(noise)
     camera = Camera(**{**values, "homography": None})
     if camera.black_level >= camera.saturation:
         raise InputError(

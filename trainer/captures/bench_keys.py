@@ -75,8 +75,9 @@ TABLES: dict[str, dict[str, KeyRule]] = {
         "registered": KeyRule(bool),
         "bit_depth": KeyRule(int, 4, 16),
         "black_level": KeyRule(float, 0, 65534, unit="counts"),
-        "full_well_e": KeyRule(float, 1, 1e9, unit="electrons"),
-        "read_noise_e": KeyRule(float, 0, 1e6, unit="electrons"),
+        # Left out, these two are measured from repeated captures; until then, or without repeats, a common camera's.
+        "full_well_e": KeyRule(float, 1, 1e9, default=10000.0, unit="electrons"),
+        "read_noise_e": KeyRule(float, 0, 1e6, default=5.0, unit="electrons"),
         "homography": KeyRule(list),
     },
 }

@@ -7,6 +7,7 @@ count points to the true black level. Stray light does not change this, because 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,8 @@ from trainer.captures.bench_file import Camera
 
 BINS = 32
 SLOPE_DOUBT = 0.008  # relative standard error that a stated full well has at best
+SURE = 4.0  # standard errors from which a slope or a bend counts
+BEND = 0.25  # of the variance at the brightest bin that a bend may add before it is no line
 
 
 @dataclass(frozen=True)
@@ -28,14 +31,39 @@ class RepeatNoise:
     variance : float array [n], counts^2
     error : float array [n], counts^2
         Standard error of the variance.
-    ratio : float
-        Measured noise over the camera model's, both averaged over the pixels.
+    ratio, ratio_error : float
+        Measured noise over the camera model's, both averaged over the pixels, and its standard error.
+    black_level : float, counts
+        The stated one.
     """
 
     mean: np.ndarray
     variance: np.ndarray
     error: np.ndarray
     ratio: float
+    ratio_error: float
+    black_level: float
+
+    def ratio_to(self, camera: Camera) -> float:
+        """Measured noise over that of a camera with other numbers than the stated."""
+        return float(self.variance.mean() / noise_variance(self.mean - self.black_level, camera).mean())
+
+
+@dataclass(frozen=True)
+class NoiseLine:
+    """The straight line of variance against mean count.
+
+    Attributes
+    ----------
+    slope, slope_error : float, counts
+        Counts that one electron adds, and its standard error.
+    at_black : float, counts^2
+        Variance at the stated black level.
+    """
+
+    slope: float
+    slope_error: float
+    at_black: float
 
 
 @dataclass(frozen=True)
@@ -99,10 +127,45 @@ def compare_repeats(first: np.ndarray, second: np.ndarray, camera: Camera) -> Re
     full = number >= 32
     center = np.bincount(place, mean, minlength=len(number))[full] / number[full]
     variance = np.bincount(place, halved, minlength=len(number))[full] / number[full]
-    expected = noise_variance(mean - camera.black_level, camera)
+    expected = float(noise_variance(mean - camera.black_level, camera).mean())
+    spread = float(halved.std()) / math.sqrt(halved.size)
     return RepeatNoise(
-        center, variance, variance * np.sqrt(2 / number[full]), float(halved.mean() / expected.mean())
+        center,
+        variance,
+        variance * np.sqrt(2 / number[full]),
+        float(halved.mean()) / expected,
+        spread / expected,
+        camera.black_level,
     )
+
+
+def straight_line(repeats: Sequence[RepeatNoise], camera: Camera) -> NoiseLine | None:
+    """Variance against mean as a straight line.
+
+    Returns
+    -------
+    NoiseLine or None
+        None where the range of brightness is too small, where no line rises, or where the variance bends away from
+        it by more than BEND of itself: then more than the camera's noise differs between the pictures.
+    """
+    mean = np.concatenate([r.mean for r in repeats]) if repeats else np.zeros(0)
+    variance = np.concatenate([r.variance for r in repeats]) if repeats else np.zeros(0)
+    if len(mean) < 8 or np.ptp(mean) < 0.02 * camera.full_scale or not (variance > 0).all():
+        return None
+    relative = np.concatenate([r.error for r in repeats]) / variance + 1e-3
+    step = float(np.ptp(mean))
+    place = (mean - camera.black_level) / step
+    line = _fit(np.stack([np.ones_like(place), place], 1), variance, relative)
+    bent = _fit(np.stack([np.ones_like(place), place, place**2], 1), variance, relative)
+    if line is None or bent is None:
+        return None
+    (at_black, rise), covariance = line
+    bend, bend_error = bent[0][2], math.sqrt(bent[1][2, 2])
+    if rise <= SURE * math.sqrt(covariance[1, 1]):
+        return None
+    if abs(bend) > SURE * bend_error and abs(bend) > BEND * rise:
+        return None
+    return NoiseLine(float(rise) / step, math.sqrt(covariance[1, 1]) / step, float(at_black))
 
 
 def black_estimate(repeats: list[RepeatNoise], camera: Camera) -> BlackEstimate | None:

@@ -20,8 +20,9 @@ from typing import Any
 import numpy as np
 
 from firmware_iface.errors import InputError
-from trainer.captures.bench_file import Bench, read_bench
-from trainer.captures.camera_noise import noise_variance
+from trainer.captures.bench_file import Bench, Camera, read_bench
+from trainer.captures.camera_noise import compare_repeats, noise_variance
+from trainer.captures.camera_numbers import MEASURED_PAIRS, camera_by_repeats, repeated_pairs
 from trainer.captures.capture_table import Capture, scan_rows
 from trainer.captures.equal_patterns import one_name_each
 from trainer.captures.png_reader import read_picture
@@ -114,9 +115,19 @@ class CaptureSet:
             self.bench.camera.black_level
         ), counts < self.bench.camera.saturation
 
+    def noise_camera(self) -> Camera:
+        """The bench's camera with the full well and read noise that count.
+
+        Those that bench.toml states; those that repeated captures show where it is silent or clearly wrong.
+        """
+        pictures = tuple((a.image, b.image) for a, b in repeated_pairs(self.captures)[:MEASURED_PAIRS])
+        return _noise_camera(
+            self.bench.camera, pictures, tuple(_changed(path) for pair in pictures for path in pair)
+        )
+
     def noise_variance(self, signal: Any) -> Any:
         """Variance of the camera's noise, counts^2, of a signal of counts above black; in the signal's shape."""
-        return noise_variance(signal, self.bench.camera)
+        return noise_variance(signal, self.noise_camera())
 
     def _repr_html_(self) -> str:
         """What a notebook shows."""
@@ -181,6 +192,26 @@ def read_captures(folder: Path | str) -> CaptureSet:
     if faults:
         raise InputError(faults[0].message)
     return CaptureSet(folder, bench, tuple(one_name_each(captures)))
+
+
+@lru_cache(maxsize=8)
+def _noise_camera(
+    camera: Camera, pictures: tuple[tuple[Path, Path], ...], changed: tuple[int, ...]
+) -> Camera:
+    depth = 16 if camera.bit_depth > 8 else 0
+    try:
+        pairs = [[read_picture(path, camera.shape, depth, "the image") for path in pair] for pair in pictures]
+    except InputError:  # a picture that cannot be read: whoever uses it reports that
+        return camera
+    repeats = (compare_repeats(first, second, camera) for first, second in pairs)
+    return camera_by_repeats(camera, [r for r in repeats if r is not None])
+
+
+def _changed(path: Path) -> int:
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:
+        return 0
 
 
 def opened(folder: Path) -> CaptureSet:

@@ -12,6 +12,7 @@ from trainer.captures.problems import Problem
 from trainer.captures.signal_present import DARK, fault_of
 
 SATURATED_SHARE = 0.03  # of the pixels at the top count
+PILE_FACTOR, PILE_LEAST = 10, 8  # pixels at a top count: times those at each count just below, and at least
 DARK_SHARE = 1e-3  # of the pixels that lie well below the stated black level
 
 
@@ -75,6 +76,34 @@ def check_bits(counts: np.ndarray, camera: Camera, name: str) -> tuple[int, list
             )
         ]
     return 0, []
+
+
+def check_top(camera: Camera, counts: np.ndarray) -> list[Problem]:
+    """Whether the pixels pile up at the top count of fewer bits than bit_depth says.
+
+    Parameters
+    ----------
+    camera : Camera
+    counts : int array [65536]
+        How many unsaturated pixels of all captures have each count.
+    """
+    used = np.flatnonzero(counts)
+    top = int(used[-1]) if used.size else 0
+    bits = top.bit_length()
+    if top != 2**bits - 1 or bits >= camera.bit_depth or top <= camera.black_level:
+        return []
+    near = float(counts[max(top - 16, 0) : top].mean())
+    if counts[top] < max(PILE_LEAST, PILE_FACTOR * near):
+        return []
+    return [
+        Problem(
+            "error",
+            "bit_depth",
+            "",
+            f"{counts[top]} pixels pile up at {top}, the top count of {bits} bits, and none is above, but "
+            f"camera.bit_depth = {camera.bit_depth}: write bit_depth = {bits}",
+        )
+    ]
 
 
 def check_brightness(counts: np.ndarray, camera: Camera, name: str) -> list[Problem]:

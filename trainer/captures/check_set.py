@@ -17,16 +17,20 @@ from firmware_iface.errors import InputError
 from runtime.program.progress import Progress
 from trainer.captures.bench_file import Bench, read_bench
 from trainer.captures.camera_noise import RepeatNoise, compare_repeats
+from trainer.captures.camera_numbers import MEASURED_PAIRS, MOST_PAIRS, camera_by_repeats, numbers_text
 from trainer.captures.capture_table import Capture, scan_rows
-from trainer.captures.check_counts import check_bits, check_black_level, check_brightness
+from trainer.captures.check_counts import check_bits, check_black_level, check_brightness, check_top
 from trainer.captures.conventions import Predict, Sample, compare_conventions
 from trainer.captures.mismatches import mismatched
 from trainer.captures.png_reader import PictureError, read_picture
 from trainer.captures.problems import Problem
 
 NOISE_FACTOR = 2.25  # measured noise variance over the camera model's
+NOT_MEASURED = (
+    "bench.toml does not state camera.full_well_e and read_noise_e, and no repeated pictures show them, so a common "
+    "camera's are assumed: capture one pattern twice, or write them"
+)
 FEWEST_PATTERNS = 4
-MOST_PAIRS = 12  # pairs of repeated pictures that are compared
 
 
 @dataclass
@@ -162,26 +166,33 @@ def _patterns(bench: Bench, statistics: _SetStatistics) -> list[Problem]:
 
 def _camera(bench: Bench, statistics: _SetStatistics) -> list[Problem]:
     """The stated camera against the darkest pixels of all captures, and against repeated patterns."""
-    camera, problems = bench.camera, []
-    pairs = [pair for group in statistics.repeats.values() for pair in pairwise(group)]
+    camera, problems = bench.camera, check_top(bench.camera, statistics.dark)
+    pairs = [pair for group in statistics.repeats.values() for pair in pairwise(group)][:MOST_PAIRS]
     measured: list[tuple[str, RepeatNoise]] = []
-    for a, b in pairs[:MOST_PAIRS]:
+    for a, b in pairs:
         repeats = compare_repeats(_load(a, bench, statistics)[1], _load(b, bench, statistics)[1], camera)
         if repeats:
             measured.append((b.capture, repeats))
     black = check_black_level(camera, statistics.dark, [repeats for _, repeats in measured])
     if black:
-        return [black]
+        return [*problems, black]
+    used = camera_by_repeats(camera, [repeats for _, repeats in measured[:MEASURED_PAIRS]])
+    text = numbers_text(camera, used)
+    if text:
+        problems.append(Problem("warning", "camera_numbers", "", text + "; correct them in bench.toml"))
+    elif not camera.noise_stated:
+        problems.append(Problem("warning", "camera_numbers", "", NOT_MEASURED))
     for name, repeats in measured:
-        if repeats.ratio > NOISE_FACTOR or repeats.ratio < 1 / NOISE_FACTOR:
-            more = repeats.ratio > 1
+        ratio = repeats.ratio_to(used)
+        if ratio > NOISE_FACTOR or ratio < 1 / NOISE_FACTOR:
+            more = ratio > 1
             problems.append(
                 Problem(
                     "warning",
                     "noise",
                     name,
                     f"capture {name} differs from an earlier capture of its pattern "
-                    f"by {repeats.ratio**0.5:.2g} times the noise that the camera's numbers give: "
+                    f"by {ratio**0.5:.2g} times the noise that the camera's numbers give: "
                     + ("look for vibration, drift or flicker, or " if more else "")
                     + "correct full_well_e and read_noise_e",
                 )

@@ -22,8 +22,8 @@ class Problem:
         "error" or "warning".
     kind : str
         missing_file, wrong_size, saturated, left_justified, black_level, duplicate, too_few, unknown_channel,
-        unreadable, bit_depth, not_a_number, noise, pattern, dark, no_signal, convention, mismatched or
-        no_correlation.
+        unreadable, bit_depth, not_a_number, noise, pattern, dark, no_signal, camera_numbers, convention,
+        mismatched or no_correlation.
     capture : str
         The capture's id; "" for the whole set.
     message : str

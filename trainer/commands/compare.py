@@ -11,7 +11,13 @@ from runtime.program.command import Command, Result
 from runtime.program.progress import part_of
 from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
-from trainer.commands.inputs import ONE_PATTERN, captures_argument, inputs_of, model_options, note_left_out
+from trainer.commands.inputs import (
+    ONE_PATTERN,
+    captures_argument,
+    inputs_of,
+    model_options,
+    note_what_is_used,
+)
 from trainer.commands.number_text import percent_text, small_text
 from trainer.commands.outputs import report_option, report_out
 from trainer.commands.workers import use_every_core
@@ -41,7 +47,7 @@ def options(parser: ArgumentParser) -> None:
 def run(args: Namespace, screen: Screen) -> Result:
     """How far a model is from the captures."""
     captures, _, model = inputs_of(args)
-    note_left_out(captures, screen)
+    note_what_is_used(captures, screen)
     from dataclasses import replace
 
     from trainer.diagnosis.comparison import compare

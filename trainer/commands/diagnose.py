@@ -8,7 +8,13 @@ from collections.abc import Mapping
 from runtime.program.command import Command, Result
 from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
-from trainer.commands.inputs import captures_argument, inputs_of, model_options, note_left_out, refuse_misread
+from trainer.commands.inputs import (
+    captures_argument,
+    inputs_of,
+    model_options,
+    note_what_is_used,
+    refuse_misread,
+)
 from trainer.commands.number_text import sizes_text, small_text
 from trainer.commands.outputs import report_option, report_out
 from trainer.commands.thresholds import threshold_options, thresholds_of
@@ -31,7 +37,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     """What is missing from a model."""
     thresholds = thresholds_of(args)
     captures, known, model = inputs_of(args)
-    note_left_out(captures, screen)
+    note_what_is_used(captures, screen)
     refuse_misread(args.captures, screen)
     from trainer.diagnosis.diagnosis import diagnose
     from trainer.fitting.pool import open_pool

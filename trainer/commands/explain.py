@@ -14,7 +14,7 @@ from trainer.commands.inputs import (
     captures_argument,
     inputs_of,
     model_options,
-    note_left_out,
+    note_what_is_used,
     origin,
     refuse_misread,
 )
@@ -54,7 +54,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     """
     thresholds = thresholds_of(args)
     captures, known, model = inputs_of(args)
-    note_left_out(captures, screen)
+    note_what_is_used(captures, screen)
     refuse_misread(args.captures, screen)
     from trainer.diagnosis.explanation import explain
     from trainer.fitting.pool import open_pool

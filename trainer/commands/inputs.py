@@ -81,14 +81,15 @@ def origin(captures: CaptureSet) -> dict[str, Any]:
     }
 
 
-def note_left_out(captures: CaptureSet, screen: Screen) -> None:
-    """Warn on stderr of captures that say nothing and are used for nothing.
+def note_what_is_used(captures: CaptureSet, screen: Screen) -> None:
+    """Warn on stderr of captures that are used for nothing, and of camera numbers that were measured instead.
 
     Raises
     ------
     InputError
         Where that is so of every capture.
     """
+    from trainer.captures.camera_numbers import numbers_text
     from trainer.captures.signal_present import with_signal
 
     _, left_out = with_signal(captures)
@@ -100,12 +101,15 @@ def note_left_out(captures: CaptureSet, screen: Screen) -> None:
             f"warning: left out capture{plural} {', '.join(ids[:MOST_NAMED])}{more} ({why}); "
             f"see: {command_line('check', captures.folder)}"
         )
+    measured = numbers_text(captures.bench.camera, captures.noise_camera())
+    if measured:
+        screen.note(f"warning: {measured}")
 
 
 def refuse_misread(folder: Path, screen: Screen) -> None:
     """Refuse captures that are not what bench.toml says, and warn on stderr of other errors of the set.
 
-    Other errors may be what is to be explained. Dark captures are those that `note_left_out` warns of.
+    Other errors may be what is to be explained. Dark captures are those that `note_what_is_used` warns of.
 
     Raises
     ------

@@ -17,6 +17,7 @@ from firmware_iface.errors import InputError
 from runtime.excess import PredictionErrors, joined
 from runtime.program.progress import Progress
 from trainer.captures.batches import load_batch
+from trainer.captures.bench_file import Camera
 from trainer.captures.camera_noise import compare_repeats
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.capture_table import Capture
@@ -81,6 +82,8 @@ class Comparison:
     noise_from_repeats : float or None
         Measured noise variance over the expected one, from captures of the same pattern; None where no pattern is
         repeated.
+    camera : Camera
+        With the full well and read noise that were used: stated, or measured from repeats.
     pictures : tuple of CapturePicture
         A few of the captures, for the report.
     budget : ErrorBudget or None
@@ -99,6 +102,7 @@ class Comparison:
     frequency: list[dict[str, float]]
     brightness: list[dict[str, Any]]
     noise_from_repeats: float | None
+    camera: Camera
     pictures: tuple[CapturePicture, ...] = ()
     budget: ErrorBudget | None = None
     is_held_out: bool = True
@@ -120,7 +124,8 @@ class Comparison:
         """The object that `compare --json` prints; None where there is no such number.
 
         Keys `heldout`, `held_out` (false where the captures hold one pattern), `psnr_db`, `by_channel`,
-        `by_plane`, `by_capture`, `budget`, `noise_from_repeats` and `where`,
+        `by_plane`, `by_capture`, `budget`, `noise_from_repeats`, `camera` (the noise that was used,
+        and whether it was measured from repeats) and `where`,
         which has `field`, `tile_px`, `frequency`, `brightness` and `time`.
         """
         rows = self.by_capture()
@@ -136,6 +141,11 @@ class Comparison:
             "by_capture": rows,
             "budget": None if self.budget is None else vars(self.budget),
             "noise_from_repeats": self.noise_from_repeats,
+            "camera": {
+                "full_well_e": self.camera.full_well_e,
+                "read_noise_e": self.camera.read_noise_e,
+                "measured": self.camera != self.model.bench.camera,
+            },
             "where": {
                 "field": self.field,
                 "tile_px": self.tile_px,
@@ -268,6 +278,7 @@ class _Sums:
             self.frequency.rows(),
             self.brightness.rows(),
             noise_from_repeats(captures),
+            captures.noise_camera(),
             tuple(self.pictures),
             is_held_out=is_held_out,
         )

@@ -10,13 +10,14 @@ import numpy as np
 
 from runtime.excess import PredictionErrors
 from runtime.program.progress import Progress, no_progress
+from trainer.captures.bench_file import Camera
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import CaptureRoles, capture_roles
 from trainer.diagnosis.probes import ProbeResult, probe
 from trainer.diagnosis.ranking import RankedEffect, rank, try_all, try_together_with_present
 from trainer.diagnosis.screen import ScreenResult, screen
 from trainer.diagnosis.separate import captures_that_separate
-from trainer.diagnosis.verdict import Thresholds, verdict_of
+from trainer.diagnosis.verdict import Thresholds, below_the_noise, verdict_of
 from trainer.effects.definition import STAGES, Effect
 from trainer.effects.effect_catalogue import Catalogue
 from trainer.fitting.gains import with_gains
@@ -80,6 +81,8 @@ class Diagnosis:
     def sentence(self) -> str:
         """The verdict in one sentence."""
         left = number(self.held_out.excess, 2)
+        if below_the_noise(self.held_out):
+            return overstated_noise(self.held_out, self.model.bench.camera)
         if self.verdict == "complete":
             return f"Nothing is missing: what remains above the camera's noise is {left} of the signal's variance."
         if self.best is None:
@@ -114,6 +117,18 @@ class Diagnosis:
             "screen": [{"effect": s.effect, "excess_removed": s.removed_excess} for s in self.screened],
             "sentence": self.sentence,
         }
+
+
+def overstated_noise(errors: PredictionErrors, camera: Camera) -> str:
+    """What to change where a model errs by less than the stated noise, in one sentence."""
+    share = float(errors.squared.sum() / errors.noise.sum())
+    excess = number(errors.excess, 2)
+    return (
+        f"The camera's numbers are wrong: the model's squared error is {share:.2g} of what the stated noise alone "
+        f"would be (excess {excess}), so nothing can be said of what is missing. Correct full_well_e = "
+        f"{camera.full_well_e:g}, read_noise_e = {camera.read_noise_e:g} or bit_depth = {camera.bit_depth} in "
+        "bench.toml, or capture one pattern twice to have the noise measured."
+    )
 
 
 def ideal_errors(roles: CaptureRoles, model: Model) -> PredictionErrors:
@@ -155,12 +170,13 @@ def diagnose(
     ideal_excess = (ideal or (before if not model.present else ideal_errors(roles, model))).excess
     complete = thresholds.complete(before.excess, ideal_excess)
 
-    if complete and not with_probes:
+    overstated = below_the_noise(before)
+    if overstated or (complete and not with_probes):
         return Diagnosis(
             model,
             before,
             ideal_excess,
-            "complete",
+            "outside_catalogue" if overstated else "complete",
             None,
             (),
             (),

@@ -15,7 +15,9 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Literal
 
-from runtime.excess import COMPLETE_EXCESS, COMPLETE_SHARE, RemovedExcess, is_complete
+from runtime.excess import COMPLETE_EXCESS, COMPLETE_SHARE, PredictionErrors, RemovedExcess, is_complete
+
+SURELY = 0.999  # confidence of the interval that lies below zero where there is less error than noise
 
 Verdict = Literal["complete", "missing", "outside_catalogue"]
 
@@ -33,6 +35,11 @@ def verdict_of(complete: bool, worth_adding: bool) -> Verdict:
     if complete:
         return "complete"
     return "missing" if worth_adding else "outside_catalogue"
+
+
+def below_the_noise(errors: PredictionErrors) -> bool:
+    """Whether a model errs by less than the camera's noise, which no model can: the noise is overstated."""
+    return errors.interval(SURELY)[1] < 0
 
 
 @dataclass(frozen=True)

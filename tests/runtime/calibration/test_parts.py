@@ -215,7 +215,13 @@ def _heldout(excess: float, rng: np.random.Generator, count: int = 400) -> Predi
     """A held-out error whose tiles scatter by a tenth about their mean."""
     noise = 0.001
     tiles = (excess + noise) * (1 + 0.1 * rng.normal(size=count)) / count
-    return PredictionErrors(("0",), tiles[None], np.array([noise]), np.ones(1), np.full(1, float(count)))
+    return PredictionErrors(
+        ("0",),
+        tiles[None],
+        np.full((1, tiles.size), noise / tiles.size),
+        np.ones(1),
+        np.full(1, float(count)),
+    )
 
 
 @pytest.mark.parametrize(
