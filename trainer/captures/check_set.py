@@ -23,7 +23,7 @@ from trainer.captures.check_counts import check_bits, check_black_level, check_b
 from trainer.captures.conventions import Predict, Sample, compare_conventions
 from trainer.captures.mismatches import mismatched
 from trainer.captures.png_reader import PictureError, read_picture
-from trainer.captures.problems import Problem
+from trainer.captures.problems import MISREAD, Problem
 
 NOISE_FACTOR = 2.25  # measured noise variance over the camera model's
 NOT_MEASURED = (
@@ -92,6 +92,21 @@ def check_captures(folder: Path | str, predict: Predict, progress: Progress | No
     problems += _camera(bench, statistics)
     problems += _convention(bench, statistics, predict)
     return problems
+
+
+def errors_unless_misread(folder: Path | str, predict: Predict) -> list[Problem]:
+    """The errors of a capture set that can still be used.
+
+    Raises
+    ------
+    InputError
+        Where the captures are misread, so that every number would be wrong.
+    """
+    errors = [p for p in check_captures(folder, predict) if p.severity == "error"]
+    for problem in errors:
+        if problem.kind in MISREAD:
+            raise InputError(problem.message)
+    return errors
 
 
 def _load(capture: Capture, bench: Bench, statistics: _SetStatistics) -> tuple[np.ndarray, np.ndarray]:

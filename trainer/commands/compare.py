@@ -16,6 +16,7 @@ from trainer.commands.inputs import (
     captures_argument,
     inputs_of,
     model_options,
+    note_errors,
     note_what_is_used,
 )
 from trainer.commands.number_text import percent_text, small_text
@@ -48,6 +49,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     """How far a model is from the captures."""
     captures, _, model = inputs_of(args)
     note_what_is_used(captures, screen)
+    note_errors(args.captures, screen)
     from dataclasses import replace
 
     from trainer.diagnosis.comparison import compare

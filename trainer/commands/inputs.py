@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from firmware_iface.errors import InputError
 from runtime.program.screen import Screen
 from runtime.program.version import installed_version
 from trainer.commands.command_line import command_line
 
 if TYPE_CHECKING:
     from trainer.captures.capture_set import CaptureSet
+    from trainer.captures.problems import Problem
     from trainer.effects.effect_catalogue import Catalogue
     from trainer.model.model import Model
 
@@ -109,21 +110,31 @@ def note_what_is_used(captures: CaptureSet, screen: Screen) -> None:
 def refuse_misread(folder: Path, screen: Screen) -> None:
     """Refuse captures that are not what bench.toml says, and warn on stderr of other errors of the set.
 
-    Other errors may be what is to be explained. Dark captures are those that `note_what_is_used` warns of.
+    Other errors may be what is to be explained.
 
     Raises
     ------
     InputError
         Where the captures are misread, so that every number would be wrong.
     """
-    from trainer.captures.check_set import check_captures
-    from trainer.captures.problems import MISREAD
+    from trainer.captures.check_set import errors_unless_misread
     from trainer.model.model_stages import ideal_irradiance
 
-    errors = [p for p in check_captures(folder, ideal_irradiance) if p.severity == "error"]
-    for problem in errors:
-        if problem.kind in MISREAD:
-            raise InputError(problem.message)
+    _note_errors(folder, errors_unless_misread(folder, ideal_irradiance), screen)
+
+
+def note_errors(folder: Path, screen: Screen) -> None:
+    """Warn on stderr of the errors of a set, also of those after which every number is wrong."""
+    from trainer.captures.check_set import check_captures
+    from trainer.model.model_stages import ideal_irradiance
+
+    _note_errors(
+        folder, [p for p in check_captures(folder, ideal_irradiance) if p.severity == "error"], screen
+    )
+
+
+def _note_errors(folder: Path, errors: Sequence[Problem], screen: Screen) -> None:
+    """A warning of one line. Dark captures are those that `note_what_is_used` warns of."""
     errors = [p for p in errors if p.kind != "dark"]
     if errors:
         more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""

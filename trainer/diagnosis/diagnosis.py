@@ -12,7 +12,8 @@ from runtime.excess import PredictionErrors
 from runtime.program.progress import Progress, no_progress
 from trainer.captures.bench_file import Camera
 from trainer.captures.capture_set import CaptureSet
-from trainer.captures.held_out import CaptureRoles, capture_roles
+from trainer.captures.held_out import CaptureRoles, capture_roles, scenes
+from trainer.diagnosis.bench_facts import EqualFact, captures_that_decide, equal_facts, equal_facts_text
 from trainer.diagnosis.probes import ProbeResult, probe
 from trainer.diagnosis.ranking import RankedEffect, rank, try_all, try_together_with_present
 from trainer.diagnosis.screen import ScreenResult, screen
@@ -52,6 +53,11 @@ class Diagnosis:
         All candidates by what the screen expects of them, best first.
     is_held_out : bool
         False where there is only one pattern, so that what is judged is what was fitted.
+    equal_facts : tuple of EqualFact
+        Facts of bench.toml that would explain the captures as well as the model's, or the best candidate's, distance
+        or wavelength does.
+    equal_facts_text : str
+        The same in one sentence; "" for none.
     """
 
     model: Model
@@ -65,6 +71,8 @@ class Diagnosis:
     thresholds: Thresholds
     screened: tuple[ScreenResult, ...] = field(default=())
     is_held_out: bool = True
+    equal_facts: tuple[EqualFact, ...] = ()
+    equal_facts_text: str = ""
 
     @property
     def best(self) -> RankedEffect | None:
@@ -84,7 +92,10 @@ class Diagnosis:
         if below_the_noise(self.held_out):
             return overstated_noise(self.held_out, self.model.bench.camera)
         if self.verdict == "complete":
-            return f"Nothing is missing: what remains above the camera's noise is {left} of the signal's variance."
+            return (
+                f"Nothing is missing: what remains above the camera's noise is {left} of the signal's variance."
+                + f" {self.equal_facts_text}".rstrip()
+            )
         if self.best is None:
             where = f" It is at the {self.stage} stage." if self.stage else " No stage's probe shows where."
             return f"Something is missing that the catalogue does not name (excess {left}).{where}"
@@ -94,6 +105,8 @@ class Diagnosis:
         also = ""
         if best.indistinguishable_from:
             also = f" These captures cannot tell it from {' or '.join(best.indistinguishable_from)}."
+        if self.equal_facts_text:
+            also += f" {self.equal_facts_text}"
         gain = f"it explains {min(share, 100):.0f} % of the excess {left}"
         return f"{best.effect.name} is missing ({size}): {gain}.{also}"
 
@@ -102,7 +115,7 @@ class Diagnosis:
 
         Keys `heldout`, `held_out` (false where the captures hold one pattern), `verdict`, `stage`, `stages`,
         `ranking`, `suggested_captures`, `ideal_excess`, `thresholds`,
-        `screen` and `sentence`.
+        `screen`, `equal_facts` and `sentence`.
         """
         return {
             "heldout": self.held_out.as_json(),
@@ -115,6 +128,7 @@ class Diagnosis:
             "ideal_excess": self.ideal_excess,
             "thresholds": self.thresholds.as_json(),
             "screen": [{"effect": s.effect, "excess_removed": s.removed_excess} for s in self.screened],
+            "equal_facts": [f.as_json() for f in self.equal_facts],
             "sentence": self.sentence,
         }
 
@@ -183,9 +197,11 @@ def diagnose(
             (),
             thresholds,
             is_held_out=roles.is_held_out,
+            equal_facts=equal_facts(model, captures),
+            equal_facts_text=equal_facts_text(model, captures),
         )
 
-    candidates = [e for e in known.values() if e.name not in model.names]
+    candidates = [e for e in known.values() if e.name not in model.names and tells(e, captures)]
     screened = screen_all(roles, model, candidates, pool, report)
     order = sorted(screened, key=lambda s: -s.removed_excess)
     promising = [
@@ -217,7 +233,8 @@ def diagnose(
         # A probe of a few thousand numbers that removes nothing on held-out captures points nowhere.
         telling = [p for p in probes if thresholds.worth_adding(p.removed, ideal_excess, len(probes))]
         stage = max(telling, key=lambda p: p.removed.value).stage if telling else None
-    suggestions = suggest(roles, verdict, ranking)
+    explained = ranking[0].model if verdict == "missing" else model
+    suggestions = captures_that_decide(explained, captures) + suggest(roles, verdict, ranking)
     report(1.0, "done")
     return Diagnosis(
         model,
@@ -231,7 +248,14 @@ def diagnose(
         thresholds,
         tuple(order),
         roles.is_held_out,
+        equal_facts(explained, captures),
+        equal_facts_text(explained, captures),
     )
+
+
+def tells(effect: Effect, captures: CaptureSet) -> bool:
+    """Whether captures can tell an effect from the one that it equals at one colour and plane."""
+    return not effect.same_as or len(scenes(captures.captures)) > 1
 
 
 def screen_all(

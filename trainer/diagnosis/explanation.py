@@ -116,7 +116,7 @@ class Explanation:
         """The object that `explain --json` prints.
 
         Keys `steps`, `verdict`, `stage`, `noise_nrmse`, `model`, `sentence`, `held_out` (false where the captures
-        hold one pattern) and `suggested_captures`.
+        hold one pattern), `suggested_captures` and `equal_facts`.
         """
         return {
             "steps": [s.as_json() for s in self.steps],
@@ -126,7 +126,10 @@ class Explanation:
             "model": str(model_path),
             "sentence": self.diagnosis.sentence,
             "held_out": self.diagnosis.is_held_out,
-            "suggested_captures": [s for d in self.diagnoses for s in d.suggested_captures],
+            "suggested_captures": list(
+                dict.fromkeys(s for d in self.diagnoses for s in d.suggested_captures)
+            ),
+            "equal_facts": [f.as_json() for f in self.diagnosis.equal_facts],
         }
 
 

@@ -168,6 +168,10 @@ def rank(
     """
     complete = thresholds.complete(before.excess, ideal_excess)
     ordered = sorted(fits, key=lambda f: f.held_out.excess)
+    if len(ordered) > 1 and known[ordered[0].effect].same_as == ordered[1].effect:
+        first, second = ordered[:2]
+        if thresholds.inseparable(removed_excess(second.held_out, first.held_out), first.held_out.excess):
+            ordered[:2] = second, first  # of two that the captures cannot tell apart, the plainer
     ranked = []
     for one in ordered:
         removed = removed_excess(before, one.held_out)

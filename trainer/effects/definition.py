@@ -110,6 +110,8 @@ class Effect:
         "built in", or the file that defines it.
     takes_order : bool
         `apply` takes the effect's order as the keyword `order`.
+    same_as : str
+        The effect that it equals in captures of one colour and plane, where it is no candidate; "" for none.
     """
 
     name: str
@@ -125,6 +127,7 @@ class Effect:
     measure: Callable[..., dict[str, Any]] | None = None
     source: str = "built in"
     takes_order: bool = False
+    same_as: str = ""
 
     def parameter(self, name: str) -> Parameter:
         """The parameter of that name."""
@@ -142,6 +145,7 @@ def effect(
     rugged: bool = False,
     measure: Callable[..., dict[str, Any]] | None = None,
     told_to: str | None = None,
+    same_as: str = "",
 ) -> Callable[[Callable[..., Any]], Effect]:
     """Make an effect of a function: its name is the function's, its description the docstring's first line.
 
@@ -150,7 +154,7 @@ def effect(
 
     Parameters
     ----------
-    stage, acts_on, parameters, orders, starts, touches_iris, rugged, measure
+    stage, acts_on, parameters, orders, starts, touches_iris, rugged, measure, same_as
         As in `Effect`.
     told_to : str, optional
         The former name of `acts_on`.
@@ -201,6 +205,7 @@ def effect(
             measure,
             source,
             takes_order,
+            same_as,
         )
 
     return make

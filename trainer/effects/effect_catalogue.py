@@ -27,6 +27,7 @@ BUILT_IN: tuple[Effect, ...] = (
     panel.illumination,
     panel.panel_wavefront,
     pupil.distance,
+    pupil.wavelength,
     pupil.pupil_aberration,
     pupil.iris,
     pupil.temporal_coherence,

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from trainer.effects.definition import Parameter, effect
+from trainer.effects.starts import distance_starts, wavelength_starts
 from trainer.effects.zernike import zernike_count, zernike_maps
 from trainer.prediction.stages import Pupil
 
@@ -25,16 +26,38 @@ FWHM = 2 * math.sqrt(2 * math.log(2))
             "offset",
             "mm",
             scale=0.03,
-            low=-100,
-            high=100,
-            starts=tuple(float(s * d) for d in np.geomspace(0.1, 12, 18) for s in (-1, 1)),
+            low=-1000,
+            high=1000,
             about="how much farther from the panel the image plane is than asked for",
         )
     ],
+    starts=distance_starts,
 )
 def distance(pupil: Pupil, offset: Tensor) -> Pupil:
     """The image plane is not where the captures state it."""
     return replace(pupil, distance=pupil.distance + 1e-3 * offset)
+
+
+@effect(
+    stage="pupil",
+    acts_on="display",
+    same_as="distance",
+    parameters=[
+        Parameter(
+            "offset",
+            "nm",
+            scale=0.3,
+            low=-100,
+            high=100,
+            per_channel=True,
+            about="how much longer each colour's wavelength is than stated",
+        )
+    ],
+    starts=wavelength_starts,
+)
+def wavelength(pupil: Pupil, offset: Tensor) -> Pupil:
+    """A wavelength is not what bench.toml states; in proportion to all distances, as the panel's pitch is."""
+    return pupil.emitting(1e-9 * offset.reshape(1), torch.ones(1, dtype=offset.dtype))
 
 
 @effect(
@@ -95,7 +118,7 @@ def temporal_coherence(pupil: Pupil, line_width: Tensor) -> Pupil:
     nodes, weights = (
         torch.as_tensor(a / s, dtype=line_width.dtype) for a, s in zip(rule, (1, rule[1].sum()), strict=True)
     )
-    return replace(pupil, lines=(nodes * line_width * 1e-9 / FWHM, weights))
+    return pupil.emitting(nodes * line_width * 1e-9 / FWHM, weights)
 
 
 @effect(

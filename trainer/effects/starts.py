@@ -6,18 +6,77 @@ second, displaced picture is found from the cross-correlation of the residual wi
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from trainer.captures.bench_file import Bench
+from trainer.captures.conventions import Sample
+from trainer.captures.distance_search import best_distance
 from trainer.effects.evidence import Evidence
+from trainer.prediction.predict import bare_irradiance
+from trainer.prediction.scene import scene_at
 
 Starts = list[dict[str, Any]]
+SEARCHED = 2  # captures of a colour and plane on which its distance is searched
+_DISTANCES: dict[
+    tuple[Any, ...], float | None
+] = {}  # found before in this process: every diagnosis asks again
 TILE = 64
+
+
+def distance_starts(evidence: Sequence[Evidence]) -> Starts:
+    """The distance at which the first captures fit their patterns best, searched globally."""
+    found = _found_distance(evidence[0])
+    return [{"offset": 0.0}] + ([] if found is None else [{"offset": found - evidence[0].scene.plane_mm}])
+
+
+def wavelength_starts(evidence: Sequence[Evidence]) -> Starts:
+    """Wavelengths by which every colour's captures fit their patterns best at the stated distances."""
+    bench = evidence[0].scene.bench
+    offsets = np.zeros(len(bench.channels))
+    for row, channel in enumerate(bench.channels):
+        scenes = [one for one in evidence if one.scene.channel == channel.name]
+        found = [(_found_distance(one), one.scene.plane_mm) for one in scenes]
+        ratios = [distance / stated for distance, stated in found if distance is not None]
+        if ratios:
+            offsets[row] = channel.wavelength_nm * (float(np.mean(ratios)) - 1)
+    return [{"offset": 0.0 * offsets}, {"offset": offsets}]
+
+
+def _found_distance(evidence: Evidence) -> float | None:
+    """The distance, mm, at which a scene's captures fit their patterns best; None where none has structure."""
+    scene, batch = evidence.scene, evidence.batch
+    digest = hashlib.sha256()
+    for array in (batch.gray, batch.signal, batch.mask):
+        digest.update(array[:SEARCHED].numpy().tobytes())
+    key = (scene.bench, scene.channel, scene.plane_mm, scene.method, digest.digest())
+    if key not in _DISTANCES:
+        if len(_DISTANCES) >= 64:
+            _DISTANCES.clear()
+        samples = [
+            Sample(
+                batch.ids[k],
+                batch.gray[k].numpy().astype(np.uint8),
+                batch.signal[k].float().numpy(),
+                batch.mask[k].numpy() > 0,
+                scene.channel,
+                scene.plane_mm,
+            )
+            for k in range(min(SEARCHED, len(batch.ids)))
+        ]
+
+        def predict(bench: Bench, gray: NDArray, channel: str, plane_mm: float) -> NDArray:
+            return bare_irradiance(scene_at(bench, channel, plane_mm, scene.method, 1.0, torch.float32), gray)
+
+        found = best_distance(scene.bench, samples, predict)
+        _DISTANCES[key] = None if found is None else found.distance_mm
+    return _DISTANCES[key]
 
 
 def displacements(evidence: Evidence) -> tuple[NDArray, NDArray, NDArray]:

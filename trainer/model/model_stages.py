@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -12,9 +13,10 @@ from trainer.captures.bench_file import Bench
 from trainer.effects.own_effect import applied
 from trainer.model.model import EffectInstance, Model
 from trainer.prediction.panel_field import with_field
-from trainer.prediction.predict import light_on_camera, trace
+from trainer.prediction.predict import bare_irradiance
 from trainer.prediction.scene import Scene, Stages, bare_stages, scene_at
 
+REACH_ROOM = 1.05  # how far beyond the stated plane the grid's own room suffices
 IRIS_ROOM = 1.25  # how far an effect may open or move the iris, in units of what the bench says
 
 
@@ -27,7 +29,16 @@ def scene_for(model: Model, channel: str, plane_mm: float, dtype: torch.dtype = 
         Where the propagation method's sampling does not reach the plane.
     """
     opened = IRIS_ROOM if any(p.effect.touches_iris for p in model.present) else 1.0
-    return scene_at(model.bench, channel, plane_mm, model.method, opened, dtype)
+    scene = scene_at(model.bench, channel, plane_mm, model.method, opened, dtype)
+    pupil_effects = tuple(p for p in model.present if p.effect.stage == "pupil")
+    reach_mm = 1e3 * abs(float(stages_for(scene, pupil_effects).pupil.distance))
+    if reach_mm <= REACH_ROOM * abs(plane_mm):
+        return scene
+    # In steps, so that fits whose distance varies a little share their grids.
+    steps = math.ceil(math.log(reach_mm / abs(plane_mm), REACH_ROOM))
+    return scene_at(
+        model.bench, channel, plane_mm, model.method, opened, dtype, abs(plane_mm) * REACH_ROOM**steps
+    )
 
 
 def stages_for(scene: Scene, present: tuple[EffectInstance, ...], tensors: Any = None) -> Stages:
@@ -86,9 +97,4 @@ def ideal_irradiance(bench: Bench, gray: np.ndarray, channel: str, plane_mm: flo
     float32 array [h, w]
         In camera pixels, of arbitrary scale.
     """
-    model = Model(bench)
-    scene = scene_for(model, channel, plane_mm)
-    stages = stages_for(scene, ())
-    with torch.no_grad():
-        patterns = torch.as_tensor(gray.astype(np.int64))[None]
-        return light_on_camera(scene, stages, trace(scene, stages, patterns).image)[0].numpy()
+    return bare_irradiance(scene_for(Model(bench), channel, plane_mm), gray)

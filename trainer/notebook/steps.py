@@ -14,8 +14,7 @@ from typing import Any
 from firmware_iface.errors import InputError
 from runtime.program.progress import Progress
 from trainer.captures.capture_set import CaptureSet, read_captures
-from trainer.captures.check_set import check_captures
-from trainer.captures.problems import MISREAD
+from trainer.captures.check_set import check_captures, errors_unless_misread
 from trainer.commands.inputs import origin
 from trainer.diagnosis.comparison import compare as compare_model
 from trainer.diagnosis.diagnosis import diagnose as diagnose_model
@@ -112,7 +111,7 @@ def diagnose(
         Where a file cannot be read, or the captures are not what bench.toml says.
     """
     taken, known, start = _inputs(captures, model, effects)
-    _refuse_misread(taken)
+    errors_unless_misread(taken.folder, ideal_irradiance)
     with open_pool(workers) as pool:
         return DiagnosisResult(diagnose_model(taken, start, known, pool, thresholds, progress))
 
@@ -153,7 +152,7 @@ def explain(
         Where a file cannot be read, or the captures are not what bench.toml says.
     """
     taken, known, start = _inputs(captures, model, effects)
-    _refuse_misread(taken)
+    errors_unless_misread(taken.folder, ideal_irradiance)
     with open_pool(workers) as pool:
         found = explain_captures(taken, start, known, pool, thresholds, progress=progress)
     return ExplanationResult(taken, found)
@@ -250,10 +249,3 @@ def _inputs(
         known,
         model if isinstance(model, Model) else model_file.read_model(Path(model), known, taken.bench),
     )
-
-
-def _refuse_misread(captures: CaptureSet) -> None:
-    """Raise InputError where the captures are not what bench.toml says: every number would be wrong."""
-    for problem in check_captures(captures.folder, ideal_irradiance):
-        if problem.severity == "error" and problem.kind in MISREAD:
-            raise InputError(problem.message)

@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -66,6 +67,25 @@ def _far_field(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
     return matrices[0], matrices[1]
 
 
+def bare_irradiance(scene: Scene, gray: np.ndarray) -> np.ndarray:
+    """What the bench file alone predicts for one pattern.
+
+    Parameters
+    ----------
+    gray : uint8 array [H, W]
+        Gray levels as sent to the panel.
+
+    Returns
+    -------
+    float32 array [h, w]
+        In camera pixels, of arbitrary scale.
+    """
+    stages = bare_stages(scene)
+    with torch.no_grad():
+        patterns = torch.as_tensor(gray.astype(np.int64))[None]
+        return np.asarray(light_on_camera(scene, stages, trace(scene, stages, patterns).image)[0])
+
+
 def display_filter(stages: Stages) -> Tensor | None:
     """The irradiance filter that applies to the eye too: source extent and ghosts."""
     parts = [f for f in (stages.pupil.irradiance_filter, stages.sensor.irradiance_filter) if f is not None]
@@ -100,7 +120,8 @@ def _modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
     if pupil.transmission is not None:
         opening = opening * pupil.transmission
     grid = scene.grid
-    limits = tuple(band_limit(scene.wavelength, scene.plane_mm * 1e-3, n * grid.pitch) for n in grid.padded)
+    distance = float(pupil.distance.detach())
+    limits = tuple(band_limit(scene.wavelength, distance, n * grid.pitch) for n in grid.padded)
     modes = []
     for offset in offsets:
         wavelength = scene.wavelength + offset

@@ -55,7 +55,13 @@ class Scene:
 
 @lru_cache(maxsize=64)
 def scene_at(
-    bench: Bench, channel: str, plane_mm: float, method: str, opened: float, dtype: torch.dtype
+    bench: Bench,
+    channel: str,
+    plane_mm: float,
+    method: str,
+    opened: float,
+    dtype: torch.dtype,
+    reach_mm: float | None = None,
 ) -> Scene:
     """The scene of a bench at one colour and plane.
 
@@ -63,6 +69,8 @@ def scene_at(
     ----------
     opened : float
         Room for effects that open or move the iris, as a factor on what the bench states.
+    reach_mm : float, optional, mm
+        Room for light that goes farther than to the stated plane.
 
     Raises
     ------
@@ -74,7 +82,7 @@ def scene_at(
     half_width = min(bench.iris.half_width * opened, 1.95)
     distance = plane_mm * 1e-3
     # In the far field nothing walks out of the grid: the image has its own, and the panel needs no room.
-    spread = 0.0 if method == "fraunhofer" else distance
+    spread = 0.0 if method == "fraunhofer" else max(abs(distance), 1e-3 * (reach_mm or 0.0))
     grid = grid_for(panel.shape, panel.pitch, wavelength, spread, half_width)
     check_sampling(
         method,

@@ -150,6 +150,14 @@ class Pupil:
         before = self.path_difference
         return replace(self, path_difference=path_difference if before is None else before + path_difference)
 
+    def emitting(self, offsets: Tensor, weights: Tensor) -> Pupil:
+        """The pupil with each of the laser's lines split into lines at offsets [n], m, with these shares [n]."""
+        if self.lines is None:
+            return replace(self, lines=(offsets, weights))
+        before, shares = self.lines
+        lines = (before[:, None] + offsets).reshape(-1), (shares[:, None] * weights).reshape(-1)
+        return replace(self, lines=lines)
+
     def filtered(self, transfer: Tensor) -> Pupil:
         """The pupil with irradiance filtered by a transfer function over (iy, ix)."""
         before = self.irradiance_filter

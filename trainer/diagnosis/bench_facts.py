@@ -1,0 +1,110 @@
+"""Facts of bench.toml that captures cannot tell from a fitted distance or wavelength.
+
+Near the axis, light from a panel of pixels arrives by wavelength x distance / pitch^2 alone. So at one plane a wrong
+distance, wavelength or pixel pitch is one number. Another plane tells a distance that is off by the same length
+everywhere from the other two; a second colour tells one wrong wavelength from a wrong pitch.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from trainer.captures.bench_file import Bench
+from trainer.captures.capture_set import CaptureSet
+from trainer.formatting import number
+from trainer.model.model import Model
+
+PLANES = (0.6, 1.6)  # proposed planes, as shares of the stated distance
+ALIKE = 3.0  # standard errors up to which two colours are off in the same proportion
+LEAST = 1e-4  # a proportion closer to 1 says nothing of the facts
+
+
+@dataclass(frozen=True)
+class EqualFact:
+    """A fact of bench.toml that would explain the captures as well as a fitted effect.
+
+    Attributes
+    ----------
+    fact : str
+        table.key of bench.toml.
+    stated, value : float
+        As stated, and as it would have to be; in the key's unit.
+    """
+
+    fact: str
+    stated: float
+    value: float
+
+    def as_json(self) -> dict[str, Any]:
+        """Keys `fact`, `stated` and `value`."""
+        return dict(vars(self))
+
+    def __str__(self) -> str:
+        return f"{self.fact} = {number(self.value, 4)} instead of {self.stated:g}"
+
+
+def equal_facts(model: Model, captures: CaptureSet) -> tuple[EqualFact, ...]:
+    """Facts that would explain the captures as well as the model's distance or wavelength does; () for none."""
+    bench, planes = model.bench, captures.planes
+    if "distance" in model.names and len(planes) == 1 and planes[0]:
+        ratio = 1 + float(model.instance("distance").values["offset"]) / planes[0]
+        if abs(ratio - 1) < LEAST or ratio <= 0:
+            return ()
+        return (*_wavelengths(bench, captures, ratio), _pitch(bench, ratio))
+    if "wavelength" in model.names:
+        common = _common_ratio(model, captures)
+        if common is None or abs(common - 1) < LEAST:
+            return ()
+        return (
+            _pitch(bench, common),
+            EqualFact("propagation.distance_mm", bench.distance_mm, bench.distance_mm * common),
+        )
+    return ()
+
+
+def equal_facts_text(model: Model, captures: CaptureSet) -> str:
+    """The same in one sentence; "" for none."""
+    facts = equal_facts(model, captures)
+    if not facts:
+        return ""
+    if "distance" in model.names and len(captures.planes) == 1:
+        where = "At one plane this distance cannot be told from "
+        return where + " or ".join(map(str, facts)) + " in bench.toml."
+    return f"Instead of the wavelength, bench.toml may err in {' or '.join(map(str, facts))}: that is the same here."
+
+
+def captures_that_decide(model: Model, captures: CaptureSet) -> list[str]:
+    """Captures that would tell which fact it is, as sentences."""
+    if not equal_facts(model, captures) or len(captures.planes) > 1:
+        return []
+    plane = captures.planes[0]
+    near, far = (f"{plane * share:.3g}" for share in PLANES)
+    return [
+        f"the same patterns at {near} mm or {far} mm: a wrong distance, and a wrong wavelength or pitch, differ there"
+    ]
+
+
+def _wavelengths(bench: Bench, captures: CaptureSet, ratio: float) -> list[EqualFact]:
+    used = [c for c in bench.channels if c.name in captures.channels]
+    if len(used) > 1:  # every one would have to be off in the same proportion
+        return []
+    return [EqualFact("channel.wavelength_nm", used[0].wavelength_nm, used[0].wavelength_nm * ratio)]
+
+
+def _pitch(bench: Bench, ratio: float) -> EqualFact:
+    return EqualFact("panel.pitch_um", bench.panel.pitch_um, bench.panel.pitch_um / math.sqrt(ratio))
+
+
+def _common_ratio(model: Model, captures: CaptureSet) -> float | None:
+    """By which all used colours' wavelengths are off alike; None where they differ."""
+    present = model.instance("wavelength")
+    rows = [k for k, c in enumerate(model.bench.channels) if c.name in captures.channels]
+    stated = np.array([model.bench.channels[k].wavelength_nm for k in rows])
+    ratios = 1 + present.values["offset"][rows] / stated
+    errors = np.zeros(len(rows)) if present.errors is None else present.errors["offset"][rows] / stated
+    spread = np.abs(ratios - ratios.mean())
+    return float(ratios.mean()) if (spread <= ALIKE * errors + 1e-12).all() else None
