@@ -271,12 +271,6 @@ def test_no_scheduler_is_one_sentence_and_soon(
     pytest.importorskip("distributed")
     assert pool.ANSWER_S <= 5
     monkeypatch.setattr(pool, "ANSWER_S", 1.0)
-    start = time.monotonic()
-    assert main(["check", str(captures.folder), "--json"]) in (0, 1)
-    checked = (
-        time.monotonic() - start
-    )  # the command looks at the captures first; on a busy machine that takes long
-    capsys.readouterr()
     with socket.socket() as free, socket.socket() as silent:
         free.bind(("127.0.0.1", 0))  # taken, so that nobody else listens there
         silent.bind(("127.0.0.1", 0))
@@ -288,7 +282,7 @@ def test_no_scheduler_is_one_sentence_and_soon(
             said = one_line_of_error(capsys)
             assert f"no Dask scheduler answers at '{address}'" in said
             assert address != addresses[0] or "nobody answers there: the connection was refused" in said
-            assert time.monotonic() - start < 5 + 2 * checked
+            assert time.monotonic() - start < 5
 
 
 def test_a_scheduler_without_workers_is_one_sentence(captures: CaptureSet, capsys: Any) -> None:

@@ -37,13 +37,15 @@ def run(args: Namespace, screen: Screen) -> Result:
     """What is missing from a model."""
     thresholds = thresholds_of(args)
     captures, known, model = inputs_of(args)
-    note_what_is_used(captures, screen)
-    refuse_misread(args.captures, screen)
     from trainer.diagnosis.diagnosis import diagnose
     from trainer.fitting.pool import open_pool
 
-    with screen.progress("diagnosing") as progress, open_pool(workers_of(args), args.cluster) as pool:
-        found = diagnose(captures, model, known, pool, thresholds, progress)
+    # First: a cluster that does not answer is known at once, before the pictures are looked at.
+    with open_pool(workers_of(args), args.cluster) as pool:
+        note_what_is_used(captures, screen)
+        refuse_misread(args.captures, screen)
+        with screen.progress("diagnosing") as progress:
+            found = diagnose(captures, model, known, pool, thresholds, progress)
     if args.report:
         from trainer.diagnosis.comparison import compare
         from trainer.report import write_report

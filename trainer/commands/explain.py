@@ -54,8 +54,6 @@ def run(args: Namespace, screen: Screen) -> Result:
     """
     thresholds = thresholds_of(args)
     captures, known, model = inputs_of(args)
-    note_what_is_used(captures, screen)
-    refuse_misread(args.captures, screen)
     from trainer.diagnosis.explanation import explain
     from trainer.fitting.pool import open_pool
     from trainer.model.model_file import write_model
@@ -75,8 +73,12 @@ def run(args: Namespace, screen: Screen) -> Result:
             saved.append(better.names)
 
     try:
-        with screen.progress("explaining") as progress, open_pool(workers_of(args), args.cluster) as pool:
-            found = explain(captures, model, known, pool, thresholds, save, progress)
+        # First: a cluster that does not answer is known at once, before the pictures are looked at.
+        with open_pool(workers_of(args), args.cluster) as pool:
+            note_what_is_used(captures, screen)
+            refuse_misread(args.captures, screen)
+            with screen.progress("explaining") as progress:
+                found = explain(captures, model, known, pool, thresholds, save, progress)
         save(found.model, is_last=True)
         if args.report:
             from trainer.diagnosis.comparison import compare

@@ -1,0 +1,96 @@
+"""Benches whose bench.toml states a wrong distance, wavelength or pixel pitch."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.trainer.hidden import bench_file, captured, ran
+from trainer.cli import main
+
+TWO_PLANES = ("--planes", "10,18", "--patterns", 6)
+
+
+def state(captures: Path, key: str, value: float) -> None:
+    """Make bench.toml state another value of a key."""
+    path = captures / "bench.toml"
+    text, count = re.subn(rf"(?m)^{key} = .*$", f"{key} = {value}", path.read_text())
+    assert count == 1
+    path.write_text(text)
+
+
+def explained(capsys, captures: Path, folder: Path) -> dict:
+    return ran(capsys, "explain", captures, "--out", folder / "model.toml", "--workers", 1)
+
+
+@pytest.mark.parametrize(("key", "stated", "true"), [("pitch_um", 7.9, 8.0), ("wavelength_nm", 522.0, 520.0)])
+def test_at_one_plane_the_equivalent_facts_are_said(key, stated, true, tmp_path, capsys) -> None:
+    captures = captured(capsys, tmp_path)
+    state(captures, key, stated)
+    found = explained(capsys, captures, tmp_path)
+    assert [s["added"] for s in found["steps"]] == [None, "distance"]
+    assert found["verdict"] == "complete"
+    facts = {f["fact"].split(".")[-1]: f for f in found["equal_facts"]}
+    assert set(facts) == {"wavelength_nm", "pitch_um"}
+    assert facts[key]["stated"] == stated and facts[key]["value"] == pytest.approx(true, rel=2e-4)
+    assert "pitch_um" in found["sentence"] and "wavelength_nm" in found["sentence"]
+    assert any("another" in s or "a wrong distance" in s for s in found["suggested_captures"])
+
+
+def test_two_planes_tell_a_wrong_pitch_from_a_wrong_distance(tmp_path, capsys) -> None:
+    captures = captured(capsys, tmp_path, options=TWO_PLANES)
+    state(captures, "pitch_um", 7.9)
+    found = explained(capsys, captures, tmp_path)
+    assert [s["added"] for s in found["steps"]] == [None, "wavelength"]
+    assert found["verdict"] == "complete"
+    facts = {f["fact"]: f["value"] for f in found["equal_facts"]}
+    assert facts["panel.pitch_um"] == pytest.approx(8.0, rel=2e-4)
+
+
+def test_two_planes_show_a_wrong_distance_as_such(tmp_path, capsys) -> None:
+    captures = captured(capsys, tmp_path, 'kind = "distance"\noffset_mm = 1.0', options=TWO_PLANES)
+    found = explained(capsys, captures, tmp_path)
+    assert [s["added"] for s in found["steps"]] == [None, "distance"]
+    assert found["verdict"] == "complete" and found["equal_facts"] == []
+
+
+@pytest.mark.parametrize(("stated", "true"), [(10, 30), (30, 12), (20, 50)])
+def test_a_distance_far_from_the_stated_one_is_found(stated, true, tmp_path, capsys) -> None:
+    bench = bench_file(tmp_path, distance_mm=true)
+    captures = tmp_path / "captures"
+    ran(capsys, "capture", "--bench", bench, "--out", captures)
+    state(captures, "distance_mm", float(stated))
+    table = captures / "captures.csv"
+    table.write_text(table.read_text().replace(f",{true:.1f},", f",{stated:.1f},"))
+    problems = ran(capsys, "check", captures)["problems"]
+    assert [(p["severity"], p["kind"]) for p in problems] in ([("warning", "distance")], [])
+    added = ran(capsys, "add", "distance", captures, "--out", tmp_path / "model.toml")
+    assert added["parameters"]["offset_mm"]["value"] == pytest.approx(true - stated, abs=0.02)
+    assert added["after"]["excess"] < 3e-4
+
+
+def test_pictures_that_fit_no_pattern_are_refused(tmp_path, capsys) -> None:
+    captures = captured(capsys, tmp_path)
+    rng = np.random.default_rng(0)
+    for path in (captures / "image").glob("*.png"):
+        Image.fromarray(rng.permuted(np.asarray(Image.open(path)).ravel()).reshape(128, 160)).save(path)
+    assert main(["explain", str(captures), "--out", str(tmp_path / "model.toml")]) == 2
+    assert "fits any of their patterns" in capsys.readouterr().err
+    assert main(["compare", str(captures), "--json"]) == 0
+    assert "fits any of their patterns" in capsys.readouterr().err
+
+
+def test_images_moved_far_are_not_taken_for_the_wrong_ones(tmp_path, capsys) -> None:
+    captures = captured(capsys, tmp_path)
+    table = captures / "captures.csv"  # smooth pictures also fit when they are moved
+    head, *rows = table.read_text().splitlines()
+    table.write_text("\n".join([head, *(r for r in rows if ",random," in r or ",grains," in r)]) + "\n")
+    for path in (captures / "image").glob("*.png"):
+        Image.fromarray(np.roll(np.asarray(Image.open(path)), (31, 44), axis=(0, 1))).save(path)
+    problems = ran(capsys, "check", captures)["problems"]
+    assert [p["kind"] for p in problems if p["kind"] != "too_few"] == ["shifted"]
+    assert "-31 rows and -44 columns" in problems[-1]["message"]
