@@ -158,4 +158,4 @@ def test_one_of_the_two_numbers_alone_is_refused(tmp_path, capsys) -> None:
     captures = captured(capsys, tmp_path)
     edit(captures, "read_noise_e = 5.0\n", "")
     assert main(["compare", str(captures)]) == 2
-    assert "full_well_e and read_noise_e" in capsys.readouterr().err
+    assert "camera.read_noise_e is missing" in capsys.readouterr().err

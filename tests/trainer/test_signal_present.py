@@ -82,6 +82,10 @@ def test_equal_gray_levels_are_one_pattern_in_their_channel_whatever_the_table_s
     a, b, *rest = read_captures(captures.folder).captures
     assert a.pattern == b.pattern == "other"
     assert [c.pattern for c in rest] == ["green-1", "green-2", "green-3"]
+    gray = Image.open(b.phase).copy()
+    gray.save(b.phase, compress_level=0)  # other bytes, the same gray levels
+    assert b.phase.read_bytes() != a.phase.read_bytes()
+    assert read_captures(captures.folder).captures[1].pattern == "other"
 
 
 @pytest.mark.parametrize("column", ["pattern", "time_s"])

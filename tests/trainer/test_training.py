@@ -343,7 +343,7 @@ def test_a_second_training_in_a_folder_is_refused_and_a_dead_ones_lock_is_not(
 
 
 def test_a_folder_of_something_else_is_refused_and_a_run_of_other_settings_replaced_on_request(
-    captures: CaptureSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    captures: CaptureSet, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "run"
     out.mkdir()
@@ -355,7 +355,9 @@ def test_a_folder_of_something_else_is_refused_and_a_run_of_other_settings_repla
     assert "thesis.tex" in capsys.readouterr().err
     (out / "thesis.tex").unlink()
     assert main(words) == 0
-    assert main([*words, "--l1", "3"]) == 2
+    with monkeypatch.context() as before_any_work:
+        before_any_work.setattr("trainer.training.training_sets.training_sets", None)
+        assert main([*words, "--l1", "3"]) == 2
     assert "another recipe: give another --out, or --overwrite" in capsys.readouterr().err
     assert main([*words, "--l1", "3", "--overwrite"]) == 0
 

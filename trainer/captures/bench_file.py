@@ -294,13 +294,13 @@ def _bench(tables: Mapping[str, Any]) -> Bench:
 
 
 def _camera(values: dict[str, Any], given_table: Mapping[str, Any], panel: Panel) -> Camera:
-    noise = [key for key in ("full_well_e", "read_noise_e") if key in given_table]
-    if len(noise) == 1:
+    missing = [key for key in ("full_well_e", "read_noise_e") if key not in given_table]
+    if len(missing) == 1:
         raise InputError(
-            f"camera.{noise[0]} is given alone: write full_well_e and read_noise_e, both in electrons, or neither to "
-            "have them measured from repeated captures"
+            f"camera.{missing[0]} is missing in bench.toml: write full_well_e and read_noise_e, both in electrons, or "
+            "leave out both to have them measured from repeated captures"
         )
-    values["noise_stated"] = bool(noise)
+    values["noise_stated"] = not missing
     camera = Camera(**{**values, "homography": None})
     if camera.black_level >= camera.saturation:
         raise InputError(

@@ -3,40 +3,38 @@
 from __future__ import annotations
 
 import hashlib
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
+
+import numpy as np
+from PIL import Image
 
 from trainer.captures.capture_table import Capture
 
 
 def one_name_each(captures: Sequence[Capture]) -> list[Capture]:
-    """The captures, where those of one channel with the same pattern file have the name of the first of them.
+    """The captures, where those of one channel with the same gray levels have the name of the first of them.
 
-    Files are the same where they have the same path or the same bytes. Only files of equal size are read, since
-    others cannot be the same. A file that cannot be read keeps its name: whoever opens the picture reports it.
+    A file that cannot be read keeps its name: whoever opens the picture reports it.
     """
-    contents = _contents({c.phase for c in captures})
+    contents = {path: _content(path) for path in {c.phase for c in captures}}
     first: dict[tuple[str, str], str] = {}
     return [replace(c, pattern=first.setdefault((c.channel, contents[c.phase]), c.pattern)) for c in captures]
 
 
-def _contents(paths: set[Path]) -> dict[Path, str]:
-    """A text for each file that is the same for files of the same bytes."""
-    sizes: dict[Path, int] = {}
-    for path in paths:
-        try:
-            sizes[path] = path.stat().st_size
-        except OSError:
-            sizes[path] = -1
-    number = Counter(sizes.values())
-    found = {path: str(path) for path in paths}
-    for path, size in sizes.items():
-        if size >= 0 and number[size] > 1:
-            try:
-                with path.open("rb") as stream:
-                    found[path] = hashlib.file_digest(stream, "sha256").hexdigest()
-            except OSError:
-                continue
-    return found
+def _content(path: Path) -> str:
+    """A text that is the same for files of the same gray levels, and for no others."""
+    try:
+        about = path.stat()
+        return _digest(path, about.st_mtime_ns, about.st_size)
+    except Exception:  # any fault of the file is for its reader to report
+        return str(path)
+
+
+@lru_cache(maxsize=100_000)
+def _digest(path: Path, changed: int, size: int) -> str:
+    with Image.open(path, formats=["PNG"]) as picture:
+        gray = np.asarray(picture)
+    return hashlib.sha256(f"{gray.shape} {gray.dtype}".encode() + gray.tobytes()).hexdigest()

@@ -7,7 +7,14 @@ from argparse import ArgumentParser, Namespace
 from runtime.program.command import Command, Result
 from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
-from trainer.commands.inputs import captures_argument, inputs_of, model_options, note_what_is_used, origin
+from trainer.commands.inputs import (
+    captures_argument,
+    inputs_of,
+    judged_on,
+    model_options,
+    note_what_is_used,
+    origin,
+)
 from trainer.commands.number_text import sizes_text, small_text
 from trainer.commands.outputs import model_out, out_option
 from trainer.commands.workers import use_every_core
@@ -30,6 +37,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     effect = find_effect(catalogue(args.effects), args.effect)
     captures, known, model = inputs_of(args)
     note_what_is_used(captures, screen)
+    from trainer.captures.held_out import split
     from trainer.diagnosis.explanation import add
     from trainer.model.model_file import write_model
 
@@ -37,7 +45,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     with screen.progress(f"adding {effect.name}") as progress:
         found = add(captures, model, effect, known, progress)
     write_model(args.out, found.model, origin(captures))
-    return found.as_json()
+    return {**found.as_json(), "held_out": split(captures).is_held_out}
 
 
 def show(result: Result, args: Namespace, screen: Screen) -> None:
@@ -50,7 +58,7 @@ def show(result: Result, args: Namespace, screen: Screen) -> None:
     gained = "which is no gain: leave it out" if worse else f"from {small_text(before['excess'])}"
     screen.say(
         f"With {args.effect} ({size}), "
-        f"the excess on held-out captures is {small_text(after['excess'])}, {gained}.",
+        f"the excess on {judged_on(result)} is {small_text(after['excess'])}, {gained}.",
         style="yellow" if worse else "bold",
     )
     screen.table(

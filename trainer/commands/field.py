@@ -7,7 +7,14 @@ from argparse import ArgumentParser, Namespace
 from runtime.program.command import Command, Result
 from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
-from trainer.commands.inputs import captures_argument, inputs_of, model_options, note_what_is_used, origin
+from trainer.commands.inputs import (
+    captures_argument,
+    inputs_of,
+    judged_on,
+    model_options,
+    note_what_is_used,
+    origin,
+)
 from trainer.commands.outputs import model_out, out_option
 from trainer.commands.workers import use_every_core
 
@@ -23,6 +30,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     """A field learned at the panel, in a model."""
     captures, _, model = inputs_of(args)
     note_what_is_used(captures, screen)
+    from trainer.captures.held_out import split
     from trainer.fitting.learned_field import learn_field
     from trainer.model.model_file import write_model
 
@@ -30,7 +38,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     with screen.progress("learning the field at the panel") as progress:
         found = learn_field(captures, model, progress)
     write_model(args.out, found.model, origin(captures))
-    return {"model": str(args.out), **found.as_json()}
+    return {"model": str(args.out), **found.as_json(), "held_out": split(captures).is_held_out}
 
 
 def show(result: Result, args: Namespace, screen: Screen) -> None:
@@ -39,7 +47,7 @@ def show(result: Result, args: Namespace, screen: Screen) -> None:
     worse = after >= before
     gained = "which is no gain: leave it out" if worse else f"from {before:.2g}"
     screen.say(
-        f"With a learned field at the panel the excess on held-out captures is {after:.2g}, {gained}.",
+        f"With a learned field at the panel the excess on {judged_on(result)} is {after:.2g}, {gained}.",
         style="yellow" if worse else "bold",
     )
     screen.table(

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from runtime.program.command import Result
 from runtime.program.screen import Screen
 from runtime.program.version import installed_version
 from trainer.commands.command_line import command_line
@@ -71,6 +72,13 @@ def inputs_of(args: Namespace) -> tuple[CaptureSet, Catalogue, Model]:
     known = catalogue(args.effects)
     model = read_model(args.model, known, captures.bench) if args.model else Model(captures.bench)
     return captures, known, model
+
+
+def judged_on(result: Result) -> str:
+    """What an error is of, in words: the key `held_out` of a result says whether anything was held out."""
+    return (
+        "held-out captures" if result.get("held_out", True) else "the captured pattern, which was fitted too,"
+    )
 
 
 def origin(captures: CaptureSet) -> dict[str, Any]:

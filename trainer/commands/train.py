@@ -115,14 +115,18 @@ def _train(args: Namespace, screen: Screen, first: bool, stepped: Callable[[int]
     from dataclasses import asdict
 
     from trainer.networks.approximator import read_approximator
+    from trainer.training.checkpoint import refuse_other_run
     from trainer.training.image_metrics import noise_floor, prediction_metrics
     from trainer.training.pretrained_networks import left_out, read_pretrained
     from trainer.training.run_lock import RUNNING
-    from trainer.training.training_run import NETWORK, train
+    from trainer.training.training_run import NETWORK, refuse_without_loss, train
     from trainer.training.training_sets import training_sets
 
     recipe = _recipe(args)
     judges = read_pretrained(args.vgg, args.lpips)
+    refuse_without_loss(recipe, judges)
+    if not args.overwrite:
+        refuse_other_run(args.out, {"recipe": asdict(recipe), "seed": args.seed})
     captures, _, model = inputs_of(args)
     use_every_core()
     with screen.progress("predicting") as progress:

@@ -40,21 +40,45 @@ def read_checkpoint(folder: Path, settings: dict[str, Any], device: torch.device
     InputError
         Where the checkpoint cannot be read, or is of a run with other settings.
     """
+    state = _read(folder, device)
+    if state is not None:
+        before = state["settings"]
+        _refuse_other(folder, before, settings, [*{**before, **settings}])
+    return state
+
+
+def refuse_other_run(folder: Path, settings: dict[str, Any]) -> None:
+    """Refuse to continue a run whose checkpoint has other values of these settings, before any work is done.
+
+    Raises
+    ------
+    InputError
+        As `read_checkpoint`.
+    """
+    state = _read(folder, torch.device("cpu"))
+    if state is not None:
+        _refuse_other(folder, state["settings"], settings, list(settings))
+
+
+def _read(folder: Path, device: torch.device) -> dict[str, Any] | None:
     path = folder / CHECKPOINT
     if not path.is_file():
         return None
     try:
         state: dict[str, Any] = torch.load(path, map_location=device, weights_only=True)
-        before = state["settings"]
+        _ = state["settings"].items()
     except Exception as error:
         reason = str(error).splitlines()[0][:80] if str(error) else type(error).__name__
         raise InputError(f"{path} cannot be read ({reason}): remove it or give another --out") from None
-    if _plain(before) != _plain(settings):
-        wrong = next(k for k in {**before, **settings} if _plain(before.get(k)) != _plain(settings.get(k)))
-        raise InputError(
-            f"{folder} holds a training with another {wrong}: give another --out, or --overwrite to begin anew"
-        )
     return state
+
+
+def _refuse_other(folder: Path, before: dict[str, Any], settings: dict[str, Any], keys: list[str]) -> None:
+    for key in keys:
+        if _plain(before.get(key)) != _plain(settings.get(key)):
+            raise InputError(
+                f"{folder} holds a training with another {key}: give another --out, or --overwrite to begin anew"
+            )
 
 
 def _plain(value: Any) -> Any:

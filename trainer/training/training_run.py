@@ -40,6 +40,14 @@ EVERY = 500  # steps between checkpoints and between metrics of the held-out pic
 StepReport = Callable[[int, float], None]
 
 
+def refuse_without_loss(recipe: Recipe, pretrained: PretrainedNetworks) -> None:
+    """Raise InputError where nothing would be learned, since no loss has a weight."""
+    if recipe.l1 == recipe.adversarial == recipe.matching == 0 and pretrained.perceptual is None:
+        raise InputError(
+            "every loss has weight zero or lacks its weights file: give --l1 or another a weight"
+        )
+
+
 def train(
     pairs: Pairs,
     recipe: Recipe,
@@ -123,10 +131,7 @@ class _TrainingRun:
         every: int,
         about: dict[str, Any],
     ) -> None:
-        if recipe.l1 == recipe.adversarial == recipe.matching == 0 and pretrained.perceptual is None:
-            raise InputError(
-                "every loss has weight zero or lacks its weights file: give --l1 or another a weight"
-            )
+        refuse_without_loss(recipe, pretrained)
         self.fabric = launched_fabric(folder)
         self.pairs, self.recipe, self.steps = pairs, recipe, steps
         self.folder, self.every, self.seed, self.about = folder, every, seed, about
