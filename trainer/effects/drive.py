@@ -48,7 +48,7 @@ REACH = 2  # neighbours on either side that act on a pixel
             terms=curve_terms,
         ),
     ],
-    formula=r"\varphi(g) = 2\pi a\,t + 4t(1-t)\sum_n c_n P_n(2t-1), \qquad t = g/256",
+    formula=r"\varphi(g) = 2\pi a\,t + 4t(1-t)\sum_n\,c_n P_n(2t-1), \qquad t = g/256",
 )
 def phase_response(drive: Drive, gain: Tensor, curvature: Tensor) -> Drive:
     """Gray to phase is not the straight line that the bench file states.
@@ -87,7 +87,7 @@ def phase_response(drive: Drive, gain: Tensor, curvature: Tensor) -> Drive:
             terms=surface_terms,
         )
     ],
-    formula=r"\varphi'(x,y) = \varphi(x,y)\,\Bigl[1 + \sum_{i,j} m_{ij}\,P_i(y)\,P_j(x)\Bigr]",
+    formula=r"\varphi'(x,y) = \varphi(x,y)\,\Bigl[1 + \sum_{i,j}\,m_{ij}\,P_i(y)\,P_j(x)\Bigr]",
 )
 def phase_nonuniformity(drive: Drive, map: Tensor) -> Drive:
     """The phase's gain varies over the panel, as the cell's thickness does.
@@ -136,8 +136,8 @@ def phase_nonuniformity(drive: Drive, map: Tensor) -> Drive:
         Parameter("asymmetry_x", "1", scale=0.2, low=-1, high=1, typical=(-1, 1)),
     ],
     formula=(
-        r"\varphi' = k_y * k_x * \varphi, \qquad k(x) \propto \begin{cases} e^{-x/r_+} & x \ge 0"
-        r" \\ e^{\,x/r_-} & x < 0 \end{cases}, \qquad r_\pm = \tfrac{w}{\sqrt 2}\,(1 \pm a)"
+        r"\varphi' = k_y * k_x * \varphi, \qquad k(x) \propto e^{-|x|/r_\pm}, "
+        r"\qquad r_\pm = \frac{w}{\sqrt{2}}\,(1 \pm a) \ \mathrm{for}\ x \gtrless 0"
     ),
 )
 def crosstalk(

@@ -61,7 +61,7 @@ from trainer.prediction.stages import Panel
         ),
     ],
     formula=(
-        r"u = S\,e^{j\varphi} * \operatorname{rect}_{\sqrt F} + \ell\,S\,e^{j\psi(x,y)}, \qquad"
+        r"u = S\,e^{j\varphi} * \mathrm{rect}_{\sqrt{F}} + \ell\,S\,e^{j\psi(x,y)}, \qquad"
         r" \ell = \ell_\mathrm{r} + j\,\ell_\mathrm{i}"
     ),
 )
@@ -104,7 +104,7 @@ def zero_order(
             terms=surface_terms,
         )
     ],
-    formula=r"u' = u\,\exp\Bigl[\sum_{i,j} a_{ij}\,P_i(y)\,P_j(x)\Bigr]",
+    formula=r"u' = u\,\exp\Bigl[\sum_{i,j}\,a_{ij}\,P_i(y)\,P_j(x)\Bigr]",
 )
 def illumination(panel: Panel, log_amplitude: Tensor) -> Panel:
     """The beam that lights the panel is not uniform.
@@ -139,7 +139,7 @@ def illumination(panel: Panel, log_amplitude: Tensor) -> Panel:
             terms=surface_terms,
         )
     ],
-    formula=r"u' = u\,\exp\Bigl[\,j\,\frac{\lambda_1}{\lambda} \sum_{i,j} w_{ij}\,P_i(y)\,P_j(x)\Bigr]",
+    formula=r"u' = u\,\exp\Bigl[\,j\,\dfrac{\lambda_1}{\lambda} \sum_{i,j}\,w_{ij}\,P_i(y)\,P_j(x)\Bigr]",
 )
 def panel_wavefront(panel: Panel, wavefront: Tensor) -> Panel:
     """The beam or the panel is not flat.

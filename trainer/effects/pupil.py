@@ -70,7 +70,7 @@ def distance(pupil: Pupil, offset: Tensor) -> Pupil:
             terms=aberration_terms,
         )
     ],
-    formula=r"H' = H\,\exp\Bigl[\,2\pi j\,\frac{\lambda_1}{\lambda} \sum_k z_k\,Z_k(u, v)\Bigr]",
+    formula=r"H' = H\,\exp\Bigl[\,2\pi j\,\dfrac{\lambda_1}{\lambda} \sum_k\,z_k\,Z_k(u, v)\Bigr]",
 )
 def pupil_aberration(pupil: Pupil, zernike: Tensor, *, order: int) -> Pupil:
     """The relay aberrates (without piston, tilt or defocus, which other effects describe).
@@ -108,10 +108,7 @@ def pupil_aberration(pupil: Pupil, zernike: Tensor, *, order: int) -> Pupil:
         Parameter("centre_y", "share of band", scale=0.02, low=-0.9, high=0.9, typical=(-0.4, 0.4)),
         Parameter("centre_x", "share of band", scale=0.02, low=-0.9, high=0.9, typical=(-0.4, 0.4)),
     ],
-    formula=(
-        r"A(u,v) = \begin{cases} 1 & |u - c_x| \le w \text{ and } |v - c_y| \le w \\ 0 &"
-        r" \text{elsewhere} \end{cases}"
-    ),
+    formula=r"A(u,v) = \mathrm{rect}\dfrac{u - c_x}{2w}\;\mathrm{rect}\dfrac{v - c_y}{2w}",
 )
 def iris(pupil: Pupil, half_width: Tensor, centre_y: Tensor, centre_x: Tensor) -> Pupil:
     """The filter in the Fourier plane has another size or place than stated.
@@ -226,7 +223,7 @@ def temporal_coherence(pupil: Pupil, line_width: Tensor) -> Pupil:
         ),
     ],
     formula=(
-        r"\hat I' = \hat I\,\Bigl[(1-h)\,e^{-w^2/2 + \kappa w^4/24} + h\,e^{-w_h^2/2}\Bigr],"
+        r"\hat{I}' = \hat{I}\,\Bigl[(1-h)\,e^{-w^2/2 + \kappa w^4/24} + h\,e^{-w_h^2/2}\Bigr],"
         r" \qquad w = 2\pi z \sqrt{(\theta_x f_x)^2 + (\theta_y f_y)^2}"
     ),
 )

@@ -75,7 +75,7 @@ from trainer.prediction.stages import Sensor
         ),
     ],
     formula=(
-        r"\hat I' = \hat I\,\Bigl[(1-h)\,e^{-w^2/2 + \kappa w^4/24} + h\,e^{-w_h^2/2}\Bigr],"
+        r"\hat{I}' = \hat{I}\,\Bigl[(1-h)\,e^{-w^2/2 + \kappa w^4/24} + h\,e^{-w_h^2/2}\Bigr],"
         r" \qquad w = 2\pi \sqrt{(\sigma_x f_x)^2 + (\sigma_y f_y)^2}"
     ),
 )
@@ -127,8 +127,8 @@ def sensor_blur(
         ),
     ],
     formula=(
-        r"I'(\mathbf r) = I\bigl(\mathbf r + \mathbf s + m\,\mathbf r + \theta\,\mathbf r^{\perp}"
-        r" + \mathbf d(\mathbf r)\bigr)"
+        r"I'(\mathbf{r}) = I\bigl(\mathbf{r} + \mathbf{s} + m\,\mathbf{r} + \theta\,\mathbf{r}^{\perp}"
+        r" + \mathbf{d}(\mathbf{r})\bigr)"
     ),
 )
 def misregistration(
@@ -179,7 +179,7 @@ def misregistration(
             terms=surface_terms,
         )
     ],
-    formula=r"I' = I\,\exp\Bigl[\sum_{i,j} g_{ij}\,P_i(y)\,P_j(x)\Bigr]",
+    formula=r"I' = I\,\exp\Bigl[\sum_{i,j}\,g_{ij}\,P_i(y)\,P_j(x)\Bigr]",
 )
 def vignetting(sensor: Sensor, log_gain: Tensor) -> Sensor:
     """The camera's sensitivity falls off over the field.
@@ -213,7 +213,7 @@ def vignetting(sensor: Sensor, log_gain: Tensor) -> Sensor:
             terms=surface_terms_with_mean,
         )
     ],
-    formula=r"N' = N + \sum_{i,j} b_{ij}\,P_i(y)\,P_j(x)",
+    formula=r"N' = N + \sum_{i,j}\,b_{ij}\,P_i(y)\,P_j(x)",
 )
 def stray_light(sensor: Sensor, counts: Tensor) -> Sensor:
     """Light is simply added, smooth over the picture.
@@ -246,7 +246,7 @@ def stray_light(sensor: Sensor, counts: Tensor) -> Sensor:
             terms=curve_terms,
         )
     ],
-    formula=r"s' = s + s\,(1-s)\sum_n b_n P_n(2s-1), \qquad s = N / N_\text{full scale}",
+    formula=r"s' = s + s\,(1-s)\sum_n\,b_n P_n(2s-1), \qquad s = N / N_\mathrm{full\ scale}",
 )
 def sensor_response(sensor: Sensor, bend: Tensor) -> Sensor:
     """Counts are not proportional to light.
@@ -287,7 +287,7 @@ def sensor_response(sensor: Sensor, bend: Tensor) -> Sensor:
             example=8.0,
         )
     ],
-    formula=r"N'_k = g_k\,N_k, \qquad \operatorname{rms}(g_k - 1) = \sigma",
+    formula=r"N'_k = g_k\,N_k, \qquad \mathrm{rms}(g_k - 1) = \sigma",
 )
 def laser_drift(sensor: Sensor, spread: Tensor) -> Sensor:
     """The laser's power varies from capture to capture: each capture has its own gain, measured from it.
@@ -326,7 +326,7 @@ def laser_drift(sensor: Sensor, spread: Tensor) -> Sensor:
             typical=(0, 5),
         ),
     ],
-    formula=r"I'(\mathbf r) = I(\mathbf r) + a\,\bigl(G_b * I\bigr)(\mathbf r - \mathbf s)",
+    formula=r"I'(\mathbf{r}) = I(\mathbf{r}) + a\,\bigl(G_b * I\bigr)(\mathbf{r} - \mathbf{s})",
 )
 def ghost(sensor: Sensor, amplitude: Tensor, shift_y: Tensor, shift_x: Tensor, blur: Tensor) -> Sensor:
     """A second, weak, displaced image, as from a reflection in a window.

@@ -1,0 +1,53 @@
+"""A slider and a number field for one value, which carry their name for screen readers and work from the keyboard."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import param
+from panel.reactive import ReactiveHTML
+
+
+class LabelledSlider(ReactiveHTML):
+    """A native slider with its name, and its value as a field to type in.
+
+    Attributes
+    ----------
+    label, about : str
+        The name that is shown and spoken, and what a pointer over it shows.
+    low, high, step : float
+        Range, and the change of one key press.
+    value : float
+        In four digits or fewer, so that the field shows what is meant.
+    """
+
+    label = param.String(default="value")
+    about = param.String(default="")
+    low = param.Number(default=0.0)
+    high = param.Number(default=1.0)
+    step = param.Number(default=0.01)
+    value = param.Number(default=0.0)
+
+    _template = """
+    <div id="box" class="labelled-slider" title="{{ about }}">
+      <span id="name" class="name">{{ label }}</span>
+      <input id="number" class="number" type="number" min="${low}" max="${high}" step="any"
+             value="${value}" aria-label="{{ label }}, as a number"/>
+      <input id="range" class="range" type="range" min="${low}" max="${high}" step="${step}"
+             value="${value}" aria-label="{{ label }}"/>
+    </div>
+    """
+    _dom_events: ClassVar[dict[str, list[str]]] = {"range": ["input"], "number": ["change"]}
+    _stylesheets: ClassVar[list[str]] = [
+        """
+        .labelled-slider { display: grid; grid-template-columns: 1fr 5.4em; align-items: center; gap: 1px 8px; }
+        .name { overflow: hidden; text-overflow: ellipsis; white-space: nowrap; }
+        .number { grid-row: 1; grid-column: 2; width: 100%; box-sizing: border-box; text-align: right; font: inherit;
+          font-variant-numeric: tabular-nums; color: inherit; background: transparent; padding: 1px 4px;
+          border: 1px solid color-mix(in srgb, currentColor 30%, transparent); border-radius: 4px;
+          appearance: textfield; }
+        .number::-webkit-inner-spin-button { display: none; }
+        .range { grid-column: 1 / -1; width: 100%; margin: 0; height: 20px; accent-color: var(--accent, #2f7fbf); }
+        input:focus-visible { outline: 2px solid var(--accent, #2f7fbf); outline-offset: 1px; }
+        """
+    ]
