@@ -119,7 +119,7 @@ def phase_nonuniformity(drive: Drive, map: Tensor) -> Drive:
             even=True,
             starts=(0.1, 0.3),
             typical=(0, 0.5),
-            example=0.12,
+            example=0.05,
         ),
         Parameter(
             "width_x",
@@ -130,7 +130,7 @@ def phase_nonuniformity(drive: Drive, map: Tensor) -> Drive:
             even=True,
             starts=(0.1, 0.3),
             typical=(0, 0.5),
-            example=0.12,
+            example=0.05,
         ),
         Parameter("asymmetry_y", "1", scale=0.2, low=-1, high=1, typical=(-1, 1)),
         Parameter("asymmetry_x", "1", scale=0.2, low=-1, high=1, typical=(-1, 1)),

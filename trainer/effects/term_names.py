@@ -7,17 +7,17 @@ from trainer.effects.zernike import zernike_indices
 
 _DIGITS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 _ZERNIKE = {
-    (2, -2): "oblique astigmatism",
-    (2, 2): "astigmatism",
+    (2, -2): "astigmatism 45°",
+    (2, 2): "astigmatism 0°",
     (3, -3): "trefoil y",
     (3, -1): "coma y",
     (3, 1): "coma x",
     (3, 3): "trefoil x",
-    (4, -4): "oblique tetrafoil",
-    (4, -2): "oblique secondary astigmatism",
-    (4, 0): "spherical aberration",
-    (4, 2): "secondary astigmatism",
-    (4, 4): "tetrafoil",
+    (4, -4): "tetrafoil 22.5°",
+    (4, -2): "2nd astigmatism 45°",
+    (4, 0): "spherical",
+    (4, 2): "2nd astigmatism 0°",
+    (4, 4): "tetrafoil 0°",
 }
 
 

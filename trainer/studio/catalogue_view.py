@@ -9,6 +9,7 @@ from html import escape
 from typing import Any
 
 import panel as pn
+from bokeh.models import Div
 
 from firmware_iface.errors import InputError
 from trainer.effects.definition import STAGES, Effect
@@ -29,6 +30,7 @@ from trainer.studio.labelled_slider import LabelledSlider
 FIRST = "zero_order"
 PERIOD_MS = 80  # between two pictures of a sweep
 SWEEP_STEPS = 50  # pictures from the lowest to the highest value and back
+_SLIDER = {"flex": "1 1 190px", "max-width": "300px"}
 LIGHT_PATH = ("gray level", "drive", "panel", "pupil", "|·|²", "sensor", "camera counts")
 
 
@@ -61,7 +63,7 @@ class _CatalogueView:
 
         start = FIRST if FIRST in catalogue else next(iter(catalogue))
         self._effect = pn.widgets.Select(
-            name="Effect", value=start, size=len(catalogue) + 4, margin=0,
+            name="Effect", value=start, size=len(catalogue) + len(STAGES) - 2, margin=0,
             sizing_mode="stretch_width", stylesheets=[_LIST_STYLE], **_choices(catalogue),
         )  # fmt: skip
         self._order = pn.widgets.Select(name="Order of the map", options=[0], width=120, margin=0)
@@ -69,16 +71,19 @@ class _CatalogueView:
             name="Seen by", options={"the camera": False, "the eye": True}, width=120, margin=0
         )
         self._capture = LabelledSlider(
-            value=1, label="capture", about="Each capture has a gain of its own.", low=1, high=CAPTURES, step=1
-        )
+            value=1, label="capture", about="Each capture has a gain of its own.", low=1, high=CAPTURES, step=1,
+            styles=_SLIDER, margin=0,
+        )  # fmt: skip
         self._sweep = pn.widgets.Select(name="Moved by Play", options=[""], width=190, margin=0)
         self._play = pn.widgets.Toggle(name="Play", button_type="primary", width=90, margin=0)
         self._example = pn.widgets.Button(name="Example", width=90, margin=0)
         self._none = pn.widgets.Button(name="No effect", width=90, margin=0)
         self._whole = pn.widgets.Button(name="Whole picture", width=110, margin=0)
         self._words = _html("")
-        self._figures = _html("")
+        # A plain bokeh model: a panel pane takes several times as long to change as the picture takes to compute.
+        self._figures = Div(sizing_mode="stretch_width", stylesheets=[_WORDS_STYLE], margin=0)
         self._fault = _html("")
+        self._fault.visible = False
         self._slider_box = pn.FlexBox(flex_wrap="wrap", gap="10px 24px", sizing_mode="stretch_width", margin=0)
         one = catalogue[start]
         numbers = numbers_of(one, orders_of(one)[0])
@@ -98,10 +103,10 @@ class _CatalogueView:
             align_items="end", flex_wrap="wrap", gap="8px 12px", sizing_mode="stretch_width", margin=0,
         )  # fmt: skip
         main = pn.Column(
-            self._words, self._fault, self._pictures.view, self._figures, controls, self._slider_box,
-            styles={"flex": "1 1 480px", "min-width": "0", "gap": "14px"}, margin=0,
+            self._words, self._fault, self._pictures.view, pn.pane.Bokeh(self._figures, margin=0), controls, self._slider_box,
+            styles={"flex": "999 1 480px", "min-width": "0", "gap": "14px"}, margin=0,
         )  # fmt: skip
-        side = pn.Column(self._effect, styles={"flex": "0 1 215px"}, margin=0)
+        side = pn.Column(self._effect, styles={"flex": "1 1 215px", "max-width": "100%"}, margin=0)
         self.view = pn.FlexBox(
             side, main, flex_wrap="wrap", align_items="start", gap="20px", sizing_mode="stretch_width",
             css_classes=["catalogue"], margin=12,
@@ -129,13 +134,13 @@ class _CatalogueView:
             return
         effect = self._chosen
         before = {(effect.name, n.label): s.value for n, s in zip(self._numbers, self._sliders, strict=True)}
-        self._fault.object = ""
+        self._say("")
         try:
             self._numbers = numbers_of(effect, self._order.value)
             by_capture = differs_by_capture(effect)
         except InputError as error:
             self._numbers, by_capture = (), False
-            self._fault.object = _fault(error)
+            self._say(str(error))
         same = self._shown == effect.name
         self._shown = effect.name
         with self._silence():
@@ -143,7 +148,7 @@ class _CatalogueView:
                 LabelledSlider(
                     value=before.get((effect.name, n.label), n.example) if same else n.example,
                     label=n.label, about=n.about, low=n.low, high=n.high, step=n.step,
-                    styles={"flex": "1 1 190px", "max-width": "300px"}, margin=0,
+                    styles=_SLIDER, margin=0,
                 )
                 for n in self._numbers
             ]  # fmt: skip
@@ -193,12 +198,17 @@ class _CatalogueView:
                 capture=round(self._capture.value) - 1,
             )
         except InputError as error:
-            self._fault.object = _fault(error)
+            self._say(str(error))
             return
-        if self._fault.object:
-            self._fault.object = ""
+        self._say("")
         self._pictures.draw(picture)
-        self._figures.object = picture_figures(picture)
+        self._figures.text = picture_figures(picture)
+
+    def _say(self, fault: str) -> None:
+        """Show what went wrong with a user's effect; nothing for ""."""
+        text = f'<p role="alert" class="fault">{escape(fault)}</p>' if fault else ""
+        if self._fault.object != text:
+            self._fault.param.update(object=text, visible=bool(fault))
 
     def _start_or_stop(self, *_: Any) -> None:
         self._play.name = "Pause" if self._play.value else "Play"
@@ -232,7 +242,7 @@ class _CatalogueView:
 def effect_words(effect: Effect) -> str:
     """What an effect is, as HTML: stage, what it acts on, formula, description and references."""
     steps = "".join(
-        f'<li{" class=here aria-current=step" if step == effect.stage else ""}>{escape(step)}</li>'
+        f'<li><span{" class=here aria-current=step" if step == effect.stage else ""}>{escape(step)}</span></li>'
         for step in LIGHT_PATH
     )
     acts_on = (
@@ -256,9 +266,9 @@ def effect_words(effect: Effect) -> str:
 def picture_figures(picture: EffectPicture) -> str:
     """The numbers of a picture, as HTML."""
     rows = (
-        ("nrmse", f"{picture.nrmse:.3f}", "root mean squared difference over the picture's standard deviation"),
-        ("excess", f"{picture.excess:.4f}", "its square: the share of the picture's variance"),
-        ("light", f"{100 * picture.light:.1f} %", "of the ideal picture's light"),
+        ("nrmse", f"{picture.nrmse:.3f}", "rms difference over contrast"),
+        ("excess", f"{picture.excess:.4f}", "its square"),
+        ("light", f"{100 * picture.light:.1f} %", "of the ideal picture"),
     )
     cells = "".join(
         f'<div><dt>{name}</dt><dd><b>{value}</b> <span>{about}</span></dd></div>' for name, value, about in rows
@@ -278,16 +288,13 @@ def _choices(catalogue: Catalogue) -> dict[str, Any]:
     return {"options": options, "disabled_options": [f"stage {stage}" for stage in STAGES]}
 
 
-def _fault(error: Exception) -> str:
-    return f'<p role="alert" class="fault">{escape(str(error))}</p>'
-
-
 def _html(text: str) -> pn.pane.HTML:
     return pn.pane.HTML(text, sizing_mode="stretch_width", margin=0, stylesheets=[_WORDS_STYLE])
 
 
 _LIST_STYLE = """
 select { height: auto; overflow-y: auto; font: inherit; padding: 6px; border-radius: 6px; }
+@media (max-width: 800px) { select { height: 7.5em; } }
 option { padding: 3px 6px; border-radius: 4px; }
 option:disabled { font-size: 0.78em; letter-spacing: 0.08em; padding-top: 9px; }
 """
@@ -295,16 +302,14 @@ _WORDS_STYLE = """
 .head { display: flex; flex-wrap: wrap; align-items: center; justify-content: space-between; gap: 6px 20px; }
 h2 { font-size: 1.35rem; margin: 0; font-weight: 650; }
 .path { display: flex; flex-wrap: wrap; list-style: none; margin: 0; padding: 0; font-size: 0.85rem; gap: 4px 0; }
-.path li { padding: 1px 8px; border-radius: 999px; opacity: 0.75; }
-.path li + li::before { content: "→"; margin: 0 8px 0 -14px; opacity: 0.6; }
-.path li + li { margin-left: 14px; }
-.path .here { opacity: 1; font-weight: 650; background: var(--accent, #2f7fbf); color: #fff; }
-.path .here::before { color: currentColor; }
+.path span { padding: 2px 8px; border-radius: 999px; opacity: 0.8; }
+.path li + li::before { content: "→"; opacity: 0.5; }
+.path .here { opacity: 1; font-weight: 650; background: #20639b; color: #fff; }
 .what { display: flex; flex-wrap: wrap; gap: 8px 28px; align-items: center; margin-top: 8px; }
-.text { flex: 1 1 340px; max-width: 75ch; }
-.formula-box { flex: 0 1 auto; padding: 10px 18px; border-radius: 8px; font-size: 1.05rem; max-width: 100%;
+.text { flex: 1 1 380px; max-width: 105ch; }
+.formula-box { flex: 0 1 auto; margin-left: auto; padding: 10px 18px; border-radius: 8px; font-size: 1.05rem; max-width: 100%;
   box-sizing: border-box; overflow-x: auto; background: color-mix(in srgb, currentColor 6%, transparent); }
-p { margin: 0 0 4px; line-height: 1.45; }
+p { margin: 0 0 4px; line-height: 1.45; font-size: 0.92rem; }
 .about { font-weight: 600; }
 .acts { opacity: 0.85; }
 .sources { margin: 4px 0 0; padding: 0; list-style: none; font-size: 0.8rem; opacity: 0.8; line-height: 1.4; }

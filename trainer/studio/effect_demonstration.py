@@ -105,7 +105,9 @@ class EffectNumber:
     @property
     def label(self) -> str:
         """Name with term and unit, for people."""
-        name = self.parameter.replace("_", " ") + (f" {self.term}" if self.term else "")
+        name = self.parameter.replace("_", " ")
+        if self.term:
+            name = f"{name} {self.term}" if self.term.startswith("P") or self.term.isdecimal() else self.term
         return name if self.unit in ("", "1") else f"{name} ({self.unit})"
 
     @property

@@ -28,7 +28,7 @@ from trainer.studio.effect_demonstration import EffectPicture
 LINE = "#8a8f98"  # of frames and cross-hairs: seen on light and on dark
 STOPS = 17  # of a colour bar
 NARROWEST, GAP = 220, 16  # of a picture and between two, CSS pixels
-SHARE = 99.7  # per cent of the pixels that the difference's colours hold
+SHARE = 99.0  # per cent of the pixels that the difference's colours hold
 
 
 def _palette(name: str, instead: str) -> list[str]:
@@ -115,8 +115,9 @@ class EffectPictures:
             y_range=self._y,
             tools=[PanTool(), WheelZoomTool(modifiers={"shift": True}), ResetTool(), CrosshairTool(overlay=cross)],
             toolbar_location=None,
-            sizing_mode="stretch_width",
-            aspect_ratio=width / height,
+            width=2 * width,
+            height=2 * height,
+            sizing_mode="scale_width",
             min_border=0,
             background_fill_color=None,
             border_fill_color=None,
@@ -129,7 +130,7 @@ class EffectPictures:
         )
         rows = [("row, column", "$y{0}, $x{0}"), (name.replace("_", " "), "@" + name + "{0,0}")]
         plot.add_tools(HoverTool(tooltips=rows))
-        return pn.pane.Bokeh(plot, sizing_mode="stretch_width", margin=0)
+        return pn.pane.Bokeh(plot, sizing_mode="scale_width", margin=0)
 
 
 def _columns(picture: EffectPicture) -> dict[str, list[Any]]:

@@ -37,6 +37,7 @@ class LabelledSlider(ReactiveHTML):
              value="${value}" aria-label="{{ label }}"/>
     </div>
     """
+    _priority_changes: ClassVar[list[str]] = ["value"]  # handled at once, not after panel's 50 ms
     _dom_events: ClassVar[dict[str, list[str]]] = {"range": ["input"], "number": ["change"]}
     _stylesheets: ClassVar[list[str]] = [
         """
@@ -47,7 +48,16 @@ class LabelledSlider(ReactiveHTML):
           border: 1px solid color-mix(in srgb, currentColor 30%, transparent); border-radius: 4px;
           appearance: textfield; }
         .number::-webkit-inner-spin-button { display: none; }
-        .range { grid-column: 1 / -1; width: 100%; margin: 0; height: 20px; accent-color: var(--accent, #2f7fbf); }
+        .range { grid-column: 1 / -1; width: 100%; margin: 0; height: 20px; appearance: none; background: transparent;
+          cursor: pointer; }
+        .range::-webkit-slider-runnable-track { height: 4px; border-radius: 2px;
+          background: color-mix(in srgb, currentColor 30%, transparent); }
+        .range::-moz-range-track { height: 4px; border-radius: 2px;
+          background: color-mix(in srgb, currentColor 30%, transparent); }
+        .range::-webkit-slider-thumb { appearance: none; width: 16px; height: 16px; margin-top: -6px; border-radius: 50%;
+          background: var(--accent, #2f7fbf); }
+        .range::-moz-range-thumb { width: 16px; height: 16px; border: 0; border-radius: 50%;
+          background: var(--accent, #2f7fbf); }
         input:focus-visible { outline: 2px solid var(--accent, #2f7fbf); outline-offset: 1px; }
         """
     ]
