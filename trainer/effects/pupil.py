@@ -137,8 +137,8 @@ def iris(pupil: Pupil, half_width: Tensor, centre_y: Tensor, centre_x: Tensor) -
             high=40,
             even=True,
             starts=(0.5, 2.0),
-            typical=(0, 20),
-            example=6.0,
+            typical=(0, 40),
+            example=25.0,
         )
     ],
     formula=(
