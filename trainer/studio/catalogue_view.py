@@ -63,22 +63,22 @@ class _CatalogueView:
 
         start = FIRST if FIRST in catalogue else next(iter(catalogue))
         self._effect = pn.widgets.Select(
-            name="Effect", value=start, size=len(catalogue) + len(STAGES) - 2, margin=0,
+            label="Effect", value=start, size=len(catalogue) + len(STAGES) - 2, margin=0,
             sizing_mode="stretch_width", stylesheets=[_LIST_STYLE], **_choices(catalogue),
         )  # fmt: skip
-        self._order = pn.widgets.Select(name="Order of the map", options=[0], width=120, margin=0)
+        self._order = pn.widgets.Select(label="Order of the map", options=[0], width=120, margin=0)
         self._seen_by = pn.widgets.Select(
-            name="Seen by", options={"the camera": False, "the eye": True}, width=120, margin=0
+            label="Seen by", options={"the camera": False, "the eye": True}, width=120, margin=0
         )
         self._capture = LabelledSlider(
             value=1, label="capture", about="Each capture has a gain of its own.", low=1, high=CAPTURES, step=1,
             styles=_SLIDER, margin=0,
         )  # fmt: skip
-        self._sweep = pn.widgets.Select(name="Moved by Play", options=[""], width=190, margin=0)
-        self._play = pn.widgets.Toggle(name="Play", button_type="primary", width=90, margin=0)
-        self._example = pn.widgets.Button(name="Example", width=90, margin=0)
-        self._none = pn.widgets.Button(name="No effect", width=90, margin=0)
-        self._whole = pn.widgets.Button(name="Whole picture", width=110, margin=0)
+        self._sweep = pn.widgets.Select(label="Moved by Play", options=[""], width=190, margin=0)
+        self._play = pn.widgets.Toggle(label="Play", color="primary", width=90, margin=0)
+        self._example = pn.widgets.Button(label="Example", width=90, margin=0)
+        self._none = pn.widgets.Button(label="No effect", width=90, margin=0)
+        self._whole = pn.widgets.Button(label="Whole picture", width=110, margin=0)
         self._words = _html("")
         # A plain bokeh model: a panel pane takes several times as long to change as the picture takes to compute.
         self._figures = Div(sizing_mode="stretch_width", stylesheets=[_WORDS_STYLE], margin=0)
@@ -211,7 +211,7 @@ class _CatalogueView:
             self._fault.param.update(object=text, visible=bool(fault))
 
     def _start_or_stop(self, *_: Any) -> None:
-        self._play.name = "Pause" if self._play.value else "Play"
+        self._play.label = "Pause" if self._play.value else "Play"
         if self._play.value:
             self._step = 0
             self._player = pn.state.add_periodic_callback(self._move, period=PERIOD_MS)

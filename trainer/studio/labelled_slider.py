@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import param
 from panel.reactive import ReactiveHTML
@@ -18,7 +18,9 @@ class LabelledSlider(ReactiveHTML):
     low, high, step : float
         Range, and the change of one key press.
     value : float
-        In four digits or fewer, so that the field shows what is meant.
+        Of the slider.
+    typed : float
+        Of the field; follows the slider, and moves it when it is changed.
     """
 
     label = param.String(default="value")
@@ -27,17 +29,18 @@ class LabelledSlider(ReactiveHTML):
     high = param.Number(default=1.0)
     step = param.Number(default=0.01)
     value = param.Number(default=0.0)
+    typed = param.Number(default=0.0)
 
     _template = """
     <div id="box" class="labelled-slider" title="{{ about }}">
       <span id="name" class="name">{{ label }}</span>
       <input id="number" class="number" type="number" min="${low}" max="${high}" step="any"
-             value="${value}" aria-label="{{ label }}, as a number"/>
+             value="${typed}" aria-label="{{ label }}, as a number"/>
       <input id="range" class="range" type="range" min="${low}" max="${high}" step="${step}"
              value="${value}" aria-label="{{ label }}"/>
     </div>
     """
-    _priority_changes: ClassVar[list[str]] = ["value"]  # handled at once, not after panel's 50 ms
+    _priority_changes: ClassVar[list[str]] = ["value", "typed"]  # handled at once, not after panel's 50 ms
     _dom_events: ClassVar[dict[str, list[str]]] = {"range": ["input"], "number": ["change"]}
     _stylesheets: ClassVar[list[str]] = [
         """
@@ -61,3 +64,15 @@ class LabelledSlider(ReactiveHTML):
         input:focus-visible { outline: 2px solid var(--accent, #2f7fbf); outline-offset: 1px; }
         """
     ]
+
+    def __init__(self, **params: Any) -> None:
+        super().__init__(**{"typed": params.get("value", 0.0), **params})
+
+    @param.depends("value", watch=True)
+    def _follow(self) -> None:
+        self.typed = self.value
+
+    @param.depends("typed", watch=True)
+    def _move(self) -> None:
+        """Take the field's number, as far as it is in the range."""
+        self.value = self.typed = min(max(self.typed, self.low), self.high)

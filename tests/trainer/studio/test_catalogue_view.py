@@ -47,7 +47,7 @@ def test_a_formula_that_cannot_be_set_is_shown_as_it_is_written() -> None:
 
 def test_each_effect_can_be_chosen() -> None:
     view = catalogue_view(catalogue())
-    chooser = next(w for w in view.select(pn.widgets.Select) if w.name == "Effect")
+    chooser = next(w for w in view.select(pn.widgets.Select) if w.label == "Effect")
     for name in KNOWN:
         chooser.value = name
         assert any(f"With {name}" in str(pane.object) for pane in view.select(pn.pane.HTML))
