@@ -32,7 +32,7 @@ class EffectText:
 
 def effect_text(function: Callable[..., Any]) -> EffectText:
     """The words of a function's docstring; the function's name where it has none."""
-    text = inspect.getdoc(function) or getattr(function, "__name__", "effect")
+    text = inspect.getdoc(function) or str(getattr(function, "__name__", "effect"))
     sections = list(_SECTION.finditer(text))
     head = text[: sections[0].start()] if sections else text
     about, _, rest = head.partition("\n")

@@ -9,7 +9,7 @@ from html import escape
 from typing import Any
 
 import panel as pn
-from bokeh.models import Div
+from bokeh.models.widgets.markups import Div
 
 from firmware_iface.errors import InputError
 from trainer.effects.definition import STAGES, Effect
@@ -84,7 +84,9 @@ class _CatalogueView:
         self._figures = Div(sizing_mode="stretch_width", stylesheets=[_WORDS_STYLE], margin=0)
         self._fault = _html("")
         self._fault.visible = False
-        self._slider_box = pn.FlexBox(flex_wrap="wrap", gap="10px 24px", sizing_mode="stretch_width", margin=0)
+        self._slider_box = pn.FlexBox(
+            flex_wrap="wrap", gap="10px 24px", sizing_mode="stretch_width", margin=0
+        )
         one = catalogue[start]
         numbers = numbers_of(one, orders_of(one)[0])
         self._pictures = EffectPictures(demonstrate(one, [n.absent for n in numbers], orders_of(one)[0]))
@@ -103,7 +105,8 @@ class _CatalogueView:
             align_items="end", flex_wrap="wrap", gap="8px 12px", sizing_mode="stretch_width", margin=0,
         )  # fmt: skip
         main = pn.Column(
-            self._words, self._fault, self._pictures.view, pn.pane.Bokeh(self._figures, margin=0), controls, self._slider_box,
+            self._words, self._fault, self._pictures.view, pn.pane.Bokeh(self._figures, margin=0),
+            controls, self._slider_box,
             styles={"flex": "999 1 480px", "min-width": "0", "gap": "14px"}, margin=0,
         )  # fmt: skip
         side = pn.Column(self._effect, styles={"flex": "1 1 215px", "max-width": "100%"}, margin=0)
@@ -156,9 +159,7 @@ class _CatalogueView:
                 slider.param.watch(self._changed, "value")
             moved = [*self._sliders, self._capture] if by_capture else self._sliders
             self._slider_box.objects = moved
-            first = next(
-                (k for k, n in enumerate(self._numbers) if n.example != n.absent), 0
-            )
+            first = next((k for k, n in enumerate(self._numbers) if n.example != n.absent), 0)
             names = {s.label: k for k, s in enumerate(moved)}
             self._sweep.param.update(options=names, value=len(moved) - 1 if by_capture else first)
         if not same:
@@ -242,7 +243,7 @@ class _CatalogueView:
 def effect_words(effect: Effect) -> str:
     """What an effect is, as HTML: stage, what it acts on, formula, description and references."""
     steps = "".join(
-        f'<li><span{" class=here aria-current=step" if step == effect.stage else ""}>{escape(step)}</span></li>'
+        f"<li><span{' class=here aria-current=step' if step == effect.stage else ''}>{escape(step)}</span></li>"
         for step in LIGHT_PATH
     )
     acts_on = (
@@ -271,7 +272,8 @@ def picture_figures(picture: EffectPicture) -> str:
         ("light", f"{100 * picture.light:.1f} %", "of the ideal picture"),
     )
     cells = "".join(
-        f'<div><dt>{name}</dt><dd><b>{value}</b> <span>{about}</span></dd></div>' for name, value, about in rows
+        f"<div><dt>{name}</dt><dd><b>{value}</b> <span>{about}</span></dd></div>"
+        for name, value, about in rows
     )
     return f'<dl class="numbers">{cells}</dl>'
 
@@ -307,8 +309,9 @@ h2 { font-size: 1.35rem; margin: 0; font-weight: 650; }
 .path .here { opacity: 1; font-weight: 650; background: #20639b; color: #fff; }
 .what { display: flex; flex-wrap: wrap; gap: 8px 28px; align-items: center; margin-top: 8px; }
 .text { flex: 1 1 380px; max-width: 105ch; }
-.formula-box { flex: 0 1 auto; margin-left: auto; padding: 10px 18px; border-radius: 8px; font-size: 1.05rem; max-width: 100%;
-  box-sizing: border-box; overflow-x: auto; background: color-mix(in srgb, currentColor 6%, transparent); }
+.formula-box { flex: 0 1 auto; margin-left: auto; padding: 10px 18px; border-radius: 8px; font-size: 1.05rem;
+  max-width: 100%; box-sizing: border-box; overflow-x: auto;
+  background: color-mix(in srgb, currentColor 6%, transparent); }
 p { margin: 0 0 4px; line-height: 1.45; font-size: 0.92rem; }
 .about { font-weight: 600; }
 .acts { opacity: 0.85; }

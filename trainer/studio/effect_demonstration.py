@@ -1,7 +1,7 @@
 """What one effect does to a test picture: a small virtual bench, its ideal picture, and the picture with the effect.
 
-The picture's pattern is computed once, by phase retrieval on the ideal bench. Everything else is the trainer's own light
-path, on a grid that is small enough for a slider: one thread takes 10 to 40 ms a picture.
+The picture's pattern is computed once, by phase retrieval on the ideal bench. Everything else is the trainer's own
+light path, on a grid that is small enough for a slider: one thread takes 10 to 40 ms a picture.
 """
 
 from __future__ import annotations
@@ -228,9 +228,7 @@ def demonstrate(
         image = trace(scene, stages, _pattern(), effect.stage, before).image
         if by_eye:
             bare = bare_stages(scene).sensor
-            stages = replace(
-                stages, sensor=replace(bare, irradiance_filter=stages.sensor.irradiance_filter)
-            )
+            stages = replace(stages, sensor=replace(bare, irradiance_filter=stages.sensor.irradiance_filter))
         picture = counts(scene, stages, light_on_camera(scene, stages, image), _gain(), None)[0].numpy()
     if stages.sensor.free_capture_gain:
         picture = picture * np.float32(_capture_gain(instance, capture))

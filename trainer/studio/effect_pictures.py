@@ -17,9 +17,9 @@ from bokeh.models import (
     PanTool,
     Range1d,
     ResetTool,
-    Span,
     WheelZoomTool,
 )
+from bokeh.models.annotations.geometry import Span
 from bokeh.palettes import Viridis256
 from bokeh.plotting import figure
 
@@ -54,9 +54,9 @@ class EffectPictures:
         self._source = ColumnDataSource(data=_columns(first))
         self._top = _round_up(float(np.percentile(first.ideal, 99.8)))
         self._spread = 1.0
-        self._difference = LinearColorMapper(DIFFERENCE, low=-1, high=1)
-        irradiance = LinearColorMapper(IRRADIANCE, low=0, high=self._top)
-        self._x, self._y = Range1d(0, width), Range1d(height, 0)
+        self._difference = LinearColorMapper(palette=DIFFERENCE, low=-1, high=1)
+        irradiance = LinearColorMapper(palette=IRRADIANCE, low=0, high=self._top)
+        self._x, self._y = Range1d(start=0, end=width), Range1d(start=height, end=0)
         self._whole = (width, height)
         across, down = Span(dimension="width", line_color=LINE), Span(dimension="height", line_color=LINE)
         plots = []
@@ -113,7 +113,12 @@ class EffectPictures:
         plot = figure(
             x_range=self._x,
             y_range=self._y,
-            tools=[PanTool(), WheelZoomTool(modifiers={"shift": True}), ResetTool(), CrosshairTool(overlay=cross)],
+            tools=[
+                PanTool(),
+                WheelZoomTool(modifiers={"shift": True}),
+                ResetTool(),
+                CrosshairTool(overlay=cross),
+            ],
             toolbar_location=None,
             width=2 * width,
             height=2 * height,
@@ -125,7 +130,7 @@ class EffectPictures:
         )
         plot.axis.visible = False
         plot.grid.visible = False
-        plot.image(
+        plot.image(  # type: ignore[call-arg]
             image=name, source=self._source, x=0, y=0, dw=width, dh=height, color_mapper=mapper, name=name
         )
         rows = [("row, column", "$y{0}, $x{0}"), (name.replace("_", " "), "@" + name + "{0,0}")]
@@ -150,7 +155,7 @@ def _html(text: str) -> pn.pane.HTML:
 
 
 def _title(text: str, note: str = "") -> str:
-    return f'<h3>{escape(text)} <small>{escape(note)}</small></h3>'
+    return f"<h3>{escape(text)} <small>{escape(note)}</small></h3>"
 
 
 def _bar(colours: list[str], ends: tuple[str, str, str], unit: str) -> str:

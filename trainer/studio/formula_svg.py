@@ -27,7 +27,12 @@ def formula_svg(latex: str) -> Markup:
         Without dollar signs.
     """
     try:
-        drawn = TextPath((0, 0), f"${_SIZED.sub(_stretched, latex)}$", size=SIZE, prop=FontProperties(math_fontfamily="stix"))
+        drawn = TextPath(
+            (0, 0),
+            f"${_SIZED.sub(_stretched, latex)}$",
+            size=SIZE,
+            prop=FontProperties(math_fontfamily="stix"),
+        )
     except ValueError:
         return Markup("<code>{}</code>").format(latex)
     box = drawn.get_extents().padded(MARGIN * SIZE)

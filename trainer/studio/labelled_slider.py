@@ -57,8 +57,8 @@ class LabelledSlider(ReactiveHTML):
           background: color-mix(in srgb, currentColor 30%, transparent); }
         .range::-moz-range-track { height: 4px; border-radius: 2px;
           background: color-mix(in srgb, currentColor 30%, transparent); }
-        .range::-webkit-slider-thumb { appearance: none; width: 16px; height: 16px; margin-top: -6px; border-radius: 50%;
-          background: var(--accent, #2f7fbf); }
+        .range::-webkit-slider-thumb { appearance: none; width: 16px; height: 16px; margin-top: -6px;
+          border-radius: 50%; background: var(--accent, #2f7fbf); }
         .range::-moz-range-thumb { width: 16px; height: 16px; border: 0; border-radius: 50%;
           background: var(--accent, #2f7fbf); }
         input:focus-visible { outline: 2px solid var(--accent, #2f7fbf); outline-offset: 1px; }

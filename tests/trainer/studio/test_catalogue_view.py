@@ -38,7 +38,7 @@ def test_each_effect_has_a_formula_that_can_be_set_and_its_words(name: str) -> N
     assert one.formula and one.description
     assert formula_svg(one.formula).startswith("<svg")
     words = effect_words(one)
-    assert one.name in words and "<svg" in words and 'aria-current=step>' + one.stage in words
+    assert one.name in words and "<svg" in words and "aria-current=step>" + one.stage in words
 
 
 def test_a_formula_that_cannot_be_set_is_shown_as_it_is_written() -> None:
@@ -80,7 +80,9 @@ def page() -> Iterator[Any]:
             opened.wait_for_selector("canvas")
             opened.get_by_role("slider", name="leak real").wait_for()
             yield opened
-            outside = [u for u in requests if not u.startswith((f"http://127.0.0.1:{port}/", "data:", "blob:"))]
+            outside = [
+                u for u in requests if not u.startswith((f"http://127.0.0.1:{port}/", "data:", "blob:"))
+            ]
             assert not outside, "the page needs nothing from the internet"
             browser.close()
     finally:
