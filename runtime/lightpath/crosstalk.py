@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from array_api_compat import array_namespace
 
 Array = Any
@@ -16,8 +17,8 @@ def mix_neighbours(phase: Array, taps: Array, axis: int) -> Array:
     count = phase.shape[axis]
     total = 0
     for k in range(taps.shape[0]):
-        index = [min(max(i + k - reach, 0), count - 1) for i in range(count)]
-        total = total + taps[k] * xp.take(phase, xp.asarray(index), axis=axis)
+        index = xp.asarray(np.clip(np.arange(count) + k - reach, 0, count - 1))
+        total = total + taps[k] * xp.take(phase, index, axis=axis)
     return total
 
 

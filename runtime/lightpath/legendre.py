@@ -37,7 +37,9 @@ def legendre_count(order: int, lowest: int = 1) -> int:
 def legendre_maps(y: Array, x: Array, order: int, lowest: int = 1) -> Array:
     """Products P_i(y) P_j(x), lowest <= i + j <= order, y and x in -1 .. 1 (broadcast): [count, rows, columns]."""
     rows, columns = legendre_curve(y, order + 1), legendre_curve(x, order + 1)
-    return array_namespace(y, x).stack([rows[i, ...] * columns[j, ...] for i, j in _products(order, lowest)])
+    return array_namespace(y, x).stack(
+        [rows[i, ...] * columns[j, ...] for i, j in legendre_products(order, lowest)]
+    )
 
 
 def legendre_surface(terms: Array, y: Array, x: Array, lowest: int = 1) -> Array:
@@ -58,7 +60,7 @@ def legendre_surface(terms: Array, y: Array, x: Array, lowest: int = 1) -> Array
     """
     xp = array_namespace(terms)
     order = legendre_order(terms.shape[0], lowest)
-    places = _products(order, lowest)
+    places = legendre_products(order, lowest)
     pick = np.zeros((len(places), (order + 1) ** 2))  # where each term stands in the table of i and j
     for number, (i, j) in enumerate(places):
         pick[number, i * (order + 1) + j] = 1
@@ -72,5 +74,6 @@ def legendre_order(count: int, lowest: int = 1) -> int:
     return next(n for n in range(64) if legendre_count(n, lowest) == count)
 
 
-def _products(order: int, lowest: int) -> list[tuple[int, int]]:
+def legendre_products(order: int, lowest: int = 1) -> list[tuple[int, int]]:
+    """(i, j) of the products P_i(y) P_j(x), in the order in which surfaces hold them."""
     return [(n - m, m) for n in range(lowest, order + 1) for m in range(n + 1)]

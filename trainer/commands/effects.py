@@ -38,6 +38,9 @@ def _described(effect: Effect) -> Result:
         "stage": effect.stage,
         "acts_on": effect.acts_on,
         "about": effect.about,
+        "description": effect.description,
+        "formula": effect.formula,
+        "references": list(effect.references),
         "orders": list(effect.orders),
         "source": "built in" if effect in BUILT_IN else effect.source,
         "parameters": [
@@ -68,6 +71,9 @@ def show(result: Result, args: Namespace, screen: Screen) -> None:
     one = result["effects"][0]
     screen.say(f"{one['name']}: {one['about']}", style="bold")
     screen.say(f"Stage {one['stage']}, acts on the {one['acts_on']}, {one['source']}.")
+    for text in (one["description"], one["formula"], *one["references"]):
+        if text:
+            screen.say(text)
     rows = []
     for p in one["parameters"]:
         low, high = plain(p["low"]), plain(p["high"])

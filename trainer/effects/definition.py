@@ -15,6 +15,7 @@ import numpy as np
 
 from firmware_iface.errors import InputError
 from trainer.captures.bench_file import Bench
+from trainer.effects.docstring import effect_text
 from trainer.formatting import UNIT_SUFFIX
 
 STAGES = ("drive", "panel", "pupil", "sensor")
@@ -49,6 +50,12 @@ class Parameter:
         What it is, in a few words.
     blocks : int
         Equal parts of the numbers, each with its lowest terms first (2 for a field of displacements).
+    typical : (float, float) or None
+        What real benches show; the range of a slider. None: 20 scales about `absent`, within `low` and `high`.
+    example : float or tuple of float or None
+        A value, or the first terms, with which the effect is easy to see. None: left absent.
+    terms : callable or None
+        Names of the numbers, a function of the effect's order, as `count` is. None: their numbers from 1.
     """
 
     name: str
@@ -63,6 +70,9 @@ class Parameter:
     starts: tuple[float, ...] = ()
     about: str = ""
     blocks: int = 1
+    typical: tuple[float, float] | None = None
+    example: float | tuple[float, ...] | None = None
+    terms: Callable[[int], tuple[str, ...]] | None = None
 
     def absent_value(self, bench: Bench) -> float:
         """The value at which the effect is not there, on this bench."""
@@ -112,6 +122,12 @@ class Effect:
         `apply` takes the effect's order as the keyword `order`.
     same_as : str
         The effect that it equals in captures of one colour and plane, where it is no candidate; "" for none.
+    formula : str
+        LaTeX, without dollar signs; "" where none is given.
+    description : str
+        One or two sentences on what it is and where it comes from.
+    references : tuple of str
+        Papers, standards and books.
     """
 
     name: str
@@ -128,6 +144,9 @@ class Effect:
     source: str = "built in"
     takes_order: bool = False
     same_as: str = ""
+    formula: str = ""
+    description: str = ""
+    references: tuple[str, ...] = ()
 
     def parameter(self, name: str) -> Parameter:
         """The parameter of that name."""
@@ -146,15 +165,17 @@ def effect(
     measure: Callable[..., dict[str, Any]] | None = None,
     told_to: str | None = None,
     same_as: str = "",
+    formula: str = "",
 ) -> Callable[[Callable[..., Any]], Effect]:
     """Make an effect of a function: its name is the function's, its description the docstring's first line.
 
     The function takes the stage, then its parameters in their order. A keyword-only argument `order` receives the
-    effect's order.
+    effect's order. The docstring's further paragraphs are the effect's description, and its section `References`
+    its references.
 
     Parameters
     ----------
-    stage, acts_on, parameters, orders, starts, touches_iris, rugged, measure, same_as
+    stage, acts_on, parameters, orders, starts, touches_iris, rugged, measure, same_as, formula
         As in `Effect`.
     told_to : str, optional
         The former name of `acts_on`.
@@ -188,14 +209,14 @@ def effect(
                 f"effect '{name}': the function takes ({', '.join(taken)}) after the stage, its parameters are "
                 f"({', '.join(named)}); make them the same, in the same order"
             )
-        about = (inspect.getdoc(function) or name).splitlines()[0]
+        text = effect_text(function)
         own = function.__module__.startswith("trainer.effects.")
         source = "built in" if own else inspect.getsourcefile(function) or "built in"
         return Effect(
             name,
             stage,
             acted_on,
-            about,
+            text.about,
             tuple(parameters),
             function,
             orders,
@@ -206,6 +227,9 @@ def effect(
             source,
             takes_order,
             same_as,
+            formula.strip(),
+            text.description,
+            text.references,
         )
 
     return make

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from runtime.lightpath.legendre import legendre_count, legendre_curve, legendre_surface
 from trainer.effects.definition import Parameter, effect
+from trainer.effects.term_names import curve_terms, surface_terms
 from trainer.prediction.stages import Drive
 
 SUB_PIXELS = 4  # of a pixel along each axis; 3 leave an excess of 9e-4, 5 gain nothing visible to a camera
@@ -31,6 +32,8 @@ REACH = 2  # neighbours on either side that act on a pixel
             per_channel=True,
             starts=(0.8, 0.9, 1.0, 1.1, 1.2, 1.35),
             about="phase at the last gray level over its nominal value",
+            typical=(0.7, 1.3),
+            example=0.95,
         ),
         Parameter(
             "curvature",
@@ -41,11 +44,26 @@ REACH = 2  # neighbours on either side that act on a pixel
             count=lambda order: order,
             per_channel=True,
             about="Legendre terms of the deviation from the straight line, zero at both ends",
+            typical=(-1.5, 1.5),
+            terms=curve_terms,
         ),
     ],
+    formula=r"\varphi(g) = 2\pi a\,t + 4t(1-t)\sum_n\,c_n P_n(2t-1), \qquad t = g/256",
 )
 def phase_response(drive: Drive, gain: Tensor, curvature: Tensor) -> Drive:
-    """Gray to phase is not the straight line that the bench file states."""
+    """Gray to phase is not the straight line that the bench file states.
+
+    The liquid crystal turns further or less far than its nominal wave, and not evenly from one gray level to the
+    next. Light then lands in the unmodulated spot and in false images, and contrast falls.
+
+    References
+    ----------
+    Reichelt 2013, Spatially resolved phase-response calibration of liquid-crystal-based spatial light modulators,
+    Appl. Opt. 52, 2610.
+
+    Schroff et al. 2024, Rapid stochastic spatial light modulator calibration and pixel crosstalk optimisation,
+    arXiv:2408.07672.
+    """
     t = drive.level
     bend = t * (1 - t) * 4 * (curvature @ legendre_curve(2 * t - 1, curvature.shape[0]))
     return replace(drive, response=drive.response * gain + drive.sign * bend)
@@ -64,11 +82,27 @@ def phase_response(drive: Drive, gain: Tensor, curvature: Tensor) -> Drive:
             high=0.8,
             count=legendre_count,
             about="Legendre terms of the relative change of the phase's gain over the panel",
+            typical=(-0.3, 0.3),
+            example=(0.0, 0.0, 0.15),
+            terms=surface_terms,
         )
     ],
+    formula=r"\varphi'(x,y) = \varphi(x,y)\,\Bigl[1 + \sum_{i,j}\,m_{ij}\,P_i(y)\,P_j(x)\Bigr]",
 )
 def phase_nonuniformity(drive: Drive, map: Tensor) -> Drive:
-    """The phase's gain varies over the panel, as the cell's thickness does."""
+    """The phase's gain varies over the panel, as the cell's thickness does.
+
+    Where the liquid crystal's layer is thicker, the same voltage gives more phase. One response table for the whole
+    panel then fits in some places and not in others.
+
+    References
+    ----------
+    Reichelt 2013, Spatially resolved phase-response calibration of liquid-crystal-based spatial light modulators,
+    Appl. Opt. 52, 2610.
+
+    Schroff et al. 2024, Rapid stochastic spatial light modulator calibration and pixel crosstalk optimisation,
+    arXiv:2408.07672.
+    """
     return drive.scaled(1 + legendre_surface(map, drive.y, drive.x))
 
 
@@ -76,16 +110,52 @@ def phase_nonuniformity(drive: Drive, map: Tensor) -> Drive:
     stage="drive",
     acts_on="display",
     parameters=[
-        Parameter("width_y", "pixels", scale=0.08, low=0, high=1.5, even=True, starts=(0.1, 0.3)),
-        Parameter("width_x", "pixels", scale=0.08, low=0, high=1.5, even=True, starts=(0.1, 0.3)),
-        Parameter("asymmetry_y", "1", scale=0.2, low=-1, high=1),
-        Parameter("asymmetry_x", "1", scale=0.2, low=-1, high=1),
+        Parameter(
+            "width_y",
+            "pixels",
+            scale=0.08,
+            low=0,
+            high=1.5,
+            even=True,
+            starts=(0.1, 0.3),
+            typical=(0, 0.5),
+            example=0.05,
+        ),
+        Parameter(
+            "width_x",
+            "pixels",
+            scale=0.08,
+            low=0,
+            high=1.5,
+            even=True,
+            starts=(0.1, 0.3),
+            typical=(0, 0.5),
+            example=0.05,
+        ),
+        Parameter("asymmetry_y", "1", scale=0.2, low=-1, high=1, typical=(-1, 1)),
+        Parameter("asymmetry_x", "1", scale=0.2, low=-1, high=1, typical=(-1, 1)),
     ],
+    formula=(
+        r"\varphi' = k_y * k_x * \varphi, \qquad k(x) \propto e^{-|x|/r_\pm}, "
+        r"\qquad r_\pm = \frac{w}{\sqrt{2}}\,(1 \pm a) \ \mathrm{for}\ x \gtrless 0"
+    ),
 )
 def crosstalk(
     drive: Drive, width_y: Tensor, width_x: Tensor, asymmetry_y: Tensor, asymmetry_x: Tensor
 ) -> Drive:
-    """Fringing fields: neighbouring pixels' voltages mix over a fraction of a pixel."""
+    """Fringing fields: neighbouring pixels' voltages mix over a fraction of a pixel.
+
+    The electric field of a pixel reaches into its neighbours, so steep steps of phase become ramps. Jumps from one
+    wave to zero suffer most: light leaves the picture at every such jump.
+
+    References
+    ----------
+    Persson et al. 2012, Reducing the effect of pixel crosstalk in phase only spatial light modulators, Opt. Express
+    20, 22334.
+
+    Schroff et al. 2024, Rapid stochastic spatial light modulator calibration and pixel crosstalk optimisation,
+    arXiv:2408.07672.
+    """
     return replace(drive, crosstalk=(_taps(width_y, asymmetry_y), _taps(width_x, asymmetry_x)))
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from runtime.lightpath.legendre import legendre_count, legendre_surface
 from trainer.effects.definition import Parameter, effect
 from trainer.effects.starts import wavefront_starts
+from trainer.effects.term_names import surface_terms
 from trainer.prediction.stages import Panel
 
 
@@ -25,9 +26,17 @@ from trainer.prediction.stages import Panel
             low=-1,
             high=1,
             about="in phase with gray level 0, of the modulated amplitude",
+            typical=(-0.3, 0.3),
+            example=0.1,
         ),
         Parameter(
-            "leak_imaginary", "1", scale=0.02, low=-1, high=1, about="a quarter wave ahead of gray level 0"
+            "leak_imaginary",
+            "1",
+            scale=0.02,
+            low=-1,
+            high=1,
+            about="a quarter wave ahead of gray level 0",
+            typical=(-0.3, 0.3),
         ),
         Parameter(
             "fill_factor",
@@ -37,6 +46,7 @@ from trainer.prediction.stages import Panel
             low=0.3,
             high=1.0,
             about="lit share of a pixel's area, which also sets the pixel's aperture",
+            typical=(0.5, 1.0),
         ),
         Parameter(
             "leak_wavefront",
@@ -46,13 +56,28 @@ from trainer.prediction.stages import Panel
             high=60,
             count=legendre_count,
             about="Legendre terms of the leak's phase against the modulated light's: a first surface has its own shape",
+            typical=(-10, 10),
+            terms=surface_terms,
         ),
     ],
+    formula=(
+        r"u = S\,e^{j\varphi} * \mathrm{rect}_{\sqrt{F}} + \ell\,S\,e^{j\psi(x,y)}, \qquad"
+        r" \ell = \ell_\mathrm{r} + j\,\ell_\mathrm{i}"
+    ),
 )
 def zero_order(
     panel: Panel, leak_real: Tensor, leak_imaginary: Tensor, fill_factor: Tensor, leak_wavefront: Tensor
 ) -> Panel:
-    """Light that the pattern does not modulate: dead space between pixels, first-surface reflection."""
+    """Light that the pattern does not modulate: dead space between pixels, first-surface reflection.
+
+    Dead space between the pixels and the panel's first surface reflect light that no pattern reaches. It crosses
+    the picture as a plane wave and interferes with it.
+
+    References
+    ----------
+    Chakravarthula et al. 2020, Learned hardware-in-the-loop phase retrieval for holographic near-eye displays, ACM
+    Trans. Graph. 39, 186, supplement, eq. 9 to 11.
+    """
     side = torch.sqrt(fill_factor)
     leak = panel.source * torch.complex(leak_real, leak_imaginary)
     if leak_wavefront.shape[0]:
@@ -74,11 +99,24 @@ def zero_order(
             high=4,
             count=legendre_count,
             about="Legendre terms of the logarithm of the beam's amplitude",
+            typical=(-0.8, 0.8),
+            example=(0.0, 0.0, -0.3, 0.0, -0.3),
+            terms=surface_terms,
         )
     ],
+    formula=r"u' = u\,\exp\Bigl[\sum_{i,j}\,a_{ij}\,P_i(y)\,P_j(x)\Bigr]",
 )
 def illumination(panel: Panel, log_amplitude: Tensor) -> Panel:
-    """The beam that lights the panel is not uniform."""
+    """The beam that lights the panel is not uniform.
+
+    A laser beam is brighter in its middle than at its edge, and it may be off centre. The model takes it as
+    uniform.
+
+    References
+    ----------
+    Čižmár et al. 2010, In situ wavefront correction and its application to micromanipulation, Nat. Photonics 4,
+    388.
+    """
     return panel.multiplied(torch.exp(legendre_surface(log_amplitude, panel.y, panel.x)))
 
 
@@ -96,10 +134,23 @@ def illumination(panel: Panel, log_amplitude: Tensor) -> Panel:
             high=60,
             count=legendre_count,
             about="Legendre terms at the first channel's wavelength; one path difference for all colours",
+            typical=(-10, 10),
+            example=(0.0, 0.0, 2.0),
+            terms=surface_terms,
         )
     ],
+    formula=r"u' = u\,\exp\Bigl[\,j\,\dfrac{\lambda_1}{\lambda} \sum_{i,j}\,w_{ij}\,P_i(y)\,P_j(x)\Bigr]",
 )
 def panel_wavefront(panel: Panel, wavefront: Tensor) -> Panel:
-    """The beam or the panel is not flat."""
+    """The beam or the panel is not flat.
+
+    The panel's cover glass and backplane bend, and the beam that lights it is not quite collimated. Tilts move the
+    picture, curvature defocuses it, and higher terms distort it.
+
+    References
+    ----------
+    Čižmár et al. 2010, In situ wavefront correction and its application to micromanipulation, Nat. Photonics 4,
+    388.
+    """
     phase = legendre_surface(wavefront, panel.y, panel.x) * (panel.reference_wavelength / panel.wavelength)
     return panel.multiplied(torch.polar(torch.ones_like(phase), phase))

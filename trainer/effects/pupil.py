@@ -11,6 +11,7 @@ from torch import Tensor
 
 from trainer.effects.definition import Parameter, effect
 from trainer.effects.starts import distance_starts, wavelength_starts
+from trainer.effects.term_names import aberration_terms
 from trainer.effects.zernike import zernike_count, zernike_maps
 from trainer.prediction.stages import Pupil
 
@@ -29,12 +30,26 @@ FWHM = 2 * math.sqrt(2 * math.log(2))
             low=-1000,
             high=1000,
             about="how much farther from the panel the image plane is than asked for",
+            typical=(-3, 3),
+            example=0.6,
         )
     ],
     starts=distance_starts,
+    formula=r"H(f_x, f_y) = \exp\Bigl[\,2\pi j\,(z + \Delta z)\sqrt{\lambda^{-2} - f_x^2 - f_y^2}\,\Bigr]",
 )
 def distance(pupil: Pupil, offset: Tensor) -> Pupil:
-    """The image plane is not where the captures state it."""
+    """The image plane is not where the captures state it.
+
+    Light is propagated by the angular spectrum to a plane that is nearer or farther than the real one. The picture
+    is out of focus, and each edge gets fringes.
+
+    References
+    ----------
+    Goodman, Introduction to Fourier Optics, section 3.10.
+
+    Matsushima and Shimobaba 2009, Band-limited angular spectrum method for numerical simulation of free-space
+    propagation in far and near fields, Opt. Express 17, 19662.
+    """
     return replace(pupil, distance=pupil.distance + 1e-3 * offset)
 
 
@@ -51,12 +66,23 @@ def distance(pupil: Pupil, offset: Tensor) -> Pupil:
             high=100,
             per_channel=True,
             about="how much longer each colour's wavelength is than stated",
+            typical=(-15, 15),
+            example=8.0,
         )
     ],
     starts=wavelength_starts,
+    formula=r"H(f_x, f_y) = \exp\Bigl[\,2\pi j\,z\sqrt{(\lambda + \Delta\lambda)^{-2} - f_x^2 - f_y^2}\,\Bigr]",
 )
 def wavelength(pupil: Pupil, offset: Tensor) -> Pupil:
-    """A wavelength is not what bench.toml states; in proportion to all distances, as the panel's pitch is."""
+    """A wavelength is not what bench.toml states.
+
+    Near the axis light arrives by wavelength x distance / pitch^2 alone, so in one colour and at one plane this is a
+    distance. Diode lasers differ by some nanometres from their data sheet, and drift with temperature.
+
+    References
+    ----------
+    Goodman, Introduction to Fourier Optics, section 3.10.
+    """
     return pupil.emitting(1e-9 * offset.reshape(1), torch.ones(1, dtype=offset.dtype))
 
 
@@ -73,11 +99,25 @@ def wavelength(pupil: Pupil, offset: Tensor) -> Pupil:
             high=10,
             count=lambda order: zernike_count(order, without_defocus=True),
             about="Noll-normalised terms from astigmatism on, at the first channel's wavelength",
+            typical=(-0.5, 0.5),
+            example=(0.0, 0.0, 0.0, 0.2),
+            terms=aberration_terms,
         )
     ],
+    formula=r"H' = H\,\exp\Bigl[\,2\pi j\,\dfrac{\lambda_1}{\lambda} \sum_k\,z_k\,Z_k(u, v)\Bigr]",
 )
 def pupil_aberration(pupil: Pupil, zernike: Tensor, *, order: int) -> Pupil:
-    """The relay aberrates (without piston, tilt or defocus, which other effects describe)."""
+    """The relay aberrates (without piston, tilt or defocus, which other effects describe).
+
+    The lenses between panel and image delay some spatial frequencies more than others. Each point of the picture
+    becomes the aberration's own small figure.
+
+    References
+    ----------
+    Noll 1976, Zernike polynomials and atmospheric turbulence, J. Opt. Soc. Am. 66, 207.
+
+    Goodman, Introduction to Fourier Optics, section 6.4.
+    """
     maps = zernike_maps(pupil.v, pupil.u, order, without_defocus=True)
     return pupil.delayed(torch.tensordot(zernike, maps, dims=1) * pupil.reference_wavelength)
 
@@ -96,13 +136,25 @@ def pupil_aberration(pupil: Pupil, zernike: Tensor, *, order: int) -> Pupil:
             low=0.05,
             high=1.9,
             starts=(0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
+            typical=(0.1, 1.0),
+            example=0.4,
         ),
-        Parameter("centre_y", "share of band", scale=0.02, low=-0.9, high=0.9),
-        Parameter("centre_x", "share of band", scale=0.02, low=-0.9, high=0.9),
+        Parameter("centre_y", "share of band", scale=0.02, low=-0.9, high=0.9, typical=(-0.4, 0.4)),
+        Parameter("centre_x", "share of band", scale=0.02, low=-0.9, high=0.9, typical=(-0.4, 0.4)),
     ],
+    formula=r"A(u,v) = \mathrm{rect}\dfrac{u - c_x}{2w}\;\mathrm{rect}\dfrac{v - c_y}{2w}",
 )
 def iris(pupil: Pupil, half_width: Tensor, centre_y: Tensor, centre_x: Tensor) -> Pupil:
-    """The filter in the Fourier plane has another size or place than stated."""
+    """The filter in the Fourier plane has another size or place than stated.
+
+    The opening in the Fourier plane that blocks the panel's higher orders is smaller, larger or beside its place.
+    It removes fine detail that the model still expects, or lets through light that the model blocks. The formula is
+    that of a square; a round one has a radius.
+
+    References
+    ----------
+    Goodman, Introduction to Fourier Optics, chapter 6.
+    """
     centre = (pupil.centre[0] + centre_y, pupil.centre[1] + centre_x)
     return replace(pupil, half_width=half_width, centre=centre)
 
@@ -110,10 +162,35 @@ def iris(pupil: Pupil, half_width: Tensor, centre_y: Tensor, centre_x: Tensor) -
 @effect(
     stage="pupil",
     acts_on="display",
-    parameters=[Parameter("line_width", "nm", scale=0.3, low=0, high=40, even=True, starts=(0.5, 2.0))],
+    parameters=[
+        Parameter(
+            "line_width",
+            "nm",
+            scale=0.3,
+            low=0,
+            high=40,
+            even=True,
+            starts=(0.5, 2.0),
+            typical=(0, 40),
+            example=25.0,
+        )
+    ],
+    formula=(
+        r"I = \int s(\delta)\,I_{\lambda+\delta}\,\mathrm{d}\delta, \qquad s:\ \text{Gaussian,"
+        r" full width } \Delta\lambda"
+    ),
 )
 def temporal_coherence(pupil: Pupil, line_width: Tensor) -> Pupil:
-    """The laser has a line width (full width at half maximum of a Gaussian line)."""
+    """The laser has a line width (full width at half maximum of a Gaussian line).
+
+    A laser diode emits a band of wavelengths, and each one forms its own picture with its own diffraction. They add
+    as light, not as waves: fine structure blurs, most where light comes at steep angles.
+
+    References
+    ----------
+    Deng and Chu 2017, Coherence properties of different light sources and their effect on the image sharpness and
+    speckle of holographic displays, Sci. Rep. 7, 5893.
+    """
     rule = np.polynomial.hermite_e.hermegauss(LINES)
     nodes, weights = (
         torch.as_tensor(a / s, dtype=line_width.dtype) for a, s in zip(rule, (1, rule[1].sum()), strict=True)
@@ -134,6 +211,8 @@ def temporal_coherence(pupil: Pupil, line_width: Tensor) -> Pupil:
             even=True,
             starts=(0.1, 0.3, 1.0),
             about="rms angle",
+            typical=(0, 3),
+            example=1.0,
         ),
         Parameter(
             "extent_x",
@@ -144,20 +223,57 @@ def temporal_coherence(pupil: Pupil, line_width: Tensor) -> Pupil:
             even=True,
             starts=(0.1, 0.3, 1.0),
             about="rms angle",
-        ),
-        Parameter("kurtosis", "1", scale=0.5, low=-1.5, high=1.5, about="shape: 0 Gaussian, -1 uniform disc"),
-        Parameter(
-            "halo", "1", scale=0.05, low=0, high=0.9, about="share of the light in a wider, round part"
+            typical=(0, 3),
+            example=1.0,
         ),
         Parameter(
-            "halo_extent", "mrad", scale=0.3, absent=1.0, low=0.01, high=100, about="rms angle of that part"
+            "kurtosis",
+            "1",
+            scale=0.5,
+            low=-1.5,
+            high=1.5,
+            about="shape: 0 Gaussian, -1 uniform disc",
+            typical=(-1.5, 1.5),
+        ),
+        Parameter(
+            "halo",
+            "1",
+            scale=0.05,
+            low=0,
+            high=0.9,
+            about="share of the light in a wider, round part",
+            typical=(0, 0.5),
+        ),
+        Parameter(
+            "halo_extent",
+            "mrad",
+            scale=0.3,
+            absent=1.0,
+            low=0.01,
+            high=100,
+            about="rms angle of that part",
+            typical=(0.1, 20),
+            example=5.0,
         ),
     ],
+    formula=(
+        r"\hat{I}' = \hat{I}\,\Bigl[(1-h)\,e^{-w^2/2 + \kappa w^4/24} + h\,e^{-w_h^2/2}\Bigr],"
+        r" \qquad w = 2\pi z \sqrt{(\theta_x f_x)^2 + (\theta_y f_y)^2}"
+    ),
 )
 def spatial_coherence(
     pupil: Pupil, extent_y: Tensor, extent_x: Tensor, kurtosis: Tensor, halo: Tensor, halo_extent: Tensor
 ) -> Pupil:
-    """The source has an extent: each of its points tilts the light and displaces the picture by distance x angle."""
+    """The source has an extent: each of its points tilts the light and displaces the picture by distance x angle.
+
+    A source that is not a point lights the panel from many angles at once. Each angle moves the picture by distance
+    times angle, and the sum is a blur that grows with the distance.
+
+    References
+    ----------
+    Deng and Chu 2017, Coherence properties of different light sources and their effect on the image sharpness and
+    speckle of holographic displays, Sci. Rep. 7, 5893.
+    """
     # Exact except at the iris's edge, and hundreds of times cheaper than one propagation for each source point.
     reach = 1e-3 * torch.abs(pupil.distance)
     widths = (reach * extent_y, reach * extent_x, reach * halo_extent)

@@ -12,6 +12,7 @@ from runtime.lightpath.legendre import legendre_count, legendre_curve, legendre_
 from trainer.effects.definition import Parameter, effect
 from trainer.effects.pupil import kernel_transfer
 from trainer.effects.starts import gain_spread, ghost_starts, registration_starts
+from trainer.effects.term_names import curve_terms, distortion_terms, surface_terms, surface_terms_with_mean
 from trainer.prediction.stages import Sensor
 
 
@@ -20,22 +21,76 @@ from trainer.prediction.stages import Sensor
     acts_on="camera",
     parameters=[
         Parameter(
-            "width_y", "pixels", scale=0.15, low=0, high=20, even=True, starts=(0.3, 0.6, 1.2), about="rms"
+            "width_y",
+            "pixels",
+            scale=0.15,
+            low=0,
+            high=20,
+            even=True,
+            starts=(0.3, 0.6, 1.2),
+            about="rms",
+            typical=(0, 3),
+            example=0.8,
         ),
         Parameter(
-            "width_x", "pixels", scale=0.15, low=0, high=20, even=True, starts=(0.3, 0.6, 1.2), about="rms"
+            "width_x",
+            "pixels",
+            scale=0.15,
+            low=0,
+            high=20,
+            even=True,
+            starts=(0.3, 0.6, 1.2),
+            about="rms",
+            typical=(0, 3),
+            example=0.8,
         ),
-        Parameter("kurtosis", "1", scale=0.5, low=-1.5, high=1.5, about="shape: 0 Gaussian, -1 uniform disc"),
         Parameter(
-            "halo", "1", scale=0.05, low=0, high=0.9, about="share of the light in a wider, round part"
+            "kurtosis",
+            "1",
+            scale=0.5,
+            low=-1.5,
+            high=1.5,
+            about="shape: 0 Gaussian, -1 uniform disc",
+            typical=(-1.5, 1.5),
         ),
-        Parameter("halo_width", "pixels", scale=0.3, absent=2.0, low=0.1, high=60, about="rms of that part"),
+        Parameter(
+            "halo",
+            "1",
+            scale=0.05,
+            low=0,
+            high=0.9,
+            about="share of the light in a wider, round part",
+            typical=(0, 0.5),
+        ),
+        Parameter(
+            "halo_width",
+            "pixels",
+            scale=0.3,
+            absent=2.0,
+            low=0.1,
+            high=60,
+            about="rms of that part",
+            typical=(0.1, 20),
+            example=6.0,
+        ),
     ],
+    formula=(
+        r"\hat{I}' = \hat{I}\,\Bigl[(1-h)\,e^{-w^2/2 + \kappa w^4/24} + h\,e^{-w_h^2/2}\Bigr],"
+        r" \qquad w = 2\pi \sqrt{(\sigma_x f_x)^2 + (\sigma_y f_y)^2}"
+    ),
 )
 def sensor_blur(
     sensor: Sensor, width_y: Tensor, width_x: Tensor, kurtosis: Tensor, halo: Tensor, halo_width: Tensor
 ) -> Sensor:
-    """The camera's lens and pixels blur the picture."""
+    """The camera's lens and pixels blur the picture.
+
+    The camera's lens is not sharp to the pixel, and some light scatters widely. The eye does not look through this
+    lens, so no pattern may correct for it.
+
+    References
+    ----------
+    Goodman, Introduction to Fourier Optics, section 6.3.
+    """
     widths = (width_y, width_x, halo_width)
     return sensor.blurred(kernel_transfer(sensor.iy, sensor.ix, widths, kurtosis, halo))
 
@@ -46,9 +101,9 @@ def sensor_blur(
     orders=(1, 3),
     starts=registration_starts,
     parameters=[
-        Parameter("shift_y", "pixels", scale=0.05, low=-60, high=60),
-        Parameter("shift_x", "pixels", scale=0.05, low=-60, high=60),
-        Parameter("rotation", "mrad", scale=0.5, low=-300, high=300),
+        Parameter("shift_y", "pixels", scale=0.05, low=-60, high=60, typical=(-4, 4)),
+        Parameter("shift_x", "pixels", scale=0.05, low=-60, high=60, typical=(-4, 4), example=0.7),
+        Parameter("rotation", "mrad", scale=0.5, low=-300, high=300, typical=(-30, 30)),
         Parameter(
             "magnification",
             "%",
@@ -56,6 +111,7 @@ def sensor_blur(
             low=-20,
             high=20,
             about="size of the picture in excess of nominal",
+            typical=(-4, 4),
         ),
         Parameter(
             "distortion",
@@ -66,8 +122,14 @@ def sensor_blur(
             count=lambda order: 2 * (legendre_count(order, 1) - 1),
             blocks=2,
             about="Legendre terms of the displacement that shift, rotation and size leave; rows, then columns",
+            typical=(-4, 4),
+            terms=distortion_terms,
         ),
     ],
+    formula=(
+        r"I'(\mathbf{r}) = I\bigl(\mathbf{r} + \mathbf{s} + m\,\mathbf{r} + \theta\,\mathbf{r}^{\perp}"
+        r" + \mathbf{d}(\mathbf{r})\bigr)"
+    ),
 )
 def misregistration(
     sensor: Sensor,
@@ -77,7 +139,15 @@ def misregistration(
     magnification: Tensor,
     distortion: Tensor,
 ) -> Sensor:
-    """Camera pixels are not where the registration states: shift, rotation, scale, distortion."""
+    """Camera pixels are not where the registration states: shift, rotation, scale, distortion.
+
+    The camera's pixels are taken for places on the panel where they do not look. A tenth of a pixel already shows
+    at every edge.
+
+    References
+    ----------
+    Hartley and Zisserman 2004, Multiple View Geometry in Computer Vision, section 7.4.
+    """
     half_height, half_width = (n / 2 for n in sensor.y.shape)
     y, x = sensor.y * half_height, sensor.x * half_width
     angle, size = 1e-3 * rotation, 1e-2 * magnification
@@ -104,11 +174,24 @@ def misregistration(
             high=4,
             count=legendre_count,
             about="Legendre terms over the picture",
+            typical=(-1, 1),
+            example=(0.0, 0.0, -0.3, 0.0, -0.3),
+            terms=surface_terms,
         )
     ],
+    formula=r"I' = I\,\exp\Bigl[\sum_{i,j}\,g_{ij}\,P_i(y)\,P_j(x)\Bigr]",
 )
 def vignetting(sensor: Sensor, log_gain: Tensor) -> Sensor:
-    """The camera's sensitivity falls off over the field."""
+    """The camera's sensitivity falls off over the field.
+
+    The camera's lens passes less light towards the edge of the field, and its pixels accept oblique light less
+    well.
+
+    References
+    ----------
+    Goldman 2010, Vignette and exposure calibration and compensation, IEEE Trans. Pattern Anal. Mach. Intell. 32,
+    2276.
+    """
     return sensor.multiplied(torch.exp(legendre_surface(log_gain, sensor.y, sensor.x)))
 
 
@@ -125,11 +208,23 @@ def vignetting(sensor: Sensor, log_gain: Tensor) -> Sensor:
             high=60000,
             count=lambda order: legendre_count(order, 0),
             about="Legendre terms over the picture, the mean first",
+            typical=(-400, 400),
+            example=(150.0, 0.0, 100.0),
+            terms=surface_terms_with_mean,
         )
     ],
+    formula=r"N' = N + \sum_{i,j}\,b_{ij}\,P_i(y)\,P_j(x)",
 )
 def stray_light(sensor: Sensor, counts: Tensor) -> Sensor:
-    """Light is simply added, smooth over the picture."""
+    """Light is simply added, smooth over the picture.
+
+    Room light, glare in the camera's lens or a black level that is wrong add counts that no pattern controls. Dark
+    places show it first.
+
+    References
+    ----------
+    Talvala et al. 2007, Veiling glare in high dynamic range imaging, ACM Trans. Graph. 26, 37.
+    """
     return sensor.brightened(legendre_surface(counts, sensor.y, sensor.x, lowest=0))
 
 
@@ -146,11 +241,25 @@ def stray_light(sensor: Sensor, counts: Tensor) -> Sensor:
             high=6,
             count=lambda order: order,
             about="Legendre terms of the deviation from a straight line, zero at both ends, share of full scale",
+            typical=(-0.6, 0.6),
+            example=0.3,
+            terms=curve_terms,
         )
     ],
+    formula=r"s' = s + s\,(1-s)\sum_n\,b_n P_n(2s-1), \qquad s = N / N_\mathrm{full\ scale}",
 )
 def sensor_response(sensor: Sensor, bend: Tensor) -> Sensor:
-    """Counts are not proportional to light."""
+    """Counts are not proportional to light.
+
+    Twice the light does not give twice the counts, because a pixel's well fills or the camera's software applies a
+    curve. Middle tones are off while black and white are right.
+
+    References
+    ----------
+    Debevec and Malik 1997, Recovering high dynamic range radiance maps from photographs, SIGGRAPH.
+
+    EMVA 2021, Standard for characterization of image sensors and cameras, EMVA 1288, release 4.0.
+    """
 
     def curve(share: Tensor) -> Tensor:
         # The polynomial is fitted from darkness to full scale; beyond that the curve continues as a straight line.
@@ -167,11 +276,25 @@ def sensor_response(sensor: Sensor, bend: Tensor) -> Sensor:
     acts_on="camera",
     measure=gain_spread,
     parameters=[
-        Parameter("spread", "%", scale=1.0, low=0, high=100, about="rms of the gain from capture to capture")
+        Parameter(
+            "spread",
+            "%",
+            scale=1.0,
+            low=0,
+            high=100,
+            about="rms of the gain from capture to capture",
+            typical=(0, 30),
+            example=8.0,
+        )
     ],
+    formula=r"N'_k = g_k\,N_k, \qquad \mathrm{rms}(g_k - 1) = \sigma",
 )
 def laser_drift(sensor: Sensor, spread: Tensor) -> Sensor:
-    """The laser's power varies from capture to capture: each capture has its own gain, measured from it."""
+    """The laser's power varies from capture to capture: each capture has its own gain, measured from it.
+
+    The laser's power changes with its temperature and current between one capture and the next. Each capture is a
+    little brighter or darker as a whole.
+    """
     return replace(sensor, free_capture_gain=sensor.free_capture_gain or bool(spread != 0))
 
 
@@ -187,9 +310,11 @@ def laser_drift(sensor: Sensor, spread: Tensor) -> Sensor:
             low=0,
             high=1,
             about="irradiance of the copy over that of the picture",
+            typical=(0, 0.5),
+            example=0.15,
         ),
-        Parameter("shift_y", "pixels", scale=0.3, low=-200, high=200),
-        Parameter("shift_x", "pixels", scale=0.3, low=-200, high=200),
+        Parameter("shift_y", "pixels", scale=0.3, low=-200, high=200, typical=(-30, 30), example=4.0),
+        Parameter("shift_x", "pixels", scale=0.3, low=-200, high=200, typical=(-30, 30), example=9.0),
         Parameter(
             "blur",
             "pixels",
@@ -198,11 +323,21 @@ def laser_drift(sensor: Sensor, spread: Tensor) -> Sensor:
             high=20,
             even=True,
             about="rms of the copy's own blur along an axis",
+            typical=(0, 5),
         ),
     ],
+    formula=r"I'(\mathbf{r}) = I(\mathbf{r}) + a\,\bigl(G_b * I\bigr)(\mathbf{r} - \mathbf{s})",
 )
 def ghost(sensor: Sensor, amplitude: Tensor, shift_y: Tensor, shift_x: Tensor, blur: Tensor) -> Sensor:
-    """A second, weak, displaced image, as from a reflection in a window."""
+    """A second, weak, displaced image, as from a reflection in a window.
+
+    Light that is reflected twice inside a window or a beam splitter arrives beside the picture. It is taken as
+    incoherent: the second way is longer than the laser's coherence.
+
+    References
+    ----------
+    Born and Wolf 1999, Principles of Optics, section 7.6.
+    """
     angle = -2 * math.pi * (sensor.iy * shift_y + sensor.ix * shift_x)
     none = torch.zeros_like(blur)
     size = amplitude * kernel_transfer(sensor.iy, sensor.ix, (blur, blur, none), none, none)
