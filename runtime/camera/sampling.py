@@ -43,6 +43,33 @@ def pixel_area(iy: Array, ix: Array, y: Array, x: Array) -> Array:
     return xp.sinc(iy * down[0] + ix * down[1]) * xp.sinc(iy * right[0] + ix * right[1])
 
 
+def registered_samples(grid: Grid, spectrum: Array) -> Array:
+    """The picture of a spectrum at the centres of the panel's pixels.
+
+    To read every second sample of a picture is to fold its spectrum: the inverse transform is a quarter as large.
+
+    Parameters
+    ----------
+    grid : Grid
+    spectrum : complex array [..., n, m // 2 + 1]
+        As from `rfft2` of a picture on the fine image grid.
+
+    Returns
+    -------
+    real array [..., H, W]
+    """
+    xp = array_namespace(spectrum)
+    rows, columns = (n // FINE for n in grid.image_shape)
+    folded = spectrum[..., :rows, :] + spectrum[..., rows:, :]
+    last = columns // 2 + 1
+    # The columns beyond the half spectrum are those of the negative frequencies: reversed, conjugated.
+    mirrored = xp.flip(folded[..., columns - last + 1 :], axis=-1)
+    mirrored = xp.conj(xp.roll(xp.flip(mirrored, axis=-2), 1, axis=-2))
+    picture = irfft2((folded[..., :last] + mirrored) / FINE**2, (rows, columns))
+    margin = grid.margin
+    return picture[..., margin : margin + grid.shape[0], margin : margin + grid.shape[1]]
+
+
 def spline_filter(iy: Array, ix: Array, finer: int) -> Array:
     """Transfer function to divide by, so that `spline_samples` passes through the samples.
 

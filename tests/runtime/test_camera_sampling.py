@@ -13,13 +13,14 @@ from runtime.camera.sampling import (
     finer_picture_adjoint,
     pixel_area,
     rectified,
+    registered_samples,
     spline_filter,
     spline_matrix,
     spline_samples,
 )
 from runtime.camera.view import View, sampler_and_adjoint
 from runtime.lightpath.fft import irfft2, rfft2
-from runtime.lightpath.grid import FINE
+from runtime.lightpath.grid import FINE, at_pixels, grid_for
 from tests.runtime.benches import ideal_path
 
 SIZES = [(32, 40), (31, 40), (32, 41), (31, 41)]  # even and odd, rows and columns
@@ -55,6 +56,20 @@ def coefficients(picture: np.ndarray, finer: int, as_array: Callable[[np.ndarray
     iy, ix = (as_array(f) for f in frequencies(picture.shape))  # type: ignore[arg-type]
     spectrum = rfft2(as_array(picture)) / spline_filter(iy, ix, finer)
     return finer_picture(spectrum, picture.shape, finer)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("shape", [(20, 24), (21, 25), (20, 25)])
+def test_samples_at_the_panels_pixels_are_those_of_the_whole_picture(
+    shape: tuple[int, int], as_array: Callable[[np.ndarray], Any]
+) -> None:
+    grid = grid_for(shape, 8e-6, 520e-9, 1e-3, 1.0, margin=6)
+    picture = np.random.default_rng(0).normal(size=(2, *grid.image_shape))
+    shift = np.exp(
+        -2j * np.pi * 0.3 * np.fft.rfftfreq(grid.image_shape[1])
+    )  # not symmetric: a displaced picture
+    spectrum = np.fft.rfft2(picture) * shift
+    expected = at_pixels(grid, np.fft.irfft2(spectrum, s=grid.image_shape))
+    np.testing.assert_allclose(np.asarray(registered_samples(grid, as_array(spectrum))), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("size", SIZES)

@@ -14,9 +14,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from runtime.camera.sampling import finer_picture, pixel_area, sample_places, spline_filter, spline_samples
-from runtime.lightpath.fft import irfft2, rfft2
-from runtime.lightpath.grid import FINE, at_pixels
+from runtime.camera.sampling import (
+    finer_picture,
+    pixel_area,
+    registered_samples,
+    sample_places,
+    spline_filter,
+    spline_samples,
+)
+from runtime.lightpath.fft import rfft2
+from runtime.lightpath.grid import FINE
 from runtime.lightpath.light_path import LightPath, mode_irradiance, panel_phase, panel_spectrum
 from runtime.lightpath.propagation import (
     band_limit,
@@ -229,7 +236,7 @@ def light_on_camera(scene: Scene, stages: Stages, image: Tensor) -> Tensor:
         if extra is not None:
             transfer = transfer * extra
     if sensor.displacement is None and camera.registered:
-        return at_pixels(grid, irfft2(rfft2(image) * transfer, grid.image_shape))
+        return registered_samples(grid, rfft2(image) * transfer)
     if sensor.displacement is None:
         y, x = camera_positions(scene)
     else:
