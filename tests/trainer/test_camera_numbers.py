@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -140,6 +141,8 @@ def test_without_repeats_a_negative_excess_is_never_complete(tmp_path, capsys) -
     without_repeats(captures)
     found = ran(capsys, "explain", captures, "--out", tmp_path / "model.toml", "--workers", 1)
     assert found["verdict"] == "outside_catalogue" and len(found["steps"]) == 1
+    shown = re.search(r"what remains shows full_well_e = ([\d.e+]+)", found["sentence"])
+    assert shown and float(shown[1]) == pytest.approx(10500, rel=0.1)
     assert "full_well_e = 5250" in found["sentence"] and "capture one pattern twice" in found["sentence"]
     assert ran(capsys, "diagnose", captures, "--workers", 1)["verdict"] == "outside_catalogue"
 

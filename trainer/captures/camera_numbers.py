@@ -14,8 +14,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from runtime.excess import PredictionErrors
 from trainer.captures.bench_file import Camera
-from trainer.captures.camera_noise import RepeatNoise, straight_line
+from trainer.captures.camera_noise import RepeatNoise, noise_variance, straight_line
 from trainer.captures.capture_table import Capture
 
 MOST_PAIRS = 12  # pairs of repeated pictures that are compared
@@ -98,6 +99,40 @@ def camera_by_repeats(camera: Camera, repeats: Sequence[RepeatNoise]) -> Camera:
     if found is None or (camera.noise_stated and not found.differs()):
         return camera
     return replace(camera, full_well_e=found.full_well_e, read_noise_e=found.read_noise_e)
+
+
+def camera_of_residual(errors: PredictionErrors, camera: Camera) -> Camera | None:
+    """The camera with the full well and read noise that the residual of a complete model shows.
+
+    Photon transfer of the captures themselves: the squared error of each tile of the pictures against the mean signal
+    there, which the stated noise tells.
+
+    Parameters
+    ----------
+    errors : PredictionErrors
+        Of a model that leaves nothing but noise.
+    camera : Camera
+        With the stated numbers that the errors' expected noise was computed from.
+
+    Returns
+    -------
+    Camera or None
+        None where brightness varies too little over the tiles for a line.
+    """
+    inside = errors.noise > 0.5 * np.median(
+        errors.noise
+    )  # not those that are cut off at the border, or saturated
+    pixels = np.broadcast_to(errors.pixels[:, None] / errors.noise.shape[-1], errors.noise.shape)[inside]
+    gain = camera.counts_per_electron
+    signal = (errors.noise[inside] / pixels - noise_variance(0.0, camera)) / gain
+    squared = errors.squared[inside] / pixels
+    if signal.size < 16 or np.ptp(signal) < 0.02 * camera.full_scale:
+        return None
+    slope, floor = np.polyfit(signal, squared, 1, w=1 / np.maximum(errors.noise[inside] / pixels, 1e-12))
+    if slope <= 0:
+        return None
+    read = math.sqrt(max(float(floor) - 1 / 12, 0.0)) / float(slope)
+    return replace(camera, full_well_e=camera.full_scale / float(slope), read_noise_e=read)
 
 
 def numbers_text(stated: Camera, used: Camera) -> str:

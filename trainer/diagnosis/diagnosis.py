@@ -11,6 +11,7 @@ import numpy as np
 from runtime.excess import PredictionErrors
 from runtime.program.progress import Progress, no_progress
 from trainer.captures.bench_file import Camera
+from trainer.captures.camera_numbers import camera_of_residual
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import CaptureRoles, capture_roles, scenes
 from trainer.diagnosis.bench_facts import EqualFact, captures_that_decide, equal_facts, equal_facts_text
@@ -136,12 +137,14 @@ class Diagnosis:
 def overstated_noise(errors: PredictionErrors, camera: Camera) -> str:
     """What to change where a model errs by less than the stated noise, in one sentence."""
     share = float(errors.squared.sum() / errors.noise.sum())
+    shown = camera_of_residual(errors, camera)
+    found = f" (what remains shows full_well_e = {shown.full_well_e:.3g})" if shown else ""
     excess = number(errors.excess, 2)
     return (
         f"The camera's numbers are wrong: the model's squared error is {share:.2g} of what the stated noise alone "
         f"would be (excess {excess}), so nothing can be said of what is missing. Correct full_well_e = "
         f"{camera.full_well_e:g}, read_noise_e = {camera.read_noise_e:g} or bit_depth = {camera.bit_depth} in "
-        "bench.toml, or capture one pattern twice to have the noise measured."
+        f"bench.toml{found}, or capture one pattern twice to have the noise measured."
     )
 
 
