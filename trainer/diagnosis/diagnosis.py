@@ -217,7 +217,7 @@ def diagnose(
     ranking = rank(before, fits, known, thresholds, ideal_excess, len(candidates))
     if not complete and not any(r.worth_adding for r in ranking):
         rest = [s for s in order if s.effect not in {f.effect for f in fits}]
-        fits += try_all(roles, model, before, rest, pool, report, 0.5, 0.7)
+        fits += try_all(roles, model, before, rest, pool, report, 0.6, 0.7)
         ranking = rank(before, fits, known, thresholds, ideal_excess, len(candidates))
         if model.present and not any(r.worth_adding for r in ranking):
             report(0.7, "fitting candidates and present effects together")

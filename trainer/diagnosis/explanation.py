@@ -207,10 +207,9 @@ def explain(
     diagnoses: list[Diagnosis] = []
     while True:
         done = len(steps) - 1
-
         report_share = part_of(report, 1 - 0.6**done, 1 - 0.6**done * 0.6)
-
-        found = diagnose(captures, model, known, pool, thresholds, report_share, ideal, with_probes=False)
+        diagnosing = part_of(report_share, 0, 0.9)
+        found = diagnose(captures, model, known, pool, thresholds, diagnosing, ideal, with_probes=False)
         diagnoses.append(found)
         best = found.best
         if best is None or len(model.names) >= MOST_EFFECTS:
