@@ -19,6 +19,7 @@ from runtime.program.command import Command, Result
 from runtime.program.completion import complete
 from runtime.program.csv_tables import write_tables
 from runtime.program.interrupt import Interrupted
+from runtime.program.large_blocks import keep_large_blocks
 from runtime.program.log_file import Log, open_log
 from runtime.program.outputs import check_outputs, files_written
 from runtime.program.parser import ProgramParser
@@ -67,6 +68,7 @@ class Program:
         int
             The exit code.
         """
+        keep_large_blocks()
         try:
             return self._main(list(sys.argv[1:] if arguments is None else arguments))
         except _NoReader:

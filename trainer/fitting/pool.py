@@ -24,6 +24,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from firmware_iface.errors import InputError
+from runtime.program.large_blocks import keep_large_blocks
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -247,6 +248,8 @@ def _packed(task: bytes) -> bytes:
 
     Results are bytes because torch otherwise passes tensors through sockets and shared memory.
     """
+    # Dask starts its workers so that they give back every temporary; also those that join later are told here.
+    keep_large_blocks()
     function, arguments = pickle.loads(task)
     return pickle.dumps(function(*arguments))
 
@@ -255,7 +258,6 @@ def _single_threaded() -> None:
     import torch
 
     threading.Thread(target=_end_with_parent, daemon=True).start()
-
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # where there are no masks
 
