@@ -17,6 +17,8 @@ PARALLEL = "PYTEST_XDIST_WORKER" in os.environ
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the programs do
+
 if PARALLEL:  # before NumPy and torch are imported: workers that each take every core slow each other down
     for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(variable, "1")

@@ -1,0 +1,20 @@
+"""How threads wait: asleep, so that programs next to each other do not slow each other down."""
+
+from __future__ import annotations
+
+import os
+
+# Read by the OpenMP libraries when torch or another library loads them; worker processes inherit these.
+# GNU's spins for milliseconds at every barrier, which takes the cores from whoever would do the work.
+WAITING = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "0", "KMP_BLOCKTIME": "0"}
+
+
+def wait_asleep() -> None:
+    """Let idle threads of OpenMP sleep instead of spin; what the environment says already stands.
+
+    References
+    ----------
+    OpenMP 5.2, section 21.7 (OMP_WAIT_POLICY); GCC's libgomp manual (GOMP_SPINCOUNT).
+    """
+    for name, value in WAITING.items():
+        os.environ.setdefault(name, value)

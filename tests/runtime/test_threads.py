@@ -1,0 +1,57 @@
+"""Threads that wait leave the cores to others."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("torch")
+ROOT = Path(__file__).resolve().parents[2]
+CORES = 2
+BUSY = "while True: pass"
+# Small steps with a barrier after each, as a fit has: done within a second of processor time.
+STEPS = """
+import os, sys, time
+if sys.argv[1] == "asleep":
+    from runtime.program.threads import wait_asleep
+    wait_asleep()
+import torch
+torch.set_num_threads(2)
+a = torch.ones(300_000)
+for _ in range(50):
+    a = a * 1.0001
+begin, steps = time.process_time(), 0
+while time.process_time() - begin < 1:
+    a = a * 1.0001
+    steps += 1
+print(steps)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes cannot be put on two cores here")
+def test_on_busy_cores_waiting_threads_leave_the_time_to_those_that_work() -> None:
+    cores = sorted(os.sched_getaffinity(0))[:CORES]
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("OMP_", "GOMP_", "KMP_", "MKL_"))}
+
+    def begun(*arguments: str) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            [sys.executable, "-c", *arguments],
+            cwd=ROOT,
+            env=environment,
+            stdout=subprocess.PIPE,
+            text=True,
+            preexec_fn=lambda: os.sched_setaffinity(0, cores),
+        )
+
+    neighbours = [begun(BUSY) for _ in range(CORES)]
+    try:
+        steps = {how: int(begun(STEPS, how).communicate(timeout=120)[0]) for how in ("spinning", "asleep")}
+    finally:
+        for one in neighbours:
+            one.kill()
+            one.communicate()
+    assert steps["asleep"] > 1.3 * steps["spinning"], steps
