@@ -7,7 +7,7 @@ from argparse import ArgumentParser, Namespace
 from runtime.program.command import Command, Result
 from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
-from trainer.commands.inputs import captures_argument, inputs_of, model_options, note_left_out, origin
+from trainer.commands.inputs import captures_argument, inputs_of, model_options, note_left_out
 from trainer.commands.number_text import sizes_text, small_text
 from trainer.commands.outputs import model_out, out_option
 from trainer.commands.workers import use_every_core
@@ -30,6 +30,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     effect = find_effect(catalogue(args.effects), args.effect)
     captures, known, model = inputs_of(args)
     note_left_out(captures, screen)
+    from trainer.captures.capture_origin import origin
     from trainer.diagnosis.explanation import add
     from trainer.model.model_file import write_model
 

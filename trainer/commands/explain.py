@@ -15,7 +15,6 @@ from trainer.commands.inputs import (
     inputs_of,
     model_options,
     note_left_out,
-    origin,
     refuse_misread,
 )
 from trainer.commands.number_text import small_text
@@ -56,6 +55,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     captures, known, model = inputs_of(args)
     note_left_out(captures, screen)
     refuse_misread(args.captures, screen)
+    from trainer.captures.capture_origin import origin
     from trainer.diagnosis.explanation import explain
     from trainer.fitting.pool import open_pool
     from trainer.model.model_file import write_model

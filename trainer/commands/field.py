@@ -7,7 +7,7 @@ from argparse import ArgumentParser, Namespace
 from runtime.program.command import Command, Result
 from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
-from trainer.commands.inputs import captures_argument, inputs_of, model_options, note_left_out, origin
+from trainer.commands.inputs import captures_argument, inputs_of, model_options, note_left_out
 from trainer.commands.outputs import model_out, out_option
 from trainer.commands.workers import use_every_core
 
@@ -23,6 +23,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     """A field learned at the panel, in a model."""
     captures, _, model = inputs_of(args)
     note_left_out(captures, screen)
+    from trainer.captures.capture_origin import origin
     from trainer.fitting.learned_field import learn_field
     from trainer.model.model_file import write_model
 

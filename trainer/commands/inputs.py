@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from firmware_iface.errors import InputError
 from runtime.program.screen import Screen
-from runtime.program.version import installed_version
 from trainer.commands.command_line import command_line
 
 if TYPE_CHECKING:
@@ -70,15 +69,6 @@ def inputs_of(args: Namespace) -> tuple[CaptureSet, Catalogue, Model]:
     known = catalogue(args.effects)
     model = read_model(args.model, known, captures.bench) if args.model else Model(captures.bench)
     return captures, known, model
-
-
-def origin(captures: CaptureSet) -> dict[str, Any]:
-    """Where a model comes from, for its file."""
-    return {
-        "written_by": f"hololoop {installed_version()}",
-        "captures": captures.folder.name,
-        "captures_sha256": captures.content_hash(),
-    }
 
 
 def note_left_out(captures: CaptureSet, screen: Screen) -> None:

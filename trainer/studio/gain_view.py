@@ -1,0 +1,12 @@
+"""What is gained."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import panel as pn
+
+
+def gain_view(project: Any, visit: Any) -> Any:
+    """Nothing yet."""
+    return pn.pane.HTML("<p>later</p>")

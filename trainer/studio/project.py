@@ -1,0 +1,719 @@
+"""The state of one studio: captures, model file, effect files, work under way and its results.
+
+Every browser watches the same project. The model file is the state; what is here besides is computed from it.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from firmware_iface.errors import InputError
+from trainer.captures.capture_origin import origin
+from trainer.captures.capture_set import CaptureSet, read_captures
+from trainer.captures.capture_table import Capture
+from trainer.captures.held_out import split
+from trainer.captures.problems import MISREAD, Problem
+from trainer.diagnosis.capture_errors import SetErrors
+from trainer.diagnosis.diagnosis import Diagnosis
+from trainer.diagnosis.ranking import RankedEffect
+from trainer.effects.effect_catalogue import Catalogue, catalogue, forget_effect_files
+from trainer.model.model import Model
+from trainer.model.model_file import read_model
+from trainer.studio import job_tasks
+from trainer.studio.job_tasks import CandidatePreview, CapturePrediction
+from trainer.studio.jobs import WorkerProcess, sentence_of
+from trainer.studio.model_steps import ModelSteps
+
+TOPICS = ("set", "model", "picture", "errors", "job", "diagnosis", "notice", "effects", "other", "gain")
+KEPT_BYTES = 768 * 2**20  # of predicted captures
+WATCH_S = 0.7  # between two looks at the files
+
+Watcher = Callable[[str], None]
+
+
+@dataclass
+class Work:
+    """Long work that is under way.
+
+    Attributes
+    ----------
+    name : str
+        What a person asked for: "Diagnose", "Add zero_order" and so on.
+    share : float
+        That is done.
+    what : str
+        Is done now.
+    started : float, s
+        Of the monotonic clock.
+    """
+
+    name: str
+    share: float = 0.0
+    what: str = "starting"
+    started: float = field(default_factory=time.monotonic)
+
+    @property
+    def seconds_left(self) -> float | None:
+        """An estimate; None while there is nothing to estimate from."""
+        spent = time.monotonic() - self.started
+        if self.share < 0.04 or spent < 1.0:
+            return None
+        return spent * (1 - self.share) / self.share
+
+
+class Project:
+    """One set of captures and one model file, and the work on them.
+
+    Parameters
+    ----------
+    home : Path
+        Folder in which new files are made.
+    effects : iterable of Path
+        Files of the user's own effects; they are watched.
+    """
+
+    def __init__(self, home: Path, effects: Iterable[Path] = ()) -> None:
+        self.home = home
+        self.lock = threading.RLock()
+        self.effect_files: tuple[Path, ...] = tuple(p.absolute() for p in effects)
+        self.effects_fault = ""
+        self.known: Catalogue = {}
+        self.folder: Path | None = None
+        self.captures: CaptureSet | None = None
+        self.held_out: tuple[Capture, ...] = ()
+        self.problems: list[Problem] | None = None
+        self.set_fault = ""
+        self.steps: ModelSteps | None = None
+        self.model: Model | None = None
+        self.other: tuple[str, Model] | None = None
+        self.work: Work | None = None
+        self.diagnosis: Diagnosis | None = None
+        self.ranking: tuple[RankedEffect, ...] = ()
+        self.previews: dict[str, CandidatePreview] = {}
+        self.notice: tuple[str, str] = ("", "")
+        self.verdict = ""
+        self.gain: Any = None
+        self._revision = 0
+        self._other_revision = -1  # revisions of the second model are negative
+        self._with_gains: dict[int, Model] = {}
+        self._predictions: OrderedDict[tuple[int, str], CapturePrediction] = OrderedDict()
+        self._wanted: list[tuple[int, str]] = []
+        self._faults: dict[tuple[int, str], str] = {}
+        self._checked = False
+        self._effects_version = 0
+        self._watchers: dict[int, Watcher] = {}
+        self._marks: dict[Path, int] = {}
+        self._closing = threading.Event()
+        self._pictures = WorkerProcess("hololoop studio: pictures")
+        self._jobs = WorkerProcess("hololoop studio: work")
+        self._read_effects()
+        threading.Thread(target=self._watch_files, daemon=True).start()
+
+    # Watching
+
+    def watch(self, watcher: Watcher) -> int:
+        """Have a function called, in any thread, with the topic of each change; returns a number for `unwatch`."""
+        with self.lock:
+            number = max(self._watchers, default=0) + 1
+            self._watchers[number] = watcher
+            return number
+
+    def unwatch(self, number: int) -> None:
+        """Call a watcher no longer."""
+        with self.lock:
+            self._watchers.pop(number, None)
+
+    def tell(self, *topics: str) -> None:
+        """Say that something has changed."""
+        with self.lock:
+            watchers = list(self._watchers.values())
+        for topic in topics:
+            for watcher in watchers:
+                with suppress(Exception):  # a browser that has just left
+                    watcher(topic)
+
+    def say(self, sentence: str, severity: str = "note") -> None:
+        """Show a sentence in every browser; severity is "note" or "error"."""
+        self.notice = (severity, sentence)
+        self.tell("notice")
+
+    def close(self) -> None:
+        """End all processes."""
+        self._closing.set()
+        self._pictures.close()
+        self._jobs.close()
+
+    # Captures
+
+    def open_set(self, folder: Path, model_path: Path | None = None) -> None:
+        """Open a capture set; what is wrong with it is kept as a sentence and as the check's findings.
+
+        Raises
+        ------
+        InputError
+            Where there is no such folder.
+        """
+        folder = folder.absolute()
+        if not folder.is_dir():
+            raise InputError(
+                f"{folder} is not a folder: name a capture set, with bench.toml and captures.csv"
+            )
+        with self.lock:
+            if self.work is not None:
+                raise InputError("work is under way on the present captures: wait for it, or cancel it")
+            self._forget_results()
+            self.folder, self.captures, self.held_out = folder, None, ()
+            self.problems, self.set_fault, self._checked = None, "", False
+            path = model_path or self.home / f"{folder.name}-model.toml"
+            self.steps = ModelSteps(path.absolute())
+            self._read_set()
+            self._mark()
+        self.tell("set", "model", "notice")
+        self._next_picture()
+
+    def close_set(self) -> None:
+        """Back to the start page."""
+        with self.lock:
+            if self.work is not None:
+                raise InputError("work is under way on these captures: wait for it, or cancel it")
+            self._forget_results()
+            self.folder = self.captures = self.model = self.steps = None
+            self.problems, self.set_fault = None, ""
+        self.tell("set", "model", "notice")
+
+    def _forget_results(self) -> None:
+        self._revision += 1
+        self.model, self.other, self.diagnosis, self.ranking, self.previews = None, None, None, (), {}
+        self.verdict, self.notice, self.gain = "", ("", ""), None
+        self._predictions.clear()
+        self._with_gains.clear()
+        self._faults.clear()
+        self._wanted = []
+
+    def _read_set(self) -> None:
+        assert self.folder is not None and self.steps is not None
+        try:
+            self.captures = read_captures(self.folder)
+            self.held_out = split(self.captures).held_out
+        except InputError as error:
+            self.captures, self.held_out, self.set_fault = None, (), str(error)
+            return
+        except OSError as error:
+            self.captures, self.held_out, self.set_fault = None, (), sentence_of(error)
+            return
+        self.set_fault = ""
+        self._read_model()
+
+    @property
+    def misread(self) -> str:
+        """Why nothing can be explained by these captures: they are not what bench.toml says; "" where they are."""
+        wrong = [p for p in self.problems or () if p.severity == "error" and p.kind in MISREAD]
+        return wrong[0].message if wrong else ""
+
+    # The model
+
+    @property
+    def model_path(self) -> Path | None:
+        """Of the model file."""
+        return None if self.steps is None else self.steps.path
+
+    def _read_model(self) -> None:
+        """The model of the file, or the bench's ideal one where there is no file."""
+        assert self.captures is not None and self.steps is not None
+        model = Model(self.captures.bench)
+        if self.steps.path.is_file():
+            try:
+                model = read_model(self.steps.path, self.known, self.captures.bench)
+            except InputError as error:
+                self.notice = ("error", str(error))
+        self._take(model)
+
+    def _take(self, model: Model) -> None:
+        """Make a model the one that is shown."""
+        self._revision += 1
+        self.model = model
+        self.diagnosis, self.ranking, self.previews = None, (), {}
+        self.verdict = ""
+        keep = {self._other_revision}
+        for key in [k for k in self._predictions if k[0] not in keep]:
+            del self._predictions[key]
+        self._wanted = [key for key in self._wanted if key[0] in keep]
+
+    def _write(self, model: Model) -> None:
+        """Make a model the state: write its file, and show it.
+
+        Raises
+        ------
+        InputError
+            Where it cannot be written.
+        """
+        assert self.captures is not None and self.steps is not None and self.model is not None
+        before = self._with_gains.get(self._revision, self.model)
+        self.steps.write(model, before, origin(self.captures))
+        self._take(model)
+        self._mark()
+
+    def can_undo(self) -> bool:
+        """Whether there is a state before the present one."""
+        return (
+            self.work is None
+            and self.steps is not None
+            and self.captures is not None
+            and self.steps.can_undo()
+        )
+
+    def can_redo(self) -> bool:
+        """Whether there is an undone state after the present one."""
+        return (
+            self.work is None
+            and self.steps is not None
+            and self.captures is not None
+            and self.steps.can_redo()
+        )
+
+    def undo(self) -> None:
+        """Go back by a step."""
+        self._step(-1)
+
+    def redo(self) -> None:
+        """Go forward by a step."""
+        self._step(1)
+
+    def _step(self, by: int) -> None:
+        with self.lock:
+            if self.captures is None or self.steps is None:
+                return
+            try:
+                model = self.steps.step(by, self.known, origin(self.captures))
+            except (InputError, OSError) as error:
+                self.say(sentence_of(error), "error")
+                return
+            self._take(model)
+            self._mark()
+            self.notice = ("", "")
+        self.tell("model", "diagnosis", "notice")
+        self._next_picture()
+
+    def compare_with(self, name: str, model: Model | None) -> None:
+        """Show a second model next to the first; None: no longer."""
+        with self.lock:
+            for key in [k for k in self._predictions if k[0] == self._other_revision]:
+                del self._predictions[key]
+            self._other_revision -= 1
+            self.other = None if model is None else (name, model)
+        self.tell("other", "picture", "errors")
+        self._next_picture()
+
+    def earlier_models(self) -> dict[str, Path]:
+        """Kept states of the model by what a person calls them."""
+        if self.steps is None:
+            return {}
+        return {f"step {int(p.stem) - 1}": p for p in self.steps.files()}
+
+    # Pictures
+
+    def prediction(self, capture: str, of_other: bool = False) -> CapturePrediction | None:
+        """A capture, measured and predicted; None while it is computed, which "picture" tells the end of."""
+        with self.lock:
+            key = (self._other_revision if of_other else self._revision, capture)
+            if key in self._predictions:
+                self._predictions.move_to_end(key)
+                return self._predictions[key]
+            if self.captures is None or key in self._faults or (of_other and self.other is None):
+                return None
+            if key in self._wanted:
+                self._wanted.remove(key)
+            self._wanted.insert(0, key)
+        self._next_picture()
+        return None
+
+    def prediction_fault(self, capture: str) -> str:
+        """Why a capture cannot be predicted; "" where it can."""
+        return self._faults.get((self._revision, capture), "")
+
+    @property
+    def errors(self) -> SetErrors | None:
+        """Where the model fails on the held-out captures; None until all of them are predicted."""
+        with self.lock:
+            found = [self._predictions.get((self._revision, c.capture)) for c in self.held_out]
+            if not found or any(
+                one is None and (self._revision, c.capture) not in self._faults
+                for one, c in zip(found, self.held_out, strict=True)
+            ):
+                return None
+            return SetErrors.of([one.errors for one in found if one is not None and one.errors is not None])
+
+    @property
+    def errors_share(self) -> float:
+        """Share of the held-out captures that are predicted."""
+        with self.lock:
+            done = sum((self._revision, c.capture) in self._predictions for c in self.held_out)
+            return done / max(1, len(self.held_out))
+
+    def _next_picture(self) -> None:
+        """Give the pictures' process its next task: what somebody looks at first, then the check, then the rest."""
+        with self.lock:
+            if self._pictures.busy or self._closing.is_set() or self.folder is None:
+                return
+            folder, revision = self.folder, self._revision
+            if self.captures is not None and self.model is not None:
+                pending = [k for k in self._wanted if k[0] in (revision, self._other_revision)]
+                rest = [(revision, c.capture) for c in self.held_out]
+                rest = [k for k in rest if k not in self._predictions and k not in self._faults]
+                key = pending[0] if pending else None
+                if key is None and rest and (self._checked or len(rest) == len(self.held_out)):
+                    key = rest[0]
+                if key is not None:
+                    self._predict(folder, key)
+                    return
+                if not self._checked:
+                    self._check(folder)
+                elif rest:
+                    self._predict(folder, rest[0])
+            elif not self._checked:
+                self._check(folder)
+
+    def _check(self, folder: Path) -> None:
+        def heard(kind: str, value: Any) -> None:
+            if kind == "progress":
+                return
+            with self.lock:
+                if folder == self.folder:
+                    self.problems = (
+                        value if kind == "done" else [Problem("error", "unreadable", "", str(value))]
+                    )
+            self.tell("set")
+            self._next_picture()
+
+        self._checked = True
+        self._pictures.submit(job_tasks.check, (folder,), heard)
+
+    def _predict(self, folder: Path, key: tuple[int, str]) -> None:
+        revision, capture = key
+        is_other = revision == self._other_revision and self.other is not None
+        model = self.other[1] if is_other and self.other else self.model
+        model = self._with_gains.get(revision, model)
+        assert model is not None and self.captures is not None
+        if set(self.captures.channels) - set(model.gain):
+            self._pictures.submit(job_tasks.fit_gains, (folder, model), lambda k, v: self._gained(key, k, v))
+            return
+        arguments = (folder, model, capture, self._effects_version)
+        self._pictures.submit(job_tasks.predict, arguments, lambda k, v: self._predicted(key, k, v))
+
+    def _gained(self, key: tuple[int, str], kind: str, value: Any) -> None:
+        with self.lock:
+            if kind == "done":
+                self._with_gains[key[0]] = value
+            elif kind == "failed":
+                self._fault_all(key[0], str(value))
+        self._next_picture()
+
+    def _predicted(self, key: tuple[int, str], kind: str, value: Any) -> None:
+        with self.lock:
+            if key in self._wanted:
+                self._wanted.remove(key)
+            if key[0] in (self._revision, self._other_revision):
+                if kind == "done":
+                    self._predictions[key] = value
+                    self._drop_old()
+                elif kind == "failed":
+                    self._faults[key] = str(value)
+        self.tell("picture")
+        if self.errors_share == 1:
+            self.tell("errors")
+        self._next_picture()
+
+    def _fault_all(self, revision: int, sentence: str) -> None:
+        for capture in self.captures.captures if self.captures else ():
+            self._faults[(revision, capture.capture)] = sentence
+        self._wanted = []
+        self.say(sentence, "error")
+        self.tell("picture", "errors")
+
+    def _drop_old(self) -> None:
+        """Forget full pictures that nobody has looked at for long, keeping what maps of the set need."""
+        size = sum(p.measured.nbytes + p.predicted.nbytes for p in self._predictions.values())
+        for key in list(self._predictions):
+            if size <= KEPT_BYTES or key == next(reversed(self._predictions)):
+                return
+            if any(key == (self._revision, c.capture) for c in self.held_out):
+                continue
+            one = self._predictions.pop(key)
+            size -= one.measured.nbytes + one.predicted.nbytes
+
+    # Work
+
+    def diagnose(self) -> None:
+        """Look for what is missing."""
+        if self._ready():
+            arguments = (self.folder, self._model_now(), self.effect_files)
+            self._begin("Diagnose", job_tasks.find_missing, arguments, self._diagnosed)
+
+    def add(self, name: str) -> None:
+        """Put an effect in, and fit everything again."""
+        if self._ready():
+            arguments = (self.folder, self._model_now(), name, self.effect_files)
+            self._begin(f"Add {name}", job_tasks.add_effect, arguments, self._added)
+
+    def explain(self) -> None:
+        """Diagnose and add, again and again."""
+        if self._ready():
+            arguments = (self.folder, self._model_now(), self.effect_files)
+            self._begin("Explain", job_tasks.explain_all, arguments, self._explained)
+
+    def learn_field(self) -> None:
+        """Learn the wave at the panel, without a name."""
+        if self._ready():
+            arguments = (self.folder, self._model_now())
+            self._begin("Learn the field", job_tasks.learn_panel_field, arguments, self._learned)
+
+    def cancel(self) -> None:
+        """End the work that is under way."""
+        if not self._jobs.cancel():
+            self._finish()
+
+    def run(
+        self, name: str, task: Callable[..., Any], arguments: tuple[Any, ...], done: Callable[[Any], None]
+    ) -> None:
+        """Begin other work, such as captures of a simulated bench.
+
+        Parameters
+        ----------
+        name : str
+            For a person.
+        task : callable
+            Of `trainer.studio.job_tasks` or a module like it.
+        done : callable
+            Called with the result.
+        """
+        if self.work is not None:
+            self.say("Other work is under way: wait for it, or cancel it.", "error")
+            return
+        self._begin(name, task, arguments, done)
+
+    def _ready(self) -> bool:
+        if self.captures is None or self.model is None:
+            return False
+        if self.work is not None:
+            self.say("Other work is under way: wait for it, or cancel it.", "error")
+            return False
+        if self.misread:
+            self.say(f"Correct the captures first: {self.misread}", "error")
+            return False
+        return True
+
+    def _model_now(self) -> Model:
+        assert self.model is not None
+        return self._with_gains.get(self._revision, self.model)
+
+    def _begin(
+        self, name: str, task: Callable[..., Any], arguments: tuple[Any, ...], done: Callable[[Any], None]
+    ) -> None:
+        def heard(kind: str, value: Any) -> None:
+            if kind == "progress":
+                with self.lock:
+                    if self.work is not None:
+                        self.work.share, self.work.what = value
+                self.tell("job")
+            elif kind == "done":
+                self._finish()
+                try:
+                    done(value)
+                except (InputError, OSError) as error:
+                    self.say(sentence_of(error), "error")
+                    self.tell("model", "diagnosis")
+            elif kind in ("failed", "cancelled"):
+                self._finish()
+                self.say(str(value), "error" if kind == "failed" else "note")
+            else:
+                self._news(kind, value)
+
+        with self.lock:
+            self.work, self.notice = Work(name), ("", "")
+        self.tell("job", "notice")
+        try:
+            self._jobs.submit(task, arguments, heard)
+        except InputError as error:
+            self._finish()
+            self.say(str(error), "error")
+
+    def _finish(self) -> None:
+        with self.lock:
+            self.work = None
+        self.tell("job")
+
+    def _news(self, kind: str, value: Any) -> None:
+        if kind == "model":
+            try:
+                with self.lock:
+                    self._write(value)
+            except (InputError, OSError) as error:
+                self.cancel()
+                self.say(sentence_of(error), "error")
+                return
+            self.tell("model", "diagnosis")
+            self._next_picture()
+        elif kind == "picture":
+            self.gain = value
+            self.tell("gain")
+
+    def _diagnosed(self, value: tuple[Diagnosis, list[CandidatePreview]]) -> None:
+        with self.lock:
+            self._show(value[0])
+            self.previews = {p.effect: p for p in value[1]}
+        self.tell("diagnosis")
+
+    def _show(self, found: Diagnosis) -> None:
+        self.diagnosis, self.ranking, self.verdict = found, found.ranking, found.sentence
+
+    def _added(self, value: tuple[Model, Diagnosis | None]) -> None:
+        model, found = value
+        before = self.model.history[-1].get("excess") if self.model and self.model.history else None
+        with self.lock:
+            self._write(model)
+            if found is not None:
+                self._show(found)
+            else:
+                after = model.history[-1]
+                gained = "" if before is None else f" from {before:.2g}"
+                self.verdict = (
+                    f"{after['added']} is in the model: the excess is {after['excess']:.2g}{gained}. "
+                    "Diagnose says what is left."
+                )
+        self.tell("model", "diagnosis")
+        self._next_picture()
+
+    def _explained(self, found: Diagnosis) -> None:
+        with self.lock:
+            self._show(found)
+        self.tell("diagnosis")
+
+    def _learned(self, value: tuple[Model, float, float]) -> None:
+        model, before, after = value
+        if after >= before:
+            self.say(f"A learned field would be no gain: the excess stays at {before:.2g}. It was left out.")
+            return
+        with self.lock:
+            self._write(model)
+            self.verdict = f"With a field learned at the panel the excess is {after:.2g}, from {before:.2g}."
+        self.tell("model", "diagnosis")
+        self._next_picture()
+
+    # Files
+
+    def add_effect_file(self, path: Path) -> None:
+        """Watch one more file of effects."""
+        with self.lock:
+            if path.absolute() not in self.effect_files:
+                self.effect_files = (*self.effect_files, path.absolute())
+        self._effects_changed()
+
+    def _read_effects(self) -> None:
+        forget_effect_files()
+        self._effects_version += 1
+        try:
+            self.known, self.effects_fault = catalogue(self.effect_files), ""
+        except InputError as error:
+            self.effects_fault = str(error)
+            if not self.known:
+                self.known = catalogue()
+
+    def _effects_changed(self) -> None:
+        """Read the files of effects again, and try the user's own at once where nothing else is under way."""
+        with self.lock:
+            self._read_effects()
+            self._mark()
+        self.tell("effects")
+        if self.effects_fault or self.captures is None or self.work is not None or self.misread:
+            return
+        present = self.model.names if self.model else ()
+        own = [e.name for e in self.known.values() if e.source in {str(p) for p in self.effect_files}]
+        own = [name for name in own if name not in present]
+        if own:
+            arguments = (self.folder, self._model_now(), own, self.effect_files)
+            self._begin(f"Try {', '.join(own)}", job_tasks.try_own, arguments, self._tried)
+
+    def _tried(self, value: tuple[list[RankedEffect], list[CandidatePreview]]) -> None:
+        ranking, previews = value
+        own = {r.effect.name for r in ranking}
+        with self.lock:
+            rest = [r for r in self.ranking if r.effect.name not in own]
+            self.ranking = tuple(sorted([*ranking, *rest], key=lambda r: r.held_out.excess))
+            self.previews.update({p.effect: p for p in previews})
+        self.tell("diagnosis")
+
+    def _mark(self) -> None:
+        self._marks = {path: _changed(path) for path in self._watched()}
+
+    def _watched(self) -> list[Path]:
+        paths = list(self.effect_files)
+        if self.steps is not None:
+            paths.append(self.steps.path)
+        if self.folder is not None:
+            paths += [self.folder / "bench.toml", self.folder / "captures.csv"]
+        return paths
+
+    def _watch_files(self) -> None:
+        while not self._closing.wait(WATCH_S):
+            with suppress(Exception):
+                self.look_at_files()
+
+    def look_at_files(self) -> None:
+        """Notice what other programs have written: the command line, or an editor."""
+        with self.lock:
+            changed = [p for p in self._watched() if _changed(p) != self._marks.get(p)]
+            if not changed:
+                return
+            self._mark()
+            tables = self.folder is not None and any(
+                p.parent == self.folder and p.suffix != ".py" and p.name in ("bench.toml", "captures.csv")
+                for p in changed
+            )
+        if tables:
+            self.read_again()
+        elif self.steps is not None and self.steps.path in changed and self.captures is not None:
+            self._model_changed()
+        if any(p in self.effect_files for p in changed):
+            self._effects_changed()
+
+    def read_again(self) -> None:
+        """Read the capture set again, after its tables have changed."""
+        with self.lock:
+            self._revision += 1
+            self.problems, self._checked = None, False
+            self._predictions.clear()
+            self._with_gains.clear()
+            self._faults.clear()
+            self._read_set()
+            self._mark()
+        self.tell("set", "model", "diagnosis", "picture")
+        self._next_picture()
+
+    def _model_changed(self) -> None:
+        assert self.steps is not None and self.captures is not None
+        with self.lock:
+            before = self._model_now() if self.model is not None else None
+            self._read_model()
+            if self.steps.path.is_file() and self.model is not None and self.notice[0] != "error":
+                with suppress(InputError):
+                    self.steps.notice(self.model, before, origin(self.captures))
+                self.notice = (
+                    "note",
+                    f"{self.steps.path.name} was changed by another program; this is what it says now.",
+                )
+        self.tell("model", "diagnosis", "notice")
+        self._next_picture()
+
+
+def _changed(path: Path) -> int:
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:
+        return 0
