@@ -66,8 +66,9 @@ class LinkedPictures:
             active_scroll="wheel_zoom",
             toolbar_location=None,
             min_border=0,
-            aspect_ratio=width / height,
-            sizing_mode="stretch_width",
+            width=400,
+            height=max(1, round(400 * height / width)),
+            sizing_mode="scale_width",
         )
         one.add_tools(BoxZoomTool(match_aspect=True))
         one.axis.visible = False
@@ -200,7 +201,7 @@ def comparison_view(project: Project, visit: Visit) -> Any:
                 plot = pictures.figure(kind)
                 if not made:
                     plot.on_event(RangesUpdate, pictures.redraw)
-                made[kind] = pn.pane.Bokeh(plot, sizing_mode="stretch_width", margin=0)
+                made[kind] = pn.pane.Bokeh(plot, sizing_mode="scale_width", margin=0)
         width = "1 1 300px" if way.value == "wipe" else "1 1 200px"
         place[:] = [
             pn.Column(
@@ -334,8 +335,8 @@ def _words(project: Project, found: CapturePrediction) -> str:
     saturated = f"; {100 * lost:.2g} % saturated, gray" if lost > 0 else ""
     other = "" if project.other is None else f"; next to {escape(project.other[0])}"
     return (
-        f"<p>Capture <b>{escape(found.capture)}</b>, {escape(errors.channel)}, {errors.plane_mm:g} mm{excess}{saturated}"
-        f"{other}. Drag to pan, wheel to zoom; the pictures move together.</p>"
+        f"<p>Capture <b>{escape(found.capture)}</b>, {escape(errors.channel)}, {errors.plane_mm:g} mm{excess}"
+        f"{saturated}{other}. Drag to pan, wheel to zoom; the pictures move together.</p>"
     )
 
 

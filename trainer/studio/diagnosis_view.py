@@ -154,7 +154,8 @@ def _pictures(project: Project, one: RankedEffect) -> Any:
     if preview is None:
         return pn.pane.HTML("", margin=0)
     pictures = "".join(
-        f"<figure><img src='{difference_uri(values, preview.scale)}' alt='{alt}'><figcaption>{words}</figcaption></figure>"
+        f"<figure><img src='{difference_uri(values, preview.scale)}' alt='{alt}'>"
+        f"<figcaption>{words}</figcaption></figure>"
         for values, words, alt in (
             (preview.missing, "missing now", f"Measured less predicted in capture {escape(preview.capture)}"),
             (

@@ -76,7 +76,7 @@ def failures_view(project: Project, visit: Visit) -> Any:
         cells.append(
             pn.Column(
                 pn.pane.HTML(f"<h3>{plot.title}</h3>", margin=0),
-                pn.pane.Bokeh(plot.figure, sizing_mode="stretch_width", margin=0),
+                pn.pane.Bokeh(plot.figure, sizing_mode=plot.figure.sizing_mode, margin=0),
                 styles={"flex": "1 1 230px", "min-width": "0"},
                 margin=0,
             )
@@ -136,6 +136,12 @@ def _plot(**more: Any) -> Any:
     return one
 
 
+def _curve(plot: Any, over: str, kind: str, colour: str, dash: str) -> None:
+    plot.figure.line(
+        over, kind, source=plot.source, color=colour, line_dash=dash, line_width=2, legend_label=kind
+    )
+
+
 class _Field:
     """Excess over the picture, in tiles."""
 
@@ -145,7 +151,7 @@ class _Field:
         height, width = shape
         self.figure = figure(
             x_range=Range1d(0, width), y_range=Range1d(height, 0), tools="tap", toolbar_location=None, min_border=0,
-            aspect_ratio=width / height, sizing_mode="stretch_width",
+            width=260, height=max(1, round(260 * height / width)), sizing_mode="scale_width",
         )  # fmt: skip
         self.figure.axis.visible = False
         self.figure.grid.visible = False
@@ -188,7 +194,7 @@ class _Frequency:
     def __init__(self, visit: Visit) -> None:
         c = visit.colours
         self.figure = _plot(y_axis_type="log", x_axis_label="cycles/pixel", y_axis_label="power, counts²")
-        self.source = ColumnDataSource({k: [] for k in ("f", "error", "noise", "signal")})
+        self.source = ColumnDataSource({k: [0.1, 1.0] for k in ("f", "error", "noise", "signal")})
         for kind, colour, dash in (
             ("signal", c["quiet"], "solid"),
             ("error", c["main"], "solid"),
@@ -221,7 +227,7 @@ class _Brightness:
     def __init__(self, visit: Visit) -> None:
         c = visit.colours
         self.figure = _plot(x_axis_label="predicted counts above black", y_axis_label="counts, rms")
-        self.source = ColumnDataSource({k: [] for k in ("counts", "error", "noise", "bias")})
+        self.source = ColumnDataSource({k: [0.1, 1.0] for k in ("counts", "error", "noise", "bias")})
         for kind, colour, dash in (
             ("error", c["main"], "solid"),
             ("noise", c["other"], "dashed"),
@@ -267,7 +273,7 @@ class _Time:
 
     def __init__(self, visit: Visit) -> None:
         self.figure = _plot(x_axis_label="time, s", y_axis_label="excess")
-        self.source = ColumnDataSource({k: [] for k in ("time", "excess", "gain", "capture")})
+        self.source = ColumnDataSource({k: [0.1, 1.0] for k in ("time", "excess", "gain", "capture")})
         self.figure.line("time", "excess", source=self.source, color=visit.colours["quiet"], line_width=1)
         drawn = self.figure.scatter("time", "excess", source=self.source, color=visit.colours["main"], size=8)
         rows = [("capture", "@capture"), ("excess", "@excess{0.00000}"), ("gain", "@gain{0.0000}")]

@@ -1,4 +1,4 @@
-"""Findings of the check that a line of bench.toml or captures.csv corrects, and the correction, with a copy of the old."""
+"""Findings of the check that a line of bench.toml or captures.csv corrects: the correction, and a copy of the old."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ def findings_view(project: Project, visit: Visit) -> Any:
     def show() -> None:
         found = project.problems
         if found is None:
-            place[:] = [pn.pane.HTML("<p class='quiet'>Checking the captures …</p>", margin=0)]
+            place[:] = [_text("<p class='quiet'>Checking the captures …</p>")]
             return
         if not found:
             count = len(project.captures or ())
@@ -35,8 +35,8 @@ def findings_view(project: Project, visit: Visit) -> Any:
             return
         ordered = sorted(found, key=lambda p: p.severity != "error")
         errors = sum(p.severity == "error" for p in found)
-        words = f"{errors} error{'s' * (errors != 1)} and {len(found) - errors} warning{'s' * (len(found) - errors != 1)}"
-        rows: list[Any] = [pn.pane.HTML(f"<h2>Check of the captures: {words}</h2>", margin=0)]
+        words = f"{_count(errors, 'error')} and {_count(len(found) - errors, 'warning')}"
+        rows: list[Any] = [_text(f"<h2>Check of the captures: {words}</h2>")]
         for problem in ordered[:MOST]:
             text = (
                 f"<p class='finding {problem.severity}'><b>{problem.severity}, {escape(problem.kind.replace('_', ' '))}"
@@ -60,6 +60,14 @@ def findings_view(project: Project, visit: Visit) -> Any:
 
     visit.on("set", show)
     return place
+
+
+def _text(html: str) -> Any:
+    return pn.pane.HTML(html, margin=0)
+
+
+def _count(number: int, word: str) -> str:
+    return f"{number} {word}{'s' * (number != 1)}"
 
 
 def _apply(project: Project, fix: Any) -> None:

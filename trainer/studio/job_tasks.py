@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from firmware_iface.errors import InputError
 from runtime.program.progress import Progress
+from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet, chosen, opened
 from trainer.captures.check_set import check_captures
 from trainer.captures.held_out import capture_roles
@@ -183,7 +183,7 @@ def try_own(
     for k, name in enumerate(names):
         progress(k / len(names), f"fitting {name}")
         one = find_effect(known, name)
-        batches = [b for b in _batches(captures, roles.screened)]
+        batches = load(captures, roles.screened)
         start = screen_batches(batches, model, (one,))[0].start
         ids = tuple(c.capture for c in roles.fitted)
         held = tuple(c.capture for c in roles.held_out)
@@ -213,12 +213,6 @@ def _begin(folder: Path, effects: Sequence[Path]) -> tuple[CaptureSet, Any]:
 def _workers(captures: CaptureSet) -> int:
     panel = captures.bench.panel
     return 1 if panel.width * panel.height < SMALL_PX else cores()
-
-
-def _batches(captures: CaptureSet, rows: Any) -> Any:
-    from trainer.captures.batches import load
-
-    return load(captures, rows)
 
 
 def _progress(say: Say, end: float = 1.0) -> Progress:
@@ -278,6 +272,3 @@ def _previews(captures: CaptureSet, model: Model, ranking: Sequence[RankedEffect
 
 def _excess(captures: CaptureSet, row: Any, model: Model) -> float:
     return evaluate_captures(captures, [row], model).excess
-
-
-__all__ = ["CandidatePreview", "CapturePrediction", "InputError", "replace"]

@@ -52,8 +52,9 @@ def ladder_view(project: Project, visit: Visit) -> Any:
         chart = ladder_chart([r["label"] for r in rows], [r["nrmse"] for r in rows], rows[-1]["noise_nrmse"])
         last = rows[-1]
         pane.object = (
-            f"<h2>Ladder of errors</h2>{chart}<p class='small'>Error now <b>{percent(last['nrmse'])}</b> of the signal's "
-            f"spread; the camera's noise alone <b>{percent(last['noise_nrmse'])}</b>; excess <b>{number(last['excess'])}</b>.</p>"
+            f"<h2>Ladder of errors</h2>{chart}<p class='small'>Error now <b>{percent(last['nrmse'])}</b> of the "
+            f"signal's spread; the camera's noise alone <b>{percent(last['noise_nrmse'])}</b>; "
+            f"excess <b>{number(last['excess'])}</b>.</p>"
         )
 
     visit.on("set model errors", show)

@@ -62,10 +62,12 @@ def _stage(name: str, model: Model, probe: ProbeResult | None, excess: float, da
     title, about = ABOUT[name]
     effects = "".join(_effect(one, model) for one in model.present if one.effect.stage == name)
     if name == "gray":
-        effects = f"<small>{model.bench.panel.width} × {model.bench.panel.height}, {model.bench.panel.levels:g} levels</small>"
+        board = model.bench.panel
+        effects = f"<small>{board.width} × {board.height}, {board.levels:g} levels</small>"
     if name == "camera":
         camera = model.bench.camera
-        effects = f"<small>{camera.bit_depth} bits, black {camera.black_level:g}, {number(camera.full_well_e)} e⁻</small>"
+        words = f"{camera.bit_depth} bits, black {camera.black_level:g}, {number(camera.full_well_e)} e⁻"
+        effects = f"<small>{words}</small>"
     style, share_text = "", ""
     if probe is not None and excess > 0:
         share = max(0.0, min(1.0, probe.removed.value / excess))

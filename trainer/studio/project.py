@@ -32,6 +32,7 @@ from trainer.studio.jobs import WorkerProcess, sentence_of
 from trainer.studio.model_steps import ModelSteps
 
 TOPICS = ("set", "model", "picture", "errors", "job", "diagnosis", "notice", "effects", "other", "gain")
+TABLES = ("bench.toml", "captures.csv")
 KEPT_BYTES = 768 * 2**20  # of predicted captures
 WATCH_S = 0.7  # between two looks at the files
 
@@ -657,7 +658,7 @@ class Project:
         if self.steps is not None:
             paths.append(self.steps.path)
         if self.folder is not None:
-            paths += [self.folder / "bench.toml", self.folder / "captures.csv"]
+            paths += [self.folder / name for name in TABLES]
         return paths
 
     def _watch_files(self) -> None:
@@ -672,10 +673,7 @@ class Project:
             if not changed:
                 return
             self._mark()
-            tables = self.folder is not None and any(
-                p.parent == self.folder and p.suffix != ".py" and p.name in ("bench.toml", "captures.csv")
-                for p in changed
-            )
+            tables = any(p.name in TABLES for p in changed)
         if tables:
             self.read_again()
         elif self.steps is not None and self.steps.path in changed and self.captures is not None:

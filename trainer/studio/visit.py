@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from typing import ClassVar
 
 import panel as pn
 import param
@@ -78,4 +79,4 @@ class LiveText(pn.reactive.ReactiveHTML):  # type: ignore[misc]
     tone = param.String(default="plain")
 
     _template = '<div id="region" role="status" aria-live="polite" aria-label="${label}" class="live ${tone}">${text}</div>'
-    _child_config = {"text": "literal"}
+    _child_config: ClassVar[dict[str, str]] = {"text": "literal"}
