@@ -29,7 +29,7 @@ def diagnosis_view(project: Project, visit: Visit) -> Any:
     explain = pn.widgets.Button(name="Explain", css_classes=["plain-button"], margin=0)
     cancel = pn.widgets.Button(name="Cancel", css_classes=["plain-button"], margin=0)
     label = pn.pane.HTML("", margin=0, sizing_mode="stretch_width")
-    verdict = LiveText(label="Verdict", sizing_mode="stretch_width", css_classes=["verdict"])
+    verdict = LiveText(sizing_mode="stretch_width", css_classes=["verdict"])
     progress = pn.pane.HTML("", margin=0, sizing_mode="stretch_width")
     diagnose.on_click(lambda _: project.diagnose())
     explain.on_click(lambda _: project.explain())

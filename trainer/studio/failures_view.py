@@ -33,9 +33,10 @@ def failures_view(project: Project, visit: Visit) -> Any:
         "brightness": _Brightness(visit),
         "time": _Time(visit),
     }
+    places: dict[str, Any] = {}
     words = pn.pane.HTML("", margin=0, sizing_mode="stretch_width")
     worst = pn.FlexBox(gap="6px")
-    where = pn.widgets.Select(name="Worst captures", options={"over everything": None}, width=260, margin=0)
+    where = pn.widgets.Select(name="Worst captures", options=["over everything"], width=260, margin=0)
 
     def chosen(title: str, captures: list[tuple[str, float]]) -> None:
         buttons = []
@@ -52,10 +53,10 @@ def failures_view(project: Project, visit: Visit) -> Any:
         errors = project.errors
         if errors is None:
             return
-        if event.new is None:
+        if event.new not in places:
             chosen("over everything", _everything(errors))
         else:
-            kind, place = event.new
+            kind, place = places[event.new]
             title, captures = plots[kind].worst(errors, place)
             chosen(title, captures)
 
@@ -77,7 +78,7 @@ def failures_view(project: Project, visit: Visit) -> Any:
             pn.Column(
                 pn.pane.HTML(f"<h3>{plot.title}</h3>", margin=0),
                 pn.pane.Bokeh(plot.figure, sizing_mode=plot.figure.sizing_mode, margin=0),
-                styles={"flex": "1 1 230px", "min-width": "0"},
+                styles={"flex": "1 1 calc(50% - 14px)", "min-width": "min(100%, 240px)"},
                 margin=0,
             )
         )
@@ -90,7 +91,9 @@ def failures_view(project: Project, visit: Visit) -> Any:
             return
         for plot in plots.values():
             plot.show(errors)
-        where.options = {"over everything": None, **_places(errors, plots)}
+        places.clear()
+        places.update(_places(errors, plots))
+        where.param.update(options=["over everything", *places], value="over everything")
         chosen("over everything", _everything(errors))
 
     where.param.watch(pick, "value")

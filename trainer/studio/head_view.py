@@ -22,7 +22,7 @@ def head_view(project: Project, visit: Visit, theme: str) -> Any:
     other = pn.widgets.Button(name="Other captures", css_classes=["quiet-button"], margin=0)
     choice = pn.widgets.Select(
         name="Theme",
-        options={"as the system": "auto", "light": "light", "dark": "dark"},
+        options={"system": "auto", "light": "light", "dark": "dark"},
         value=theme if theme in ("light", "dark") else "auto",
         width=132,
         margin=0,
@@ -62,7 +62,7 @@ def head_view(project: Project, visit: Visit, theme: str) -> Any:
 
 def notice_view(project: Project, visit: Visit) -> Any:
     """The sentence of what just happened, in a live region."""
-    text = LiveText(label="What just happened", sizing_mode="stretch_width")
+    text = LiveText(sizing_mode="stretch_width")
 
     def show() -> None:
         severity, sentence = project.notice

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from runtime.program.outputs import emptied
 from runtime.program.progress import Progress
 from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet, chosen, opened
@@ -202,6 +203,29 @@ def learn_panel_field(say: Say, folder: Path, model: Model) -> tuple[Model, floa
         captures, model, lambda done, what="": progress(done, "learning the field at the panel")
     )
     return found.model, found.before.excess, found.after.excess
+
+
+def train_network(say: Say, folder: Path, model: Model, steps: int, out: Path) -> tuple[Path, float, float]:
+    """A network trained beyond the model: its file, and the PSNR of held-out predictions without and with it, dB."""
+    from trainer.training.image_metrics import prediction_metrics
+    from trainer.training.recipe import recipe_named
+    from trainer.training.training_run import NETWORK, train
+    from trainer.training.training_sets import training_sets
+
+    captures = opened(folder)
+    torch.set_num_threads(cores())
+    progress = _progress(say)
+    sets = training_sets(
+        captures, model, progress=lambda done, what="": progress(0.1 * done, "predicting what the model says")
+    )
+    emptied(out)
+    out.mkdir(parents=True, exist_ok=True)
+    network = train(
+        sets.fitted, recipe_named("compact"), steps, out, sets.held_out, about=sets.about,
+        progress=lambda step, loss: progress(0.1 + 0.9 * step / steps, f"step {step} of {steps}, loss {loss:.3g}"),
+    )  # fmt: skip
+    before, after = (prediction_metrics(sets.held_out, one).as_json() for one in (None, network))
+    return out / NETWORK, float(before["psnr_db"]), float(after["psnr_db"])
 
 
 def _begin(folder: Path, effects: Sequence[Path]) -> tuple[CaptureSet, Any]:

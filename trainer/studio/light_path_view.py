@@ -22,6 +22,7 @@ ABOUT = {
     "pupil": ("pupil", "propagation and iris"),
     "sensor": ("sensor", "irradiance to signal"),
     "camera": ("camera", "counts and their noise"),
+    "network": ("network", "what has no name, booked apart"),
     "field": ("learned field", "the wave at the panel, without a name"),
 }
 MOST_VALUES = 3
@@ -47,6 +48,8 @@ def _path(project: Project, visit: Visit) -> str:
     names = ["gray", *STAGES, "camera"]
     if model.panel_field is not None:
         names.insert(names.index("panel") + 1, "field")
+    if project.network is not None:
+        names.insert(names.index("sensor"), "network")
     boxes = "".join(_stage(n, model, probes.get(n), excess, visit.dark) for n in names)
     legend = (
         "The deeper the colour, the more of the error that is left a free-form probe of the stage would remove."

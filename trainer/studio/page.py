@@ -42,14 +42,15 @@ def studio_page(project: Project) -> Any:
     frame.add_variable("style", STYLE.read_text(encoding="utf-8"))
     frame.add_variable("theme", theme if theme in ("light", "dark") else "auto")
     frame.add_panel("head", head_view(project, visit, theme))
-    frame.add_panel("work", _work(project, visit))
+    work = pn.Column(sizing_mode="stretch_width", css_classes=["work"])
+    frame.add_panel("work", work)  # while it is empty, which is quicker
     frame.title = "hololoop studio"
+    _fill(work, project, visit)
     return frame
 
 
-def _work(project: Project, visit: Visit) -> Any:
-    """The start page, or the work on a set of captures."""
-    place = pn.Column(sizing_mode="stretch_width", css_classes=["work"])
+def _fill(place: Any, project: Project, visit: Visit) -> None:
+    """Show the start page, or the work on a set of captures."""
     shown: list[Path | None] = []
 
     def show() -> None:
@@ -68,7 +69,6 @@ def _work(project: Project, visit: Visit) -> Any:
             ]
 
     visit.on("set", show)
-    return place
 
 
 def _sections(project: Project, visit: Visit) -> Any:
@@ -99,17 +99,19 @@ def _sections(project: Project, visit: Visit) -> Any:
 
 
 def _explain(project: Project, visit: Visit) -> Any:
-    left = pn.Column(
-        comparison_view(project, visit),
-        failures_view(project, visit),
-        styles={"flex": "3 1 540px", "min-width": "0"},
-    )
+    left = pn.Column(comparison_view(project, visit), styles={"flex": "3 1 540px", "min-width": "0"})
     right = pn.Column(
         diagnosis_view(project, visit),
         ladder_view(project, visit),
-        candidates_view(project, visit),
         styles={"flex": "2 1 340px", "min-width": "0"},
     )
+
+    def rest() -> None:
+        """What stands below is made when the first view is on the screen."""
+        left.append(failures_view(project, visit))
+        right.append(candidates_view(project, visit))
+
+    pn.state.onload(rest)
     return pn.FlexBox(left, right, gap="16px", sizing_mode="stretch_width", align_items="flex-start")
 
 

@@ -26,7 +26,7 @@ from trainer.diagnosis.ranking import RankedEffect
 from trainer.effects.effect_catalogue import Catalogue, catalogue, forget_effect_files
 from trainer.model.model import Model
 from trainer.model.model_file import read_model
-from trainer.studio import job_tasks
+from trainer.studio import gain_tasks, job_tasks
 from trainer.studio.job_tasks import CandidatePreview, CapturePrediction
 from trainer.studio.jobs import WorkerProcess, sentence_of
 from trainer.studio.model_steps import ModelSteps
@@ -101,6 +101,7 @@ class Project:
         self.notice: tuple[str, str] = ("", "")
         self.verdict = ""
         self.gain: Any = None
+        self.network: tuple[Path, float, float] | None = None
         self._revision = 0
         self._other_revision = -1  # revisions of the second model are negative
         self._with_gains: dict[int, Model] = {}
@@ -192,7 +193,7 @@ class Project:
     def _forget_results(self) -> None:
         self._revision += 1
         self.model, self.other, self.diagnosis, self.ranking, self.previews = None, None, None, (), {}
-        self.verdict, self.notice, self.gain = "", ("", ""), None
+        self.verdict, self.notice, self.gain, self.network = "", ("", ""), None, None
         self._predictions.clear()
         self._with_gains.clear()
         self._faults.clear()
@@ -475,6 +476,24 @@ class Project:
             arguments = (self.folder, self._model_now())
             self._begin("Learn the field", job_tasks.learn_panel_field, arguments, self._learned)
 
+    def train_network(self, steps: int) -> None:
+        """Train a network on what the model leaves."""
+        if self._ready() and self.steps is not None:
+            folder = self.steps.path.with_name(f"{self.steps.path.stem}-network")
+            arguments = (self.folder, self._model_now(), steps, folder)
+            self._begin("Train a network", job_tasks.train_network, arguments, self._trained)
+
+    def export(self, folder: Path) -> None:
+        """Write the bundle for the headset."""
+        if self._ready():
+            arguments = (self.folder, self._model_now(), folder)
+            self._begin("Export", gain_tasks.export_model, arguments, self._exported)
+
+    def show_gain(self, found: Any) -> None:
+        """Show a displayed picture in every browser."""
+        self.gain = found
+        self.tell("gain")
+
     def cancel(self) -> None:
         """End the work that is under way."""
         if not self._jobs.cancel():
@@ -606,6 +625,24 @@ class Project:
             self.verdict = f"With a field learned at the panel the excess is {after:.2g}, from {before:.2g}."
         self.tell("model", "diagnosis")
         self._next_picture()
+
+    def _trained(self, value: tuple[Path, float, float]) -> None:
+        path, before, after = value
+        self.network = (path, before, after) if after > before else None
+        if after > before:
+            self.say(
+                f"The network {path} takes the prediction from {before:.1f} to {after:.1f} dB on held-out captures."
+            )
+        else:
+            self.say(
+                f"The network is no gain: {before:.1f} dB without it, {after:.1f} dB with it. Leave it out."
+            )
+        self.tell("model")
+
+    def _exported(self, value: dict[str, Any]) -> None:
+        self.say(
+            f"The bundle is {value['bundle']}: {', '.join(value['effects']) or 'no effects'}, {value['megabytes']} MB."
+        )
 
     # Files
 

@@ -75,8 +75,7 @@ class LiveText(pn.reactive.ReactiveHTML):  # type: ignore[misc]
     """A sentence in a live region: a screen reader says it when it changes."""
 
     text = param.String(default="")
-    label = param.String(default="")
     tone = param.String(default="plain")
 
-    _template = '<div id="region" role="status" aria-live="polite" aria-label="${label}" class="live ${tone}">${text}</div>'
+    _template = '<div id="region" role="status" aria-live="polite" class="live ${tone}">${text}</div>'
     _child_config: ClassVar[dict[str, str]] = {"text": "literal"}
