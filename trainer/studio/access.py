@@ -47,7 +47,7 @@ class TokenAccess(AuthProvider):
         return f"hololoop_studio_{self._port}"
 
     @property
-    def get_user(self) -> Callable[[Any], str]:
+    def get_user(self) -> Callable[[Any], Any]:
         """The function that Bokeh asks before it answers a page or a websocket."""
         return self._admitted
 

@@ -44,9 +44,18 @@ class LinkedPictures:
     def __init__(self, shape: tuple[int, int]) -> None:
         self.shape = shape
         height, width = shape
-        self.x, self.y = Range1d(0, width, bounds=(0, width)), Range1d(height, 0, bounds=(0, height))
-        self.light = LinearColorMapper(palette=list(irradiance_palette()), low=0, high=1, nan_color=MISSING)
-        self.apart = LinearColorMapper(palette=list(difference_palette()), low=-1, high=1, nan_color=MISSING)
+        self.x: Any
+        self.y: Any
+        self.x, self.y = (
+            Range1d(start=0, end=width, bounds=(0, width)),
+            Range1d(start=height, end=0, bounds=(0, height)),
+        )
+        self.light: Any = LinearColorMapper(
+            palette=list(irradiance_palette()), low=0, high=1, nan_color=MISSING
+        )
+        self.apart: Any = LinearColorMapper(
+            palette=list(difference_palette()), low=-1, high=1, nan_color=MISSING
+        )
         empty = [np.zeros((2, 2), np.float32)]
         self.source = ColumnDataSource(
             {**{k: empty for k in TITLES}, "x": [0], "y": [0], "dw": [width], "dh": [height]}
@@ -59,7 +68,7 @@ class LinkedPictures:
     def figure(self, kind: str) -> Any:
         """One of the pictures."""
         height, width = self.shape
-        one = figure(
+        one: Any = figure(
             x_range=self.x,
             y_range=self.y,
             tools="pan,wheel_zoom,reset",
@@ -256,11 +265,8 @@ def comparison_view(project: Project, visit: Visit) -> Any:
 
     def jump(event: Any) -> None:
         """Another view has chosen a capture."""
-        row = (
-            next((c for c in (project.captures or ()).captures if c.capture == event.new), None)
-            if event.new
-            else None
-        )
+        rows = project.captures.captures if project.captures is not None else ()
+        row = next((c for c in rows if c.capture == event.new), None)
         if row is not None and (row.channel, row.plane_mm) != (colour.value, plane.value):
             colour.value, plane.value = row.channel, row.plane_mm
         list_captures()

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from html import escape
 from typing import Any
 
 import numpy as np
 import panel as pn
 from bokeh.events import Tap
-from bokeh.models import ColumnDataSource, HoverTool, LinearColorMapper, Range1d
+from bokeh.models import BasicTickFormatter, ColumnDataSource, HoverTool, LinearColorMapper, Range1d
 from bokeh.plotting import figure
 
 from trainer.diagnosis.capture_errors import SetErrors
@@ -19,6 +20,7 @@ from trainer.studio.project import Project
 from trainer.studio.visit import Visit
 
 MOST = 5
+SMALL = 5e-4  # excess that is too little to explain, and must not fill a plot
 Chosen = Callable[[str, list[tuple[str, float]]], None]
 
 
@@ -27,7 +29,7 @@ def failures_view(project: Project, visit: Visit) -> Any:
     if project.captures is None:
         return pn.Column()
     shape = project.captures.bench.camera.shape
-    plots = {
+    plots: dict[str, Any] = {
         "field": _Field(shape),
         "frequency": _Frequency(visit),
         "brightness": _Brightness(visit),
@@ -44,7 +46,7 @@ def failures_view(project: Project, visit: Visit) -> Any:
             button = pn.widgets.Button(
                 name=f"{name}: {number(value, 2)}", css_classes=["plain-button"], margin=0
             )
-            button.on_click(lambda _, name=name: setattr(visit, "capture", name))
+            button.on_click(partial(_look_at, visit, name))
             buttons.append(button)
         words.object = f"<p class='small'>Worst {escape(title)} (click one to see it):</p>"
         worst[:] = buttons
@@ -71,12 +73,13 @@ def failures_view(project: Project, visit: Visit) -> Any:
 
         return act
 
-    cells = []
+    cells, titles = [], {}
     for kind, plot in plots.items():
         plot.figure.on_event(Tap, tapped(kind))
+        titles[kind] = pn.pane.HTML(f"<h3>{plot.title}</h3>", margin=0)
         cells.append(
             pn.Column(
-                pn.pane.HTML(f"<h3>{plot.title}</h3>", margin=0),
+                titles[kind],
                 pn.pane.Bokeh(plot.figure, sizing_mode=plot.figure.sizing_mode, margin=0),
                 styles={"flex": "1 1 calc(50% - 14px)", "min-width": "min(100%, 240px)"},
                 margin=0,
@@ -89,8 +92,9 @@ def failures_view(project: Project, visit: Visit) -> Any:
             words.object = "<p class='quiet'>Comparing with the held-out captures …</p>"
             worst[:] = []
             return
-        for plot in plots.values():
+        for kind, plot in plots.items():
             plot.show(errors)
+            titles[kind].object = f"<h3>{plot.title}</h3>"
         places.clear()
         places.update(_places(errors, plots))
         where.param.update(options=["over everything", *places], value="over everything")
@@ -110,6 +114,10 @@ def failures_view(project: Project, visit: Visit) -> Any:
         css_classes=["card"],
         sizing_mode="stretch_width",
     )
+
+
+def _look_at(visit: Visit, capture: str, _: Any) -> None:
+    visit.capture = capture
 
 
 def _everything(errors: SetErrors) -> list[tuple[str, float]]:
@@ -132,8 +140,8 @@ def _places(errors: SetErrors, plots: dict[str, Any]) -> dict[str, Any]:
 
 
 def _plot(**more: Any) -> Any:
-    one = figure(
-        height=190, min_border=4, toolbar_location=None, tools="tap", sizing_mode="stretch_width", **more
+    one: Any = figure(
+        height=220, min_border=4, toolbar_location=None, tools="tap", sizing_mode="stretch_width", **more
     )
     one.xgrid.visible = False
     return one
@@ -152,17 +160,16 @@ class _Field:
 
     def __init__(self, shape: tuple[int, int]) -> None:
         height, width = shape
-        self.figure = figure(
-            x_range=Range1d(0, width), y_range=Range1d(height, 0), tools="tap", toolbar_location=None, min_border=0,
-            width=260, height=max(1, round(260 * height / width)), sizing_mode="scale_width",
+        self.figure: Any = figure(
+            x_range=Range1d(start=0, end=width), y_range=Range1d(start=height, end=0), tools="tap",
+            toolbar_location=None, min_border=0, width=260, height=max(1, round(260 * height / width)), sizing_mode="scale_width",
         )  # fmt: skip
         self.figure.axis.visible = False
         self.figure.grid.visible = False
-        self.mapper = LinearColorMapper(palette=list(error_palette()), low=0, high=1, nan_color=MISSING)
+        self.mapper: Any = LinearColorMapper(palette=list(error_palette()), low=0, high=1, nan_color=MISSING)
         self.source = ColumnDataSource({"image": [np.zeros((2, 2))], "dw": [width], "dh": [height]})
-        drawn = self.figure.image(
-            "image", x=0, y=0, dw="dw", dh="dh", source=self.source, color_mapper=self.mapper
-        )
+        plot: Any = self.figure
+        drawn = plot.image("image", x=0, y=0, dw="dw", dh="dh", source=self.source, color_mapper=self.mapper)
         self.figure.add_tools(
             HoverTool(
                 tooltips=[("excess", "@image{0.0000}"), ("row, column", "$y{0}, $x{0}")], renderers=[drawn]
@@ -173,7 +180,8 @@ class _Field:
         """Draw."""
         field, tile = errors.field, errors.captures[0].tile_px
         top = float(np.nanmax(field)) if np.isfinite(field).any() else 1.0
-        self.mapper.update(low=0.0, high=max(top, 1e-9))
+        self.mapper.update(low=0.0, high=max(top, SMALL))
+        self.title = f"Over the field, excess 0 to {number(max(top, SMALL), 2)}"
         self.source.data = {"image": [field], "dw": [field.shape[1] * tile], "dh": [field.shape[0] * tile]}
 
     def place(self, errors: SetErrors, x: float, y: float) -> tuple[int, int] | None:
@@ -275,7 +283,8 @@ class _Time:
     title = "Over time"
 
     def __init__(self, visit: Visit) -> None:
-        self.figure = _plot(x_axis_label="time, s", y_axis_label="excess")
+        self.figure = _plot(x_axis_label="time, s", y_axis_label="excess", y_range=Range1d(start=0, end=1))
+        self.figure.yaxis.formatter = BasicTickFormatter(precision=3, power_limit_low=-3)
         self.source = ColumnDataSource({k: [0.1, 1.0] for k in ("time", "excess", "gain", "capture")})
         self.figure.line("time", "excess", source=self.source, color=visit.colours["quiet"], line_width=1)
         drawn = self.figure.scatter("time", "excess", source=self.source, color=visit.colours["main"], size=8)
@@ -285,9 +294,13 @@ class _Time:
     def show(self, errors: SetErrors) -> None:
         """Draw."""
         rows = errors.time()
+        values = [r["excess"] for r in rows]
+        low, high = min(0.0, *values), max(SMALL, *values)
+        room = 0.08 * (high - low)
+        self.figure.y_range.update(start=low - room, end=high + room)
         self.source.data = {
             "time": [r["time_s"] for r in rows],
-            "excess": [r["excess"] for r in rows],
+            "excess": values,
             "gain": [np.nan if r["gain"] is None else r["gain"] for r in rows],
             "capture": [r["capture"] for r in rows],
         }

@@ -94,7 +94,7 @@ def _set(path: Path, table: str, key: str, value: int) -> Fix:
         document = tomlkit.parse(text)
         if table not in document:
             raise InputError(f"{path.name} has no table [{table}]: add it")
-        document[table][key] = value  # type: ignore[index]
+        document[table][key] = value
         return tomlkit.dumps(document)
 
     return Fix(f"Set {key} = {value} in {path.name}", path, changed)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from html import escape
 from typing import Any
 
 import panel as pn
 
 from firmware_iface.errors import InputError
-from trainer.studio.findings_fixes import fix_of
+from trainer.studio.findings_fixes import Fix, fix_of
 from trainer.studio.jobs import sentence_of
 from trainer.studio.project import Project
 from trainer.studio.visit import Visit
@@ -46,7 +47,7 @@ def findings_view(project: Project, visit: Visit) -> Any:
             fix = fix_of(project.folder, problem) if project.folder is not None else None
             if fix is not None:
                 button = pn.widgets.Button(name=fix.what, css_classes=["main-button"], margin=0)
-                button.on_click(lambda _, fix=fix: _apply(project, fix))
+                button.on_click(partial(_clicked, project, fix))
                 row.append(button)
             rows.append(pn.FlexBox(*row, gap="10px", align_items="center"))
         if len(found) > MOST:
@@ -68,6 +69,10 @@ def _text(html: str) -> Any:
 
 def _count(number: int, word: str) -> str:
     return f"{number} {word}{'s' * (number != 1)}"
+
+
+def _clicked(project: Project, fix: Fix, _: Any) -> None:
+    _apply(project, fix)
 
 
 def _apply(project: Project, fix: Any) -> None:

@@ -1,4 +1,4 @@
-"""What is gained: the same targets with patterns for the ideal and for the explained model, as a bench displays them."""
+"""What is gained: a target with patterns for the ideal and for the explained model, as a bench displays them."""
 
 from __future__ import annotations
 
@@ -109,7 +109,8 @@ def export_model(say: Say, folder: Path, model: Model, out: Path) -> dict[str, A
 def keep(picture: GainPicture, path: Path) -> None:
     """Keep a displayed picture in a file."""
     with whole_file(path) as file:
-        np.savez_compressed(file, **{k: np.asarray(v) for k, v in vars(picture).items()})
+        arrays: dict[str, Any] = {k: np.asarray(v) for k, v in vars(picture).items()}
+        np.savez_compressed(file, **arrays)
 
 
 def recorded(path: Path) -> GainPicture:
@@ -122,14 +123,14 @@ def recorded(path: Path) -> GainPicture:
     """
     try:
         with np.load(path, allow_pickle=False) as data:
-            words = {k: str(data[k]) for k in ("name", "channel", "where")}
-            arrays = {k: data[k].astype(np.float32) for k in ("target", "ideal", "explained")}
-            numbers = {k: float(data[k]) for k in ("ideal_db", "explained_db")}
+            values: dict[str, Any] = {k: str(data[k]) for k in ("name", "channel", "where")}
+            values |= {k: data[k].astype(np.float32) for k in ("target", "ideal", "explained")}
+            values |= {k: float(data[k]) for k in ("ideal_db", "explained_db")}
     except (OSError, ValueError, KeyError) as error:
         raise InputError(
             f"{path} holds no displayed picture ({error}): give a file that this page has kept"
         ) from None
-    return GainPicture(**words, **arrays, **numbers)
+    return GainPicture(**values)
 
 
 def _displayed(
@@ -146,7 +147,8 @@ def _displayed(
     with _opened(folder, bench, where) as (headset, known):
         if not known.camera.registered:
             raise InputError(
-                f"the camera of {where} does not see the panel's own pixels: choose the prediction of the explained model"
+                f"the camera of {where} does not see the panel's own pixels: "
+                "choose the prediction of the explained model"
             )
         headset.move_to_plane(plane_mm)
         try:

@@ -41,16 +41,16 @@ class _Pictures:
     """The four pictures on common axes."""
 
     def __init__(self) -> None:
-        self.x, self.y = Range1d(0, 1), Range1d(1, 0)
+        self.x, self.y = Range1d(start=0, end=1), Range1d(start=1, end=0)
         empty = [np.zeros((2, 2), np.float32)]
         self.source = ColumnDataSource({**{k: empty for k in KINDS}, "dw": [1], "dh": [1]})
         self.arrays: dict[str, np.ndarray] = {}
 
     def figure(self, kind: str, shape: tuple[int, int]) -> Any:
         """One of the pictures."""
-        one = figure(
-            x_range=self.x, y_range=self.y, tools="pan,wheel_zoom,reset", active_scroll="wheel_zoom", toolbar_location=None,
-            min_border=0, width=400, height=max(1, round(400 * shape[0] / shape[1])), sizing_mode="scale_width",
+        one: Any = figure(
+            x_range=self.x, y_range=self.y, tools="pan,wheel_zoom,reset", active_scroll="wheel_zoom",
+            toolbar_location=None, min_border=0, width=400, height=max(1, round(400 * shape[0] / shape[1])), sizing_mode="scale_width",
         )  # fmt: skip
         one.axis.visible = False
         one.grid.visible = False
@@ -167,11 +167,11 @@ def gain_view(project: Project, visit: Visit) -> Any:
                 for k, one in made.items()
             ]
         shown[:] = [found]
-        pictures.show(found, wipe.value / 100)
+        pictures.show(found, (wipe.value or 0) / 100)
         words.object = (
             f"<p>{escape(found.name.capitalize())}, {escape(found.channel)}, displayed by {escape(found.where)}: "
-            f"<b>{found.ideal_db:.1f} dB</b> with the ideal model's pattern, <b>{found.explained_db:.1f} dB</b> with the "
-            f"explained model's.</p>"
+            f"<b>{found.ideal_db:.1f} dB</b> with the ideal model's pattern, <b>{found.explained_db:.1f} dB</b> with "
+            "the explained model's.</p>"
         )
 
     def work() -> None:
@@ -203,8 +203,8 @@ def gain_view(project: Project, visit: Visit) -> Any:
         ),
         pn.Column(
             pn.pane.HTML(
-                "<h2>Give it to the headset</h2><p class='quiet'>A bundle holds the light path of the explained model as "
-                "arrays; the headset needs neither this page nor captures.</p>",
+                "<h2>Give it to the headset</h2><p class='quiet'>A bundle holds the light path of the explained model "
+                "as arrays; the headset needs neither this page nor captures.</p>",
                 margin=0,
             ),
             pn.FlexBox(out, export, reveal, gap="10px", align_items="flex-end"),

@@ -11,7 +11,9 @@ from firmware_iface.errors import InputError
 from trainer.studio.project import Project
 from trainer.studio.visit import LiveText, Visit
 
-KEEP_THEME = "document.cookie = 'hololoop_theme=' + cb_obj.value + ';path=/;max-age=31536000;samesite=lax'; location.reload()"
+KEEP_THEME = (
+    "document.cookie = 'hololoop_theme=' + cb_obj.value + ';path=/;max-age=31536000'; location.reload()"
+)
 
 
 def head_view(project: Project, visit: Visit, theme: str) -> Any:

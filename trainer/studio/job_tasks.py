@@ -241,7 +241,7 @@ def _workers(captures: CaptureSet) -> int:
 
 def _progress(say: Say, end: float = 1.0) -> Progress:
     """Passes on how far the work is, not more often than a person can see."""
-    last = ["", 0.0]
+    last: list[Any] = ["", 0.0]
 
     def progress(done: float, what: str = "") -> None:
         now = time.monotonic()

@@ -85,9 +85,8 @@ def _effect(one: EffectInstance, model: Model) -> str:
         values = one.values[p.name]
         errors = one.errors[p.name] if one.errors is not None else values * 0
         if values.size > 4:
-            rows.append(
-                f"{plain(p.name)}: {values.size} numbers, rms {number(float((values**2).mean() ** 0.5))} {_unit(p.unit)}"
-            )
+            rms = number(float((values**2).mean() ** 0.5))
+            rows.append(f"{plain(p.name)}: {values.size} numbers, rms {rms} {_unit(p.unit)}")
             continue
         pairs = zip(values.reshape(-1), errors.reshape(-1), strict=True)
         text = ", ".join(measured(float(v), float(e) or None) for v, e in pairs)

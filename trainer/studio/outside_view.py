@@ -29,7 +29,7 @@ def outside_view(project: Project, visit: Visit) -> Any:
     write = pn.widgets.Button(name="Write the effect file", css_classes=["main-button"], margin=0)
     files = pn.pane.HTML("", margin=0, sizing_mode="stretch_width")
     learn.on_click(lambda _: project.learn_field())
-    train.on_click(lambda _: project.train_network(int(steps.value)))
+    train.on_click(lambda _: project.train_network(int(steps.value or 400)))
 
     def written(_: Any) -> None:
         if project.captures is None:
@@ -43,7 +43,7 @@ def outside_view(project: Project, visit: Visit) -> Any:
         shape = bench.camera.shape if stage.value == "sensor" else bench.panel.shape
         try:
             path = write_effect_of_probe(
-                (name.value_input or name.value).strip(),
+                (name.value_input or name.value or "").strip(),
                 stage.value,
                 found,
                 shape,
@@ -91,9 +91,9 @@ def outside_view(project: Project, visit: Visit) -> Any:
     )
     named = pn.Column(
         pn.pane.HTML(
-            "<h2>Write an effect</h2><p class='quiet'>A file with a working effect of the stage, with what the probe shows "
-            "filled in: open it in your editor. Saved, it is fitted at once, and its picture stands among the "
-            "candidates.</p>",
+            "<h2>Write an effect</h2><p class='quiet'>A file with a working effect of the stage, with what the probe "
+            "shows filled in: open it in your editor. Each time you save it, it is fitted at once, and its picture "
+            "stands among the candidates.</p>",
             margin=0,
         ),
         pn.FlexBox(stage, name, gap="10px"),
@@ -103,8 +103,8 @@ def outside_view(project: Project, visit: Visit) -> Any:
     )
     unnamed = pn.Column(
         pn.pane.HTML(
-            "<h2>Learn it without a name</h2><p class='quiet'>A map of the wave at the panel holds what is fixed to the "
-            "panel: stripes, dust. A network holds what is left after that; it is booked apart.</p>",
+            "<h2>Learn it without a name</h2><p class='quiet'>A map of the wave at the panel holds what is fixed to "
+            "the panel: stripes, dust. A network holds what is left after that; it is booked apart.</p>",
             margin=0,
         ),
         pn.FlexBox(learn, gap="10px"),
@@ -133,7 +133,8 @@ def _pictures(found: Any) -> str:
 def _map(one: HeatMap) -> str:
     low, _, high = one.scale
     return (
-        f"<figure><img src='{one.uri}' alt='{escape(one.alt, quote=True)}' style='aspect-ratio:{one.width}/{one.height}'>"
+        f"<figure><img src='{one.uri}' alt='{escape(one.alt, quote=True)}' "
+        f"style='aspect-ratio:{one.width}/{one.height}'>"
         f"<div class='scale'><span>{low.text}</span><i style='background:linear-gradient(90deg,{one.bar})'></i>"
         f"<span>{high.text} {escape(one.unit)}</span></div><figcaption>{escape(one.title)}</figcaption></figure>"
     )

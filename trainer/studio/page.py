@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,7 @@ from trainer.studio.visit import Visit
 
 STYLE = Path(__file__).with_name("studio.css")
 FRAME = Path(__file__).with_name("studio.html")
-SECTIONS = ("Explain", "No name fits", "Gain", "Catalogue")
+SECTIONS = ("Bench", "No name fits", "Gain", "Catalogue")
 
 
 def prepare() -> None:
@@ -33,6 +35,7 @@ def prepare() -> None:
 def studio_page(project: Project) -> Any:
     """The page of one browser."""
     document = pn.state.curdoc
+    assert document is not None
     theme = str(pn.state.cookies.get("hololoop_theme", "auto"))
     visit = Visit(project, document, dark=theme == "dark")
     if theme == "auto" and pn.state.browser_info is not None:
@@ -44,7 +47,6 @@ def studio_page(project: Project) -> Any:
     frame.add_panel("head", head_view(project, visit, theme))
     work = pn.Column(sizing_mode="stretch_width", css_classes=["work"])
     frame.add_panel("work", work)  # while it is empty, which is quicker
-    frame.title = "hololoop studio"
     _fill(work, project, visit)
     return frame
 
@@ -76,7 +78,7 @@ def _sections(project: Project, visit: Visit) -> Any:
     place = pn.Column(sizing_mode="stretch_width")
     made: dict[str, Any] = {}
     makers = {
-        "Explain": _explain,
+        "Bench": _bench,
         "No name fits": outside_view,
         "Gain": gain_view,
         "Catalogue": _catalogue,
@@ -91,14 +93,18 @@ def _sections(project: Project, visit: Visit) -> Any:
             button.css_classes = ["section", "current"] if other == name else ["section"]
 
     for name, button in buttons.items():
-        button.on_click(lambda _, name=name: open_section(name))
-    open_section("Explain")
+        button.on_click(partial(_opened, open_section, name))
+    open_section("Bench")
     return pn.Column(
         pn.FlexBox(*buttons.values(), css_classes=["sections"], gap="4px"), place, sizing_mode="stretch_width"
     )
 
 
-def _explain(project: Project, visit: Visit) -> Any:
+def _opened(open_section: Callable[[str], None], name: str, _: Any) -> None:
+    open_section(name)
+
+
+def _bench(project: Project, visit: Visit) -> Any:
     left = pn.Column(comparison_view(project, visit), styles={"flex": "3 1 540px", "min-width": "0"})
     right = pn.Column(
         diagnosis_view(project, visit),

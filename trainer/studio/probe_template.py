@@ -1,4 +1,4 @@
-"""An effect file for what a probe shows: the template of its stage, with starts and sizes that the probe's map gives."""
+"""An effect file for what a probe shows: the template of its stage, with starts that the probe's map gives."""
 
 from __future__ import annotations
 
@@ -78,7 +78,8 @@ def filled(text: str, stage: str, found: ProbeResult, shape: tuple[int, int]) ->
                 )
                 starts.append(_start(stage, wave, size, array, shape))
     told = "\n".join(words) or "  nothing in the maps that this effect could be seen in"
-    head = f"What the {stage} probe showed when this file was written (excess removed: {number(found.removed.value)}):\n"
+    removed = number(found.removed.value)
+    head = f"What the {stage} probe showed when this file was written (excess removed: {removed}):\n"
     text = text.replace('\n"""\n', f'\n\n{head}{told}\n"""\n', 1)
     given = [s for s in starts if s]
     if given:

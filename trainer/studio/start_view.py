@@ -49,9 +49,7 @@ def start_view(project: Project, visit: Visit) -> Any:
         for p in capture_sets_below(project.home)
     }
     sets = pn.widgets.Select(name="Capture sets found here", options=list(found), width=340, margin=0)
-    path = pn.widgets.TextInput(
-        name="Or the path of a folder", placeholder="/home/me/captures", width=340, margin=0
-    )
+    path = pn.widgets.TextInput(name="Path of a folder", placeholder="/home/me/captures", width=340, margin=0)
     opens = pn.widgets.Button(name="Open", css_classes=["main-button"], margin=0)
     kind = pn.widgets.Select(name="Simulated bench", options=list(KINDS), width=340, margin=0)
     captures = pn.widgets.Button(name="Capture", css_classes=["main-button"], margin=0)
@@ -61,11 +59,8 @@ def start_view(project: Project, visit: Visit) -> Any:
     sets.visible = bool(found)
 
     def open_folder(_: Any) -> None:
-        chosen = (
-            Path(path.value_input or path.value).expanduser()
-            if (path.value_input or path.value)
-            else found.get(sets.value)
-        )
+        typed = path.value_input or path.value
+        chosen = Path(typed).expanduser() if typed else found.get(sets.value)
         if chosen is None:
             project.say("Give the path of a folder with bench.toml and captures.csv.", "error")
             return
@@ -90,10 +85,12 @@ def start_view(project: Project, visit: Visit) -> Any:
             picture.object = ""
 
     def seen() -> None:
-        if isinstance(project.gain, np.ndarray) and project.work is not None:
+        work = project.work
+        if isinstance(project.gain, np.ndarray) and work is not None:
+            uri = _picture(project.gain)
             picture.object = (
-                f"<figure class='live-picture'><img src='{_picture(project.gain)}' alt='The last picture of the camera'>"
-                f"<figcaption>What the camera sees: {escape(project.work.what)}</figcaption></figure>"
+                f"<figure class='live-picture'><img src='{uri}' alt='The last picture of the camera'>"
+                f"<figcaption>What the camera sees: {escape(work.what)}</figcaption></figure>"
             )
 
     opens.on_click(open_folder)
@@ -104,8 +101,8 @@ def start_view(project: Project, visit: Visit) -> Any:
     style = {"flex": "1 1 340px", "min-width": "0"}
     own = pn.Column(
         pn.pane.HTML(
-            "<h2>Your captures</h2><p class='quiet'>A folder with bench.toml, captures.csv, the patterns that were sent "
-            "to the panel and the raw pictures of the camera.</p>",
+            "<h2>Your captures</h2><p class='quiet'>A folder with bench.toml, captures.csv, the patterns "
+            "that were sent to the panel and the raw pictures of the camera.</p>",
             margin=0,
         ),
         sets,
@@ -116,8 +113,8 @@ def start_view(project: Project, visit: Visit) -> Any:
     )
     guess = pn.Column(
         pn.pane.HTML(
-            "<h2>Guess what is wrong</h2><p class='quiet'>A simulated bench with hidden defects is captured while you "
-            "watch. Find out what is wrong with it, as you would with your own.</p>",
+            "<h2>Guess what is wrong</h2><p class='quiet'>A simulated bench with hidden defects is captured "
+            "while you watch. Find out what is wrong with it, as you would with your own.</p>",
             margin=0,
         ),
         kind,
@@ -128,9 +125,9 @@ def start_view(project: Project, visit: Visit) -> Any:
         styles=style,
     )
     words = pn.pane.HTML(
-        "<p class='lead'>A holographic display shows a wrong picture wherever its optics differ from the model that its "
-        "holograms were computed with. Give captures of yours; this page says what differs, and how much is gained when "
-        "the model knows it.</p>",
+        "<p class='lead'>A holographic display shows a wrong picture wherever its optics differ from the model that "
+        "its holograms were computed with. Give captures of yours; this page says what differs, and how much is "
+        "gained when the model knows it.</p>",
         margin=0,
         sizing_mode="stretch_width",
     )

@@ -71,7 +71,7 @@ class Visit(param.Parameterized):
                 _LOG.exception("a view could not show a change of %s", topic)
 
 
-class LiveText(pn.reactive.ReactiveHTML):  # type: ignore[misc]
+class LiveText(pn.reactive.ReactiveHTML):
     """A sentence in a live region: a screen reader says it when it changes."""
 
     text = param.String(default="")
