@@ -19,6 +19,12 @@ REFUSED = (
     "This page needs the token of the address that the studio printed when it started: "
     "open that whole address, or start the studio again."
 )
+ADMITTED = (  # to the address without the token, telling whether the system is dark
+    "<!doctype html><html lang='en'><meta charset='utf-8'><title>hololoop studio</title>"
+    "<noscript><meta http-equiv='refresh' content='0;url=/'></noscript>"
+    "<script>document.cookie = 'hololoop_system=' + (matchMedia('(prefers-color-scheme: dark)').matches ? 'dark' : "
+    "'light') + ';path=/'; location.replace('/');</script></html>"
+)
 FOREIGN = "The studio answers to 127.0.0.1 and localhost alone: open the address that it printed."
 
 
@@ -95,7 +101,8 @@ class TokenAccess(AuthProvider):
         if given and self._same(given):
             handler.set_cookie(self.cookie, self._token, httponly=True, samesite="Lax", path="/")
             if handler.request.method == "GET" and "Upgrade" not in handler.request.headers:
-                handler.redirect("/")
+                handler.set_header("Content-Type", "text/html; charset=utf-8")
+                handler.finish(ADMITTED)
                 raise Finish
             return "visitor"
         if not given and self._same(handler.get_cookie(self.cookie) or ""):

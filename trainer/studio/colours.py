@@ -47,13 +47,6 @@ def difference_palette() -> tuple[str, ...]:
     return (*below, *above[::-1][1:])
 
 
-def share_colour(share: float, dark: bool) -> str:
-    """The depth of one colour for a share of the remaining error, 0 to 1."""
-    share = float(np.clip(share, 0, 1))
-    lightness = 0.27 + 0.28 * share if dark else 0.985 - 0.36 * share
-    return _oklab(np.array([lightness]), np.array([0.02 + 0.12 * share]), 55.0)[0]
-
-
 def figure_theme(dark: bool) -> Theme:
     """Bokeh's theme of the light or of the dark page."""
     c = DARK if dark else LIGHT

@@ -14,7 +14,7 @@ from trainer.studio.difference_pictures import difference_uri
 from trainer.studio.project import Project, Work
 from trainer.studio.visit import LiveText, Visit
 
-MOST = 8
+MOST = 6
 TONES = {"complete": "good", "missing": "warn", "outside_catalogue": "bad"}
 LABELS = {
     "complete": "Complete",

@@ -162,7 +162,8 @@ class _Field:
         height, width = shape
         self.figure: Any = figure(
             x_range=Range1d(start=0, end=width), y_range=Range1d(start=height, end=0), tools="tap",
-            toolbar_location=None, min_border=0, width=260, height=max(1, round(260 * height / width)), sizing_mode="scale_width",
+            toolbar_location=None, min_border=0, width=260, height=max(1, round(260 * height / width)),
+            sizing_mode="scale_width",
         )  # fmt: skip
         self.figure.axis.visible = False
         self.figure.grid.visible = False

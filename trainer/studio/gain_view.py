@@ -50,7 +50,8 @@ class _Pictures:
         """One of the pictures."""
         one: Any = figure(
             x_range=self.x, y_range=self.y, tools="pan,wheel_zoom,reset", active_scroll="wheel_zoom",
-            toolbar_location=None, min_border=0, width=400, height=max(1, round(400 * shape[0] / shape[1])), sizing_mode="scale_width",
+            toolbar_location=None, min_border=0, width=400, height=max(1, round(400 * shape[0] / shape[1])),
+            sizing_mode="scale_width",
         )  # fmt: skip
         one.axis.visible = False
         one.grid.visible = False

@@ -11,7 +11,6 @@ from trainer.diagnosis.probes import ProbeResult
 from trainer.effects.definition import STAGES
 from trainer.formatting import measured, number, plain
 from trainer.model.model import EffectInstance, Model
-from trainer.studio.colours import share_colour
 from trainer.studio.project import Project
 from trainer.studio.visit import Visit
 
@@ -33,13 +32,13 @@ def light_path_view(project: Project, visit: Visit) -> Any:
     pane = pn.pane.HTML("", sizing_mode="stretch_width", margin=0, css_classes=["light-path"])
 
     def show() -> None:
-        pane.object = _path(project, visit)
+        pane.object = _path(project)
 
     visit.on("set model diagnosis", show)
     return pane
 
 
-def _path(project: Project, visit: Visit) -> str:
+def _path(project: Project) -> str:
     model = project.model
     if model is None:
         return ""
@@ -50,7 +49,7 @@ def _path(project: Project, visit: Visit) -> str:
         names.insert(names.index("panel") + 1, "field")
     if project.network is not None:
         names.insert(names.index("sensor"), "network")
-    boxes = "".join(_stage(n, model, probes.get(n), excess, visit.dark) for n in names)
+    boxes = "".join(_stage(n, model, probes.get(n), excess) for n in names)
     legend = (
         "The deeper the colour, the more of the error that is left a free-form probe of the stage would remove."
         if probes
@@ -61,7 +60,7 @@ def _path(project: Project, visit: Visit) -> str:
     )
 
 
-def _stage(name: str, model: Model, probe: ProbeResult | None, excess: float, dark: bool) -> str:
+def _stage(name: str, model: Model, probe: ProbeResult | None, excess: float) -> str:
     title, about = ABOUT[name]
     effects = "".join(_effect(one, model) for one in model.present if one.effect.stage == name)
     if name == "gray":
@@ -74,7 +73,7 @@ def _stage(name: str, model: Model, probe: ProbeResult | None, excess: float, da
     style, share_text = "", ""
     if probe is not None and excess > 0:
         share = max(0.0, min(1.0, probe.removed.value / excess))
-        style = f" style='background:{share_colour(share, dark)}'"
+        style = f" class='probed' style='--share:{share:.3f}'"
         share_text = f"<em>{100 * share:.0f} % of what is left</em>"
     return f"<li{style}><b>{title}</b><span class='about'>{about}</span>{effects}{share_text}</li>"
 

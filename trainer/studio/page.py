@@ -37,13 +37,12 @@ def studio_page(project: Project) -> Any:
     document = pn.state.curdoc
     assert document is not None
     theme = str(pn.state.cookies.get("hololoop_theme", "auto"))
-    visit = Visit(project, document, dark=theme == "dark")
-    if theme == "auto" and pn.state.browser_info is not None:
-        info = pn.state.browser_info
-        info.param.watch(lambda event: visit.retheme(bool(event.new)), "dark_mode")
+    system = str(pn.state.cookies.get("hololoop_system", "light"))
+    visit = Visit(project, document, dark=(system if theme == "auto" else theme) == "dark")
     frame = pn.Template(FRAME.read_text(encoding="utf-8"))
     frame.add_variable("style", STYLE.read_text(encoding="utf-8"))
-    frame.add_variable("theme", theme if theme in ("light", "dark") else "auto")
+    frame.add_variable("theme", "dark" if visit.dark else "light")
+    frame.add_variable("follows", theme not in ("light", "dark"))
     frame.add_panel("head", head_view(project, visit, theme))
     work = pn.Column(sizing_mode="stretch_width", css_classes=["work"])
     frame.add_panel("work", work)  # while it is empty, which is quicker

@@ -735,6 +735,7 @@ class Project:
         assert self.steps is not None and self.captures is not None
         with self.lock:
             before = self._model_now() if self.model is not None else None
+            self.notice = ("", "")
             self._read_model()
             if self.steps.path.is_file() and self.model is not None and self.notice[0] != "error":
                 with suppress(InputError):

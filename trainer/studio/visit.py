@@ -50,11 +50,6 @@ class Visit(param.Parameterized):
         if now:
             function()
 
-    def retheme(self, dark: bool) -> None:
-        """Make the page's figures dark or light."""
-        self.dark = dark
-        self.document.theme = figure_theme(dark)
-
     def _heard(self, topic: str) -> None:
         """From any thread: act on a topic once the document is free, once however often it is told until then."""
         if topic in self._pending:
