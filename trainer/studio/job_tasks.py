@@ -230,13 +230,18 @@ def train_network(say: Say, folder: Path, model: Model, steps: int, out: Path) -
 
 def _begin(folder: Path, effects: Sequence[Path]) -> tuple[CaptureSet, Any]:
     forget_effect_files()
-    torch.set_num_threads(cores())
-    return opened(folder), catalogue(effects)
+    captures = opened(folder)
+    # Threads on pictures this small wait for each other longer than they work.
+    torch.set_num_threads(1 if _is_small(captures) else cores())
+    return captures, catalogue(effects)
 
 
 def _workers(captures: CaptureSet) -> int:
-    panel = captures.bench.panel
-    return 1 if panel.width * panel.height < SMALL_PX else cores()
+    return 1 if _is_small(captures) else cores()
+
+
+def _is_small(captures: CaptureSet) -> bool:
+    return captures.bench.panel.width * captures.bench.panel.height < SMALL_PX
 
 
 def _progress(say: Say, end: float = 1.0) -> Progress:
