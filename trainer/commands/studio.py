@@ -91,6 +91,6 @@ COMMAND = Command(
     options=options,
     run=run,
     show=show,
-    examples=("studio captures/", "studio captures/ --model model.toml --port 5006 --no-browser"),
+    examples=("studio captures/",),
     after="The model is an ordinary model file: go on with it on the command line, or export it to the headset.",
 )

@@ -15,6 +15,7 @@ import signal
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from importlib import import_module
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -37,12 +38,14 @@ class WorkerProcess:
     ----------
     name : str
         For the list of processes.
+    prepared : str, optional
+        A module that the process imports before its first task comes.
     threads : int
         That torch may use.
     """
 
-    def __init__(self, name: str, threads: int = 1) -> None:
-        self._name, self._threads = name, threads
+    def __init__(self, name: str, prepared: str = "", threads: int = 1) -> None:
+        self._name, self._prepared, self._threads = name, prepared, threads
         self._lock = threading.RLock()
         self._process: Any = None
         self._connection: Connection | None = None
@@ -113,7 +116,7 @@ class WorkerProcess:
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
         self._process = context.Process(
-            target=_work, args=(theirs, self._threads), name=self._name, daemon=False
+            target=_work, args=(theirs, self._prepared, self._threads), name=self._name, daemon=False
         )
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # Ctrl-C is the server's
         try:
@@ -177,7 +180,7 @@ def sentence_of(error: BaseException) -> str:
     return f"This did not work ({type(error).__name__}: {text[:200]}). The terminal of the studio has the details."
 
 
-def _work(connection: Connection, threads: int) -> None:
+def _work(connection: Connection, prepared: str, threads: int) -> None:
     """The process: tasks one after the other, until the server ends."""
     with suppress(OSError):
         os.setsid()  # a group of its own, which `cancel` ends with all that a task has started
@@ -186,8 +189,8 @@ def _work(connection: Connection, threads: int) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     import torch
 
-    import trainer.studio.job_tasks  # noqa: F401 - what tasks need is imported before the first one comes
-
+    if prepared:
+        import_module(prepared)
     torch.set_num_threads(threads)
     sending = threading.Lock()
 

@@ -113,8 +113,8 @@ class Project:
         self._watchers: dict[int, Watcher] = {}
         self._marks: dict[Path, int] = {}
         self._closing = threading.Event()
-        self._pictures = WorkerProcess("hololoop studio: pictures")
-        self._jobs = WorkerProcess("hololoop studio: work")
+        self._pictures = WorkerProcess("hololoop studio: pictures", job_tasks.__name__)
+        self._jobs = WorkerProcess("hololoop studio: work", job_tasks.__name__)
         self._read_effects()
         threading.Thread(target=self._watch_files, daemon=True).start()
 
