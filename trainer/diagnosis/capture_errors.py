@@ -39,7 +39,7 @@ class CaptureErrors:
     frequency : float64 array [4, rings]
         Cycles/pixel; power of the error, of the expected noise and of the signal, counts^2.
     brightness : float64 array [4, STEPS]
-        Pixels, and sums of squared residual above the noise (counts^2), residual (counts) and noise variance (counts^2),
+        Pixels, and sums of squared residual above the noise (counts^2), residual (counts) and noise (counts^2),
         by steps of the predicted counts.
     edges : float64 array [STEPS + 1], counts
         Of these steps.
@@ -188,7 +188,7 @@ class SetErrors:
         return self._ordered([one.field[row, column] / self.variance for one in self.captures])
 
     def worst_in_ring(self, ring: int) -> list[tuple[str, float]]:
-        """Captures by the power of their error above the noise in a ring of spatial frequency, counts^2, worst first."""
+        """Captures by the power of their error above the noise in a ring of frequencies, counts^2, worst first."""
         return self._ordered([one.frequency[1, ring] - one.frequency[2, ring] for one in self.captures])
 
     def worst_in_step(self, step: int) -> list[tuple[str, float]]:

@@ -5,7 +5,7 @@ Large pictures are shown as means of blocks, and pixel by pixel where one has zo
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -17,15 +17,17 @@ from bokeh.models import BoxZoomTool, ColumnDataSource, HoverTool, LinearColorMa
 from bokeh.plotting import figure
 
 from firmware_iface.errors import InputError
+from trainer.diagnosis.comparison import CapturePicture
 from trainer.formatting import number
 from trainer.model.model import Model
 from trainer.model.model_file import read_model
 from trainer.report.heat_maps import blocks
 from trainer.studio.colours import MISSING, difference_palette, irradiance_palette
-from trainer.studio.job_tasks import SHOWN_PX, CapturePrediction
+from trainer.studio.job_tasks import CapturePrediction, block_side, shown_as
 from trainer.studio.project import Project
 from trainer.studio.visit import Visit
 
+NOTHING = np.zeros((2, 2), np.float32)
 KINDS = ("measured", "predicted", "difference")
 TITLES = {
     "measured": "Measured",
@@ -63,6 +65,7 @@ class LinkedPictures:
         self.shown: CapturePrediction | None = None
         self.other: CapturePrediction | None = None
         self.wipe_at = 0.5
+        self.is_wiped = False
         self._view: tuple[int, int, int, int, int] | None = None
 
     def figure(self, kind: str) -> Any:
@@ -75,6 +78,7 @@ class LinkedPictures:
             active_scroll="wheel_zoom",
             toolbar_location=None,
             min_border=0,
+            lod_timeout=120,  # ms after a zoom until finer pixels are asked for
             width=400,
             height=max(1, round(400 * height / width)),
             sizing_mode="scale_width",
@@ -110,18 +114,18 @@ class LinkedPictures:
         if self.shown is None:
             return
         left, right, top, bottom = self._in_view()
-        factor = max(1, -(-max(right - left, bottom - top) // SHOWN_PX))
-        whole = (left, right, top, bottom) == (0, self.shape[1], 0, self.shape[0])
+        factor = block_side(max(right - left, bottom - top))
+        left, top = left // factor * factor, top // factor * factor
         view = (left, right, top, bottom, factor)
         if view == self._view:
             return
         self._view = view
-        arrays = self._arrays(self.shown, view, whole, "")
+        arrays = self._arrays(self.shown, view, "")
         if self.other is not None:
-            arrays |= self._arrays(self.other, view, whole, "_2")
+            arrays |= self._arrays(self.other, view, "_2")
             del arrays["measured_2"]
-        else:
-            arrays |= {"predicted_2": arrays["predicted"], "difference_2": arrays["difference"]}
+        else:  # what is not shown is not sent
+            arrays |= {"predicted_2": NOTHING, "difference_2": NOTHING}
         rows, columns = arrays["measured"].shape
         place = {"x": [left], "y": [top], "dw": [columns * factor], "dh": [rows * factor]}
         self._pictures = arrays
@@ -138,6 +142,8 @@ class LinkedPictures:
             self.source.patch({"wipe": [(0, self._wiped(self._view[0], self._view[4]))]})
 
     def _wiped(self, left: int, factor: int) -> np.ndarray:
+        if not self.is_wiped:
+            return NOTHING
         edge = round((self.wipe_at * self.shape[1] - left) / factor)
         columns = np.arange(self._pictures["measured"].shape[1])
         return np.where(columns < edge, self._pictures["measured"], self._pictures["predicted"]).astype(
@@ -160,11 +166,14 @@ class LinkedPictures:
         )
 
     def _arrays(
-        self, found: CapturePrediction, view: tuple[int, int, int, int, int], whole: bool, tail: str
+        self, found: CapturePrediction, view: tuple[int, int, int, int, int], tail: str
     ) -> dict[str, np.ndarray]:
         left, right, top, bottom, factor = view
-        if whole and factor == found.factor:
-            measured, predicted, difference = found.reduced
+        if factor in found.levels:
+            rows = slice(top // factor, -(-bottom // factor))
+            measured, predicted, difference = found.levels[factor][
+                :, rows, left // factor : -(-right // factor)
+            ]
         else:
             part = (slice(top, bottom), slice(left, right))
             measured, predicted = found.measured[part], found.predicted[part]
@@ -173,6 +182,23 @@ class LinkedPictures:
                 blocks(a, factor).astype(np.float32) for a in (measured, predicted, difference)
             )
         return {f"measured{tail}": measured, f"predicted{tail}": predicted, f"difference{tail}": difference}
+
+
+def pictures_view(pictures: Sequence[CapturePicture]) -> Any:
+    """Pictures of a comparison, linked as in the studio, for a notebook or a file."""
+    rows = []
+    for one in pictures:
+        linked = LinkedPictures(one.measured.shape)
+        linked.show(
+            shown_as(one.capture, one.measured, one.predicted, np.isfinite(one.difference), None), None
+        )
+        plots = [pn.pane.Bokeh(linked.figure(kind), sizing_mode="scale_width") for kind in KINDS]
+        cells = [
+            pn.Column(f"**{TITLES[kind]}**, {one.capture}", plot, styles={"flex": "1 1 200px"})
+            for kind, plot in zip(KINDS, plots, strict=True)
+        ]
+        rows.append(pn.FlexBox(*cells, sizing_mode="stretch_width"))
+    return pn.Column(*rows, sizing_mode="stretch_width")
 
 
 def comparison_view(project: Project, visit: Visit) -> Any:
@@ -211,12 +237,12 @@ def comparison_view(project: Project, visit: Visit) -> Any:
                 if not made:
                     plot.on_event(RangesUpdate, pictures.redraw)
                 made[kind] = pn.pane.Bokeh(plot, sizing_mode="scale_width", margin=0)
-        width = "1 1 300px" if way.value == "wipe" else "1 1 200px"
+        share = "50%" if way.value == "wipe" and project.other is None else "33.3%"
         place[:] = [
             pn.Column(
                 pn.pane.HTML(f"<h3>{TITLES[k]}</h3>", margin=0),
                 made[k],
-                styles={"flex": width, "min-width": "0"},
+                styles={"flex": f"0 1 calc({share} - 8px)", "min-width": "min(100%, 180px)"},
                 margin=0,
             )
             for k in kinds
@@ -273,7 +299,8 @@ def comparison_view(project: Project, visit: Visit) -> Any:
         show()
 
     def ways(_: Any) -> None:
-        wipe.visible = way.value == "wipe"
+        wipe.visible = pictures.is_wiped = way.value == "wipe"
+        pictures.wipe(pictures.wipe_at)
         layout()
 
     def toggle(_: Any) -> None:

@@ -285,7 +285,7 @@ class _Time:
 
     def __init__(self, visit: Visit) -> None:
         self.figure = _plot(x_axis_label="time, s", y_axis_label="excess", y_range=Range1d(start=0, end=1))
-        self.figure.yaxis.formatter = BasicTickFormatter(precision=3, power_limit_low=-3)
+        self.figure.yaxis.formatter = BasicTickFormatter(precision=1, power_limit_low=-3)
         self.source = ColumnDataSource({k: [0.1, 1.0] for k in ("time", "excess", "gain", "capture")})
         self.figure.line("time", "excess", source=self.source, color=visit.colours["quiet"], line_width=1)
         drawn = self.figure.scatter("time", "excess", source=self.source, color=visit.colours["main"], size=8)

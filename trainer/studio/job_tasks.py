@@ -53,10 +53,9 @@ class CapturePrediction:
     measured, predicted : float32 array [h, w], counts above black
     valid : bool array [h, w]
         False where saturated.
-    reduced : float32 array [3, h', w']
-        Measured, predicted and difference (counts; NaN where saturated), means of blocks.
-    factor : int, pixels
-        Side of these blocks.
+    levels : dict of float32 arrays [3, h', w']
+        Measured, predicted and difference (counts; NaN where saturated) as means of blocks, by the blocks' side: 1
+        where the whole picture fits the page so, and else 2, 4 and so on until it does.
     light, apart : float, counts
         Ends of the colour scales: of both pictures, and of the difference.
     errors : CaptureErrors or None
@@ -67,8 +66,7 @@ class CapturePrediction:
     measured: np.ndarray
     predicted: np.ndarray
     valid: np.ndarray
-    reduced: np.ndarray
-    factor: int
+    levels: dict[int, np.ndarray]
     light: float
     apart: float
     errors: CaptureErrors | None
@@ -98,8 +96,9 @@ class CandidatePreview:
     scale: float
 
 
-def ready(say: Say) -> None:
-    """Nothing: the process has imported what it needs."""
+def block_side(pixels: int) -> int:
+    """Side of the blocks, a power of two, with which that many pixels fit the page."""
+    return 1 << max(0, (-(-pixels // SHOWN_PX) - 1).bit_length())
 
 
 def check(say: Say, folder: Path) -> list[Problem]:
@@ -119,19 +118,28 @@ def predict(say: Say, folder: Path, model: Model, capture: str, effects_version:
     row = chosen(captures, (capture,))[0]
     residual, errors = capture_errors(captures, row, model)
     measured, predicted = residual.measured.astype(np.float32), residual.predicted.astype(np.float32)
-    valid = residual.mask > 0
-    factor = -(-max(measured.shape) // SHOWN_PX)
+    return shown_as(capture, measured, predicted, residual.mask > 0, errors)
+
+
+def shown_as(
+    capture: str, measured: np.ndarray, predicted: np.ndarray, valid: np.ndarray, errors: CaptureErrors | None
+) -> CapturePrediction:
+    """A capture and its prediction with all that the page needs to show them."""
     apart = np.where(valid, measured - predicted, np.nan).astype(np.float32)
-    reduced = [blocks(a, factor).astype(np.float32) for a in (measured, predicted, apart)]
+    whole = block_side(max(measured.shape))
+    sides = [2**k for k in range(1, whole.bit_length())] or [1]
+    levels = {
+        s: np.stack([blocks(a, s).astype(np.float32) for a in (measured, predicted, apart)]) for s in sides
+    }
+    least = levels[whole]
     return CapturePrediction(
         capture,
         measured,
         predicted,
         valid,
-        np.stack(reduced),
-        factor,
-        from_zero(reduced[:2])[1],
-        symmetric(reduced[2:])[1],
+        levels,
+        from_zero([least[0], least[1]])[1],
+        symmetric([least[2]])[1],
         errors,
     )
 

@@ -110,6 +110,7 @@ def make_server(project: Project, port: int, token: str) -> Any:
         websocket_origin=own,
         auth_provider=TokenAccess(token, port),
         title={"/": "hololoop studio"},
+        location=False,
         check_unused_sessions_milliseconds=10_000,
         unused_session_lifetime_milliseconds=UNUSED_MS,
         websocket_max_message_size=64 * 2**20,

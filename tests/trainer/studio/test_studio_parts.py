@@ -380,3 +380,11 @@ def test_differences_are_white_at_zero_and_equally_deep_on_both_sides() -> None:
     light = [0.2126 * r + 0.7152 * g + 0.0722 * b for r, g, b in palette]
     assert all(a < b + 2 for a, b in pairwise(light[:128]))
     assert light[0] == pytest.approx(light[-1], abs=25)
+
+
+def test_a_notebook_shows_the_same_pictures(captures: CaptureSet, tmp_path: Path) -> None:
+    import hololoop
+
+    hololoop.compare(captures).view().save(tmp_path / "view.html", resources="inline", title="captures")
+    text = (tmp_path / "view.html").read_text(encoding="utf-8")
+    assert "Measured − predicted" in text
