@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import shutil
 import signal
 import socket
@@ -30,7 +31,7 @@ from trainer.effects.testing import captures_with
 from trainer.model.model import Model, instance_with
 from trainer.model.model_file import read_model, write_model
 from trainer.model.model_stages import ideal_irradiance
-from trainer.studio import colours, guess_benches, jobs
+from trainer.studio import colours, gain_tasks, guess_benches, jobs
 from trainer.studio.findings_fixes import fix_of
 from trainer.studio.jobs import CANCELLED, ENDED, WorkerProcess, sentence_of
 from trainer.studio.ladder_view import ladder_rows
@@ -344,6 +345,54 @@ def test_a_saved_effect_file_takes_part_at_once(
     assert str(path) in project.effects_fault and "line" in project.effects_fault
 
 
+def test_a_full_disk_is_a_sentence_and_the_model_stays(project: Project, captures: CaptureSet) -> None:
+    """A limit on the size of files stands for the full disk."""
+    project.open_set(captures.folder)
+    until(lambda: project.errors)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    try:
+        project.add("zero_order")
+        until(lambda: project.work is None and project.notice[1])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    severity, sentence = project.notice
+    assert severity == "error" and "cannot be written" in sentence and "\n" not in sentence
+    assert project.model is not None and project.model.names == ()
+    assert project.model_path is not None and not project.model_path.exists()
+    project.add("zero_order")
+    until(lambda: project.work is None)
+    assert project.model.names == ("zero_order",), project.notice
+
+
+# What is gained
+
+
+def test_a_gain_is_displayed_by_the_simulated_bench_kept_and_read_again(tmp_path: Path) -> None:
+    said: list[str] = []
+    folder = guess_benches.capture_guess(
+        lambda kind, value: said.append(kind), "one", 3, tmp_path / "guess-3"
+    )
+    assert said.count("picture") > 10 and guess_benches.noted(folder) == ("one", 3)
+    hidden = guess_benches.hidden_in(folder)
+    assert hidden is not None and len(hidden) == 1
+    model = Model(read_captures(folder).bench)
+    for where in (gain_tasks.OWN, gain_tasks.PREDICTED):
+        found = gain_tasks.show_gain(_quiet, folder, model, "coffee", "green", 18.0, where)
+        assert found.target.shape == found.ideal.shape == (144, 192) and found.ideal_db > 5
+    gain_tasks.keep(found, tmp_path / "kept.npz")
+    again = gain_tasks.recorded(tmp_path / "kept.npz")
+    assert again.where == found.where and np.array_equal(again.explained, found.explained)
+    with pytest.raises(InputError, match="is not that of these captures"):
+        gain_tasks.show_gain(_quiet, folder, model, "coffee", "green", 18.0, "virtual:demo")
+    with pytest.raises(InputError, match="holds no displayed picture"):
+        gain_tasks.recorded(folder / "bench.toml")
+
+
+def _quiet(kind: str, value: Any) -> None:
+    pass
+
+
 # Simulated benches
 
 
@@ -387,4 +436,4 @@ def test_a_notebook_shows_the_same_pictures(captures: CaptureSet, tmp_path: Path
 
     hololoop.compare(captures).view().save(tmp_path / "view.html", resources="inline", title="captures")
     text = (tmp_path / "view.html").read_text(encoding="utf-8")
-    assert "Measured − predicted" in text
+    assert "\\u2212 predicted" in text or "Measured − predicted" in text
