@@ -271,11 +271,13 @@ def comparison_view(project: Project, visit: Visit) -> Any:
 
     def show() -> None:
         name = visit.capture
-        found = project.prediction(name) if name else None
-        other = project.prediction(name, of_other=True) if name and project.other is not None else None
+        found = project.pictures.prediction(name) if name else None
+        other = (
+            project.pictures.prediction(name, of_other=True) if name and project.other is not None else None
+        )
         layout()
         if found is None:
-            fault = project.prediction_fault(name)
+            fault = project.pictures.fault(name)
             note.object = (
                 f"<p class='{'bad-text' if fault else 'quiet'}'>{escape(fault) or 'Predicting …'}</p>"
             )

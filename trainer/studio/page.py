@@ -94,7 +94,9 @@ def _sections(project: Project, visit: Visit) -> Any:
     for name, button in buttons.items():
         button.on_click(partial(_opened, open_section, name))
     open_section("Bench")
-    visit.on("effects", lambda: made.pop("Catalogue", None) and None, now=False)  # made again when it is next opened
+    visit.on(
+        "effects", lambda: made.pop("Catalogue", None) and None, now=False
+    )  # made again when it is next opened
     return pn.Column(
         pn.FlexBox(*buttons.values(), css_classes=["sections"], gap="4px"), place, sizing_mode="stretch_width"
     )

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -27,13 +26,13 @@ from trainer.effects.effect_catalogue import Catalogue, catalogue, forget_effect
 from trainer.model.model import Model
 from trainer.model.model_file import read_model
 from trainer.studio import gain_tasks, job_tasks
-from trainer.studio.job_tasks import CandidatePreview, CapturePrediction
+from trainer.studio.job_tasks import CandidatePreview
 from trainer.studio.jobs import WorkerProcess, sentence_of
 from trainer.studio.model_steps import ModelSteps
+from trainer.studio.picture_queue import PictureQueue
 
 TOPICS = ("set", "model", "picture", "errors", "job", "diagnosis", "notice", "effects", "other", "gain")
 TABLES = ("bench.toml", "captures.csv")
-KEPT_BYTES = 768 * 2**20  # of predicted captures
 WATCH_S = 0.7  # between two looks at the files
 
 Watcher = Callable[[str], None]
@@ -102,18 +101,10 @@ class Project:
         self.verdict = ""
         self.gain: Any = None
         self.network: tuple[Path, float, float] | None = None
-        self._revision = 0
-        self._other_revision = -1  # revisions of the second model are negative
-        self._with_gains: dict[int, Model] = {}
-        self._predictions: OrderedDict[tuple[int, str], CapturePrediction] = OrderedDict()
-        self._wanted: list[tuple[int, str]] = []
-        self._faults: dict[tuple[int, str], str] = {}
-        self._checked = False
-        self._effects_version = 0
         self._watchers: dict[int, Watcher] = {}
         self._marks: dict[Path, int] = {}
         self._closing = threading.Event()
-        self._pictures = WorkerProcess("hololoop studio: pictures", job_tasks.__name__)
+        self.pictures = PictureQueue(self.lock, self.tell, self._checked, self._unpredictable)
         self._jobs = WorkerProcess("hololoop studio: work", job_tasks.__name__)
         self._read_effects()
         threading.Thread(target=self._watch_files, daemon=True).start()
@@ -149,7 +140,7 @@ class Project:
     def close(self) -> None:
         """End all processes."""
         self._closing.set()
-        self._pictures.close()
+        self.pictures.close()
         self._jobs.close()
 
     # Captures
@@ -172,13 +163,13 @@ class Project:
                 raise InputError("work is under way on the present captures: wait for it, or cancel it")
             self._forget_results()
             self.folder, self.captures, self.held_out = folder, None, ()
-            self.problems, self.set_fault, self._checked = None, "", False
+            self.problems, self.set_fault = None, ""
             path = model_path or self.home / f"{folder.name}-model.toml"
             self.steps = ModelSteps(path.absolute())
             self._read_set()
             self._mark()
         self.tell("set", "model", "notice")
-        self._next_picture()
+        self.pictures.work()
 
     def close_set(self) -> None:
         """Back to the start page."""
@@ -191,27 +182,29 @@ class Project:
         self.tell("set", "model", "notice")
 
     def _forget_results(self) -> None:
-        self._revision += 1
+        self.pictures.forget(None, None, ())
         self.model, self.other, self.diagnosis, self.ranking, self.previews = None, None, None, (), {}
         self.verdict, self.notice, self.gain, self.network = "", ("", ""), None, None
-        self._predictions.clear()
-        self._with_gains.clear()
-        self._faults.clear()
-        self._wanted = []
+
+    def _checked(self, problems: list[Problem]) -> None:
+        self.problems = problems
+        self.tell("set")
+
+    def _unpredictable(self, sentence: str) -> None:
+        self.say(sentence, "error")
 
     def _read_set(self) -> None:
         assert self.folder is not None and self.steps is not None
+        self.captures, self.held_out, self.set_fault = None, (), ""
         try:
-            self.captures = read_captures(self.folder)
-            self.held_out = split(self.captures).held_out
-        except InputError as error:
-            self.captures, self.held_out, self.set_fault = None, (), str(error)
-            return
-        except OSError as error:
-            self.captures, self.held_out, self.set_fault = None, (), sentence_of(error)
-            return
-        self.set_fault = ""
-        self._read_model()
+            captures = read_captures(self.folder)
+            self.held_out = split(captures).held_out
+            self.captures = captures
+        except (InputError, OSError) as error:
+            self.set_fault = sentence_of(error)
+        self.pictures.forget(self.folder, self.captures, self.held_out)
+        if self.captures is not None:
+            self._read_model()
 
     @property
     def misread(self) -> str:
@@ -239,14 +232,10 @@ class Project:
 
     def _take(self, model: Model) -> None:
         """Make a model the one that is shown."""
-        self._revision += 1
         self.model = model
         self.diagnosis, self.ranking, self.previews = None, (), {}
         self.verdict = ""
-        keep = {self._other_revision}
-        for key in [k for k in self._predictions if k[0] not in keep]:
-            del self._predictions[key]
-        self._wanted = [key for key in self._wanted if key[0] in keep]
+        self.pictures.show(model)
 
     def _write(self, model: Model) -> None:
         """Make a model the state: write its file, and show it.
@@ -257,8 +246,7 @@ class Project:
             Where it cannot be written.
         """
         assert self.captures is not None and self.steps is not None and self.model is not None
-        before = self._with_gains.get(self._revision, self.model)
-        self.steps.write(model, before, origin(self.captures))
+        self.steps.write(model, self._model_now(), origin(self.captures))
         self._take(model)
         self._mark()
 
@@ -301,17 +289,15 @@ class Project:
             self._mark()
             self.notice = ("", "")
         self.tell("model", "diagnosis", "notice")
-        self._next_picture()
+        self.pictures.work()
 
     def compare_with(self, name: str, model: Model | None) -> None:
         """Show a second model next to the first; None: no longer."""
         with self.lock:
-            for key in [k for k in self._predictions if k[0] == self._other_revision]:
-                del self._predictions[key]
-            self._other_revision -= 1
+            self.pictures.show_other(model)
             self.other = None if model is None else (name, model)
         self.tell("other", "picture", "errors")
-        self._next_picture()
+        self.pictures.work()
 
     def earlier_models(self) -> dict[str, Path]:
         """Kept states of the model by what a person calls them."""
@@ -319,136 +305,10 @@ class Project:
             return {}
         return {f"step {int(p.stem) - 1}": p for p in self.steps.files()}
 
-    # Pictures
-
-    def prediction(self, capture: str, of_other: bool = False) -> CapturePrediction | None:
-        """A capture, measured and predicted; None while it is computed, which "picture" tells the end of."""
-        with self.lock:
-            key = (self._other_revision if of_other else self._revision, capture)
-            if key in self._predictions:
-                self._predictions.move_to_end(key)
-                return self._predictions[key]
-            if self.captures is None or key in self._faults or (of_other and self.other is None):
-                return None
-            if key in self._wanted:
-                self._wanted.remove(key)
-            self._wanted.insert(0, key)
-        self._next_picture()
-        return None
-
-    def prediction_fault(self, capture: str) -> str:
-        """Why a capture cannot be predicted; "" where it can."""
-        return self._faults.get((self._revision, capture), "")
-
     @property
     def errors(self) -> SetErrors | None:
         """Where the model fails on the held-out captures; None until all of them are predicted."""
-        with self.lock:
-            found = [self._predictions.get((self._revision, c.capture)) for c in self.held_out]
-            if not found or any(
-                one is None and (self._revision, c.capture) not in self._faults
-                for one, c in zip(found, self.held_out, strict=True)
-            ):
-                return None
-            return SetErrors.of([one.errors for one in found if one is not None and one.errors is not None])
-
-    @property
-    def errors_share(self) -> float:
-        """Share of the held-out captures that are predicted."""
-        with self.lock:
-            done = sum((self._revision, c.capture) in self._predictions for c in self.held_out)
-            return done / max(1, len(self.held_out))
-
-    def _next_picture(self) -> None:
-        """Give the pictures' process its next task: what somebody looks at first, then the check, then the rest."""
-        with self.lock:
-            if self._pictures.busy or self._closing.is_set() or self.folder is None:
-                return
-            folder, revision = self.folder, self._revision
-            if self.captures is not None and self.model is not None:
-                pending = [k for k in self._wanted if k[0] in (revision, self._other_revision)]
-                rest = [(revision, c.capture) for c in self.held_out]
-                rest = [k for k in rest if k not in self._predictions and k not in self._faults]
-                key = pending[0] if pending else None
-                if key is None and rest and (self._checked or len(rest) == len(self.held_out)):
-                    key = rest[0]
-                if key is not None:
-                    self._predict(folder, key)
-                    return
-                if not self._checked:
-                    self._check(folder)
-                elif rest:
-                    self._predict(folder, rest[0])
-            elif not self._checked:
-                self._check(folder)
-
-    def _check(self, folder: Path) -> None:
-        def heard(kind: str, value: Any) -> None:
-            if kind == "progress":
-                return
-            with self.lock:
-                if folder == self.folder:
-                    self.problems = (
-                        value if kind == "done" else [Problem("error", "unreadable", "", str(value))]
-                    )
-            self.tell("set")
-            self._next_picture()
-
-        self._checked = True
-        self._pictures.submit(job_tasks.check, (folder,), heard)
-
-    def _predict(self, folder: Path, key: tuple[int, str]) -> None:
-        revision, capture = key
-        is_other = revision == self._other_revision and self.other is not None
-        model = self.other[1] if is_other and self.other else self.model
-        model = self._with_gains.get(revision, model)
-        assert model is not None and self.captures is not None
-        if set(self.captures.channels) - set(model.gain):
-            self._pictures.submit(job_tasks.fit_gains, (folder, model), lambda k, v: self._gained(key, k, v))
-            return
-        arguments = (folder, model, capture, self._effects_version)
-        self._pictures.submit(job_tasks.predict, arguments, lambda k, v: self._predicted(key, k, v))
-
-    def _gained(self, key: tuple[int, str], kind: str, value: Any) -> None:
-        with self.lock:
-            if kind == "done":
-                self._with_gains[key[0]] = value
-            elif kind == "failed":
-                self._fault_all(key[0], str(value))
-        self._next_picture()
-
-    def _predicted(self, key: tuple[int, str], kind: str, value: Any) -> None:
-        with self.lock:
-            if key in self._wanted:
-                self._wanted.remove(key)
-            if key[0] in (self._revision, self._other_revision):
-                if kind == "done":
-                    self._predictions[key] = value
-                    self._drop_old()
-                elif kind == "failed":
-                    self._faults[key] = str(value)
-        self.tell("picture")
-        if self.errors_share == 1:
-            self.tell("errors")
-        self._next_picture()
-
-    def _fault_all(self, revision: int, sentence: str) -> None:
-        for capture in self.captures.captures if self.captures else ():
-            self._faults[(revision, capture.capture)] = sentence
-        self._wanted = []
-        self.say(sentence, "error")
-        self.tell("picture", "errors")
-
-    def _drop_old(self) -> None:
-        """Forget full pictures that nobody has looked at for long, keeping what maps of the set need."""
-        size = sum(p.measured.nbytes + p.predicted.nbytes for p in self._predictions.values())
-        for key in list(self._predictions):
-            if size <= KEPT_BYTES or key == next(reversed(self._predictions)):
-                return
-            if any(key == (self._revision, c.capture) for c in self.held_out):
-                continue
-            one = self._predictions.pop(key)
-            size -= one.measured.nbytes + one.predicted.nbytes
+        return self.pictures.errors
 
     # Work
 
@@ -531,7 +391,7 @@ class Project:
 
     def _model_now(self) -> Model:
         assert self.model is not None
-        return self._with_gains.get(self._revision, self.model)
+        return self.pictures.model or self.model
 
     def _begin(
         self, name: str, task: Callable[..., Any], arguments: tuple[Any, ...], done: Callable[[Any], None]
@@ -579,7 +439,7 @@ class Project:
                 self.say(sentence_of(error), "error")
                 return
             self.tell("model", "diagnosis")
-            self._next_picture()
+            self.pictures.work()
         elif kind == "picture":
             self.gain = value
             self.tell("gain")
@@ -608,7 +468,7 @@ class Project:
                     "Diagnose says what is left."
                 )
         self.tell("model", "diagnosis")
-        self._next_picture()
+        self.pictures.work()
 
     def _explained(self, found: Diagnosis) -> None:
         with self.lock:
@@ -624,7 +484,7 @@ class Project:
             self._write(model)
             self.verdict = f"With a field learned at the panel the excess is {after:.2g}, from {before:.2g}."
         self.tell("model", "diagnosis")
-        self._next_picture()
+        self.pictures.work()
 
     def _trained(self, value: tuple[Path, float, float]) -> None:
         path, before, after = value
@@ -655,7 +515,7 @@ class Project:
 
     def _read_effects(self) -> None:
         forget_effect_files()
-        self._effects_version += 1
+        self.pictures.effects_version += 1
         try:
             self.known, self.effects_fault = catalogue(self.effect_files), ""
         except InputError as error:
@@ -721,15 +581,11 @@ class Project:
     def read_again(self) -> None:
         """Read the capture set again, after its tables have changed."""
         with self.lock:
-            self._revision += 1
-            self.problems, self._checked = None, False
-            self._predictions.clear()
-            self._with_gains.clear()
-            self._faults.clear()
+            self.problems = None
             self._read_set()
             self._mark()
         self.tell("set", "model", "diagnosis", "picture")
-        self._next_picture()
+        self.pictures.work()
 
     def _model_changed(self) -> None:
         assert self.steps is not None and self.captures is not None
@@ -745,7 +601,7 @@ class Project:
                     f"{self.steps.path.name} was changed by another program; this is what it says now.",
                 )
         self.tell("model", "diagnosis", "notice")
-        self._next_picture()
+        self.pictures.work()
 
 
 def _changed(path: Path) -> int:

@@ -302,8 +302,9 @@ def test_a_project_predicts_adds_undoes_and_sees_the_command_line(
     assert path is not None and not path.exists()
     project.add("zero_order")
     assert project.work is not None and project.work.name == "Add zero_order"
-    until(lambda: project.work is None)
-    assert project.model is not None and project.model.names == ("zero_order",), project.notice
+    until(lambda: project.model is not None and project.model.names == ("zero_order",))
+    until(lambda: project.diagnosis is not None)
+    assert project.model is not None
     assert path.is_file()
     assert project.diagnosis is not None and project.diagnosis.verdict == "complete"
     until(lambda: project.errors)
@@ -361,8 +362,7 @@ def test_a_full_disk_is_a_sentence_and_the_model_stays(project: Project, capture
     assert project.model is not None and project.model.names == ()
     assert project.model_path is not None and not project.model_path.exists()
     project.add("zero_order")
-    until(lambda: project.work is None)
-    assert project.model.names == ("zero_order",), project.notice
+    until(lambda: project.model is not None and project.model.names == ("zero_order",))
 
 
 # What is gained
