@@ -8,10 +8,12 @@ from typing import Any
 import panel as pn
 
 from trainer.diagnosis.ranking import RankedEffect
+from trainer.diagnosis.verdict import Thresholds
 from trainer.formatting import number, plain
 from trainer.model.parameters import describe
 from trainer.studio.difference_pictures import difference_uri
-from trainer.studio.project import Project, Work
+from trainer.studio.project import Project
+from trainer.studio.running_work import Work
 from trainer.studio.visit import LiveText, Visit
 
 MOST = 6
@@ -84,6 +86,11 @@ def _first_words(project: Project) -> str:
     if errors is None:
         return "Comparing the model with captures that no fit saw …"
     one = errors.errors
+    if one.excess < Thresholds().complete_excess:
+        return (
+            "On captures that no fit saw, the model agrees with the bench to the camera's noise "
+            f"(excess {number(one.excess, 2)})."
+        )
     times = one.nrmse / one.noise_nrmse if one.noise_nrmse else 0
     return (
         f"On captures that no fit saw, the model's error is {number(times, 2)} times the camera's noise "

@@ -6,10 +6,8 @@ Every browser watches the same project. The model file is the state; what is her
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,45 +25,16 @@ from trainer.model.model import Model
 from trainer.model.model_file import read_model
 from trainer.studio import gain_tasks, job_tasks
 from trainer.studio.job_tasks import CandidatePreview
-from trainer.studio.jobs import WorkerProcess, sentence_of
+from trainer.studio.jobs import sentence_of
 from trainer.studio.model_steps import ModelSteps
 from trainer.studio.picture_queue import PictureQueue
+from trainer.studio.running_work import RunningWork, Work
+from trainer.studio.watched_files import WatchedFiles
 
 TOPICS = ("set", "model", "picture", "errors", "job", "diagnosis", "notice", "effects", "other", "gain")
 TABLES = ("bench.toml", "captures.csv")
-WATCH_S = 0.7  # between two looks at the files
 
 Watcher = Callable[[str], None]
-
-
-@dataclass
-class Work:
-    """Long work that is under way.
-
-    Attributes
-    ----------
-    name : str
-        What a person asked for: "Diagnose", "Add zero_order" and so on.
-    share : float
-        That is done.
-    what : str
-        Is done now.
-    started : float, s
-        Of the monotonic clock.
-    """
-
-    name: str
-    share: float = 0.0
-    what: str = "starting"
-    started: float = field(default_factory=time.monotonic)
-
-    @property
-    def seconds_left(self) -> float | None:
-        """An estimate; None while there is nothing to estimate from."""
-        spent = time.monotonic() - self.started
-        if self.share < 0.04 or spent < 1.0:
-            return None
-        return spent * (1 - self.share) / self.share
 
 
 class Project:
@@ -93,7 +62,6 @@ class Project:
         self.steps: ModelSteps | None = None
         self.model: Model | None = None
         self.other: tuple[str, Model] | None = None
-        self.work: Work | None = None
         self.diagnosis: Diagnosis | None = None
         self.ranking: tuple[RankedEffect, ...] = ()
         self.previews: dict[str, CandidatePreview] = {}
@@ -102,12 +70,10 @@ class Project:
         self.gain: Any = None
         self.network: tuple[Path, float, float] | None = None
         self._watchers: dict[int, Watcher] = {}
-        self._marks: dict[Path, int] = {}
-        self._closing = threading.Event()
         self.pictures = PictureQueue(self.lock, self.tell, self._checked, self._unpredictable)
-        self._jobs = WorkerProcess("hololoop studio: work", job_tasks.__name__)
+        self._jobs = RunningWork(job_tasks.__name__, self.tell, self.say, self._news)
+        self._files = WatchedFiles(self.lock, self._watched, self._changed_outside)
         self._read_effects()
-        threading.Thread(target=self._watch_files, daemon=True).start()
 
     # Watching
 
@@ -139,9 +105,14 @@ class Project:
 
     def close(self) -> None:
         """End all processes."""
-        self._closing.set()
+        self._files.close()
         self.pictures.close()
         self._jobs.close()
+
+    @property
+    def work(self) -> Work | None:
+        """What is under way; None where nothing is."""
+        return self._jobs.work
 
     # Captures
 
@@ -167,7 +138,7 @@ class Project:
             path = model_path or self.home / f"{folder.name}-model.toml"
             self.steps = ModelSteps(path.absolute())
             self._read_set()
-            self._mark()
+            self._files.seen()
         self.tell("set", "model", "notice")
         self.pictures.work()
 
@@ -248,7 +219,7 @@ class Project:
         assert self.captures is not None and self.steps is not None and self.model is not None
         self.steps.write(model, self._model_now(), origin(self.captures))
         self._take(model)
-        self._mark()
+        self._files.seen()
 
     def can_undo(self) -> bool:
         """Whether there is a state before the present one."""
@@ -286,7 +257,7 @@ class Project:
                 self.say(sentence_of(error), "error")
                 return
             self._take(model)
-            self._mark()
+            self._files.seen()
             self.notice = ("", "")
         self.tell("model", "diagnosis", "notice")
         self.pictures.work()
@@ -356,8 +327,7 @@ class Project:
 
     def cancel(self) -> None:
         """End the work that is under way."""
-        if not self._jobs.cancel():
-            self._finish()
+        self._jobs.cancel()
 
     def run(
         self, name: str, task: Callable[..., Any], arguments: tuple[Any, ...], done: Callable[[Any], None]
@@ -396,38 +366,9 @@ class Project:
     def _begin(
         self, name: str, task: Callable[..., Any], arguments: tuple[Any, ...], done: Callable[[Any], None]
     ) -> None:
-        def heard(kind: str, value: Any) -> None:
-            if kind == "progress":
-                with self.lock:
-                    if self.work is not None:
-                        self.work.share, self.work.what = value
-                self.tell("job")
-            elif kind == "done":
-                self._finish()
-                try:
-                    done(value)
-                except (InputError, OSError) as error:
-                    self.say(sentence_of(error), "error")
-                    self.tell("model", "diagnosis")
-            elif kind in ("failed", "cancelled"):
-                self._finish()
-                self.say(str(value), "error" if kind == "failed" else "note")
-            else:
-                self._news(kind, value)
-
-        with self.lock:
-            self.work, self.notice = Work(name), ("", "")
-        self.tell("job", "notice")
-        try:
-            self._jobs.submit(task, arguments, heard)
-        except InputError as error:
-            self._finish()
-            self.say(str(error), "error")
-
-    def _finish(self) -> None:
-        with self.lock:
-            self.work = None
-        self.tell("job")
+        self.notice = ("", "")
+        self.tell("notice")
+        self._jobs.begin(name, task, arguments, done)
 
     def _news(self, kind: str, value: Any) -> None:
         if kind == "model":
@@ -527,7 +468,7 @@ class Project:
         """Read the files of effects again, and try the user's own at once where nothing else is under way."""
         with self.lock:
             self._read_effects()
-            self._mark()
+            self._files.seen()
         self.tell("effects")
         if self.effects_fault or self.captures is None or self.work is not None or self.misread:
             return
@@ -547,9 +488,6 @@ class Project:
             self.previews.update({p.effect: p for p in previews})
         self.tell("diagnosis")
 
-    def _mark(self) -> None:
-        self._marks = {path: _changed(path) for path in self._watched()}
-
     def _watched(self) -> list[Path]:
         paths = list(self.effect_files)
         if self.steps is not None:
@@ -558,20 +496,9 @@ class Project:
             paths += [self.folder / name for name in TABLES]
         return paths
 
-    def _watch_files(self) -> None:
-        while not self._closing.wait(WATCH_S):
-            with suppress(Exception):
-                self.look_at_files()
-
-    def look_at_files(self) -> None:
-        """Notice what other programs have written: the command line, or an editor."""
-        with self.lock:
-            changed = [p for p in self._watched() if _changed(p) != self._marks.get(p)]
-            if not changed:
-                return
-            self._mark()
-            tables = any(p.name in TABLES for p in changed)
-        if tables:
+    def _changed_outside(self, changed: list[Path]) -> None:
+        """Act on what other programs have written."""
+        if any(p.name in TABLES for p in changed):
             self.read_again()
         elif self.steps is not None and self.steps.path in changed and self.captures is not None:
             self._model_changed()
@@ -583,7 +510,7 @@ class Project:
         with self.lock:
             self.problems = None
             self._read_set()
-            self._mark()
+            self._files.seen()
         self.tell("set", "model", "diagnosis", "picture")
         self.pictures.work()
 
@@ -602,10 +529,3 @@ class Project:
                 )
         self.tell("model", "diagnosis", "notice")
         self.pictures.work()
-
-
-def _changed(path: Path) -> int:
-    try:
-        return path.stat().st_mtime_ns
-    except OSError:
-        return 0
