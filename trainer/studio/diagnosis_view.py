@@ -102,8 +102,13 @@ def candidates_view(project: Project, visit: Visit) -> Any:
     """The ranking: each candidate with its interval, its size, and what it would change in the picture."""
     place = pn.Column(sizing_mode="stretch_width", css_classes=["candidates"])
     buttons: list[Any] = []
+    shown: list[Any] = []
 
     def show() -> None:
+        now = [project.ranking, *project.previews.values()]
+        if len(shown) == len(now) and all(a is b for a, b in zip(shown, now, strict=True)):
+            return  # a button that is replaced while somebody clicks it does nothing
+        shown[:] = now
         ranking = project.ranking[:MOST]
         buttons.clear()
         if not ranking:

@@ -79,7 +79,8 @@ class RunningWork:
                     done(value)
                 except (InputError, OSError) as error:
                     self._say(sentence_of(error), "error")
-                self._tell("job", "model", "diagnosis")
+                    self._tell("model", "diagnosis")
+                self._tell("job")
             elif kind in ("failed", "cancelled"):
                 self._finish()
                 self._say(str(value), "error" if kind == "failed" else "note")
