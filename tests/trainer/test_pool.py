@@ -273,7 +273,9 @@ def test_no_scheduler_is_one_sentence_and_soon(
     monkeypatch.setattr(pool, "ANSWER_S", 1.0)
     start = time.monotonic()
     assert main(["check", str(captures.folder), "--json"]) in (0, 1)
-    checked = time.monotonic() - start  # the command looks at the captures first; on a busy machine that takes long
+    checked = (
+        time.monotonic() - start
+    )  # the command looks at the captures first; on a busy machine that takes long
     capsys.readouterr()
     with socket.socket() as free, socket.socket() as silent:
         free.bind(("127.0.0.1", 0))  # taken, so that nobody else listens there
