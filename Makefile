@@ -54,7 +54,7 @@ $(STAMP): pyproject.toml constraints.txt
 	    exit 1; \
 	fi
 	$(BIN)/python -m pip install -c constraints.txt torch==2.13.0
-	$(BIN)/python -m pip install -c constraints.txt -e '.[trainer,completion,cluster,camera,dev]'
+	$(BIN)/python -m pip install -c constraints.txt -e '.[trainer,studio,completion,cluster,camera,dev]'
 	@touch $@
 
 quick: install

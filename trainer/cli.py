@@ -22,6 +22,7 @@ from trainer.commands import (
     loop,
     new_effect,
     register,
+    studio,
     train,
 )
 from trainer.commands.command_line import PROGRAM_NAME
@@ -36,6 +37,7 @@ The usual way:
   hololoop-trainer train captures/ --model model.toml --out run/     a network for what has no name
   hololoop-trainer export --model model.toml --out bundle/
 
+All of it in a browser, with or without captures: hololoop-trainer studio
 Without captures at hand, start with: hololoop-trainer demo --quick"""
 
 IN_ORDER_OF_USE = (
@@ -53,6 +55,7 @@ IN_ORDER_OF_USE = (
     capture,
     export,
     demo,
+    studio,
     initialiser,
     register,
 )

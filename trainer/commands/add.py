@@ -13,7 +13,6 @@ from trainer.commands.inputs import (
     judged_on,
     model_options,
     note_what_is_used,
-    origin,
 )
 from trainer.commands.number_text import sizes_text, small_text
 from trainer.commands.outputs import model_out, out_option
@@ -37,6 +36,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     effect = find_effect(catalogue(args.effects), args.effect)
     captures, known, model = inputs_of(args)
     note_what_is_used(captures, screen)
+    from trainer.captures.capture_origin import origin
     from trainer.captures.held_out import split
     from trainer.diagnosis.explanation import add
     from trainer.model.model_file import write_model

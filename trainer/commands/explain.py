@@ -15,7 +15,6 @@ from trainer.commands.inputs import (
     inputs_of,
     model_options,
     note_what_is_used,
-    origin,
     refuse_misread,
 )
 from trainer.commands.number_text import small_text
@@ -54,6 +53,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     """
     thresholds = thresholds_of(args)
     captures, known, model = inputs_of(args)
+    from trainer.captures.capture_origin import origin
     from trainer.diagnosis.explanation import explain
     from trainer.fitting.pool import open_pool
     from trainer.model.model_file import write_model

@@ -13,7 +13,6 @@ from trainer.commands.inputs import (
     judged_on,
     model_options,
     note_what_is_used,
-    origin,
 )
 from trainer.commands.outputs import model_out, out_option
 from trainer.commands.workers import use_every_core
@@ -30,6 +29,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     """A field learned at the panel, in a model."""
     captures, _, model = inputs_of(args)
     note_what_is_used(captures, screen)
+    from trainer.captures.capture_origin import origin
     from trainer.captures.held_out import split
     from trainer.fitting.learned_field import learn_field
     from trainer.model.model_file import write_model

@@ -5,11 +5,10 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from runtime.program.command import Result
 from runtime.program.screen import Screen
-from runtime.program.version import installed_version
 from trainer.commands.command_line import command_line
 
 if TYPE_CHECKING:
@@ -79,15 +78,6 @@ def judged_on(result: Result) -> str:
     return (
         "held-out captures" if result.get("held_out", True) else "the captured pattern, which was fitted too,"
     )
-
-
-def origin(captures: CaptureSet) -> dict[str, Any]:
-    """Where a model comes from, for its file."""
-    return {
-        "written_by": f"hololoop {installed_version()}",
-        "captures": captures.folder.name,
-        "captures_sha256": captures.content_hash(),
-    }
 
 
 def note_what_is_used(captures: CaptureSet, screen: Screen) -> None:

@@ -91,6 +91,12 @@ class ComparisonResult:
         """A held-out capture as measured, as predicted, and the difference."""
         return comparison_figure(self.comparison.pictures)
 
+    def view(self) -> Any:
+        """The same pictures with linked pan and zoom, as in the studio; needs the extra `studio`."""
+        from trainer.studio.comparison_view import pictures_view
+
+        return pictures_view(self.comparison.pictures)
+
     def report(self, path: str | os.PathLike[str]) -> None:
         """Write the report, one HTML file."""
         write_report(

@@ -13,9 +13,9 @@ from typing import Any
 
 from firmware_iface.errors import InputError
 from runtime.program.progress import Progress
+from trainer.captures.capture_origin import origin
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.check_set import check_captures, errors_unless_misread
-from trainer.commands.inputs import origin
 from trainer.diagnosis.comparison import compare as compare_model
 from trainer.diagnosis.diagnosis import diagnose as diagnose_model
 from trainer.diagnosis.explanation import explain as explain_captures

@@ -1,0 +1,328 @@
+"""The studio in a real browser, as a user would use it: Debian's Chromium, by Playwright."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+from urllib.error import HTTPError
+from urllib.request import HTTPCookieProcessor, Request, build_opener
+
+import pytest
+
+from firmware_iface.virtual import BenchDescription, VirtualHeadset, make_defect
+from trainer.captures.acquire import acquire_captures
+from trainer.captures.open_bench import nominal_bench
+
+pytest.importorskip("panel", reason="the studio needs the extra 'studio'")
+playwright = pytest.importorskip("playwright.sync_api", reason="browser tests need playwright (extra 'dev')")
+
+ROOT = Path(__file__).resolve().parent.parent.parent.parent
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+FLAGS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+TOKEN = "for-this-test-alone"
+SLOW_MS = 90_000
+FOCUSED = """() => {
+    let one = document.activeElement;
+    while (one.shadowRoot) one = one.shadowRoot.activeElement;
+    return one.textContent;
+}"""
+
+playwright.expect.set_options(timeout=SLOW_MS)
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None, reason="no Chromium is installed (Debian: apt install chromium)"
+)
+
+
+class Studio:
+    """A running studio."""
+
+    def __init__(self, home: Path, *arguments: str) -> None:
+        self.home = home
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+        self.log = (home / "studio.log").open("w+")
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "trainer.cli", "studio", *arguments, "--token", TOKEN, "--no-browser"],
+            cwd=home,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=self.log,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        assert "The studio is at http://127.0.0.1:" in line, line
+        self.address = line.split()[-1]
+        self.base = self.address.split("?")[0]
+
+    def end(self) -> int:
+        """Ctrl-C."""
+        self.process.send_signal(signal.SIGINT)
+        code = self.process.wait(20)
+        self.log.close()
+        return code
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with one capture set of a small simulated bench, with a leak at the panel."""
+    folder = tmp_path_factory.mktemp("home")
+    bench = BenchDescription("small", defects=(make_defect("zero_order"),)).resized(64, 96, 8.0)
+    headset = VirtualHeadset(bench, 1)
+    acquire_captures(headset, nominal_bench(headset), folder / "leaking", 7)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def studio(home: Path) -> Iterator[Studio]:
+    one = Studio(home, "leaking")
+    yield one
+    one.end()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with playwright.sync_playwright() as driver:
+        one = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield one
+        one.close()
+
+
+def opened(browser: Any, address: str) -> Any:
+    """A page of a browser of its own; what it asks of other machines fails the test."""
+    page = browser.new_context(viewport={"width": 1280, "height": 800}).new_page()
+    page.set_default_timeout(SLOW_MS)
+    page.foreign = []
+    page.on(
+        "request",
+        lambda r: (
+            page.foreign.append(r.url)
+            if not r.url.startswith(("http://127.0.0.1", "data:", "blob:"))
+            else None
+        ),
+    )
+    page.goto(address)
+    return page
+
+
+def button(page: Any, name: str) -> Any:
+    return page.get_by_role("button", name=name, exact=True)
+
+
+def idle(page: Any) -> None:
+    """Wait until no work is under way."""
+    playwright.expect(button(page, "Diagnose")).to_be_enabled(timeout=SLOW_MS)
+
+
+def verdict(page: Any, words: str) -> None:
+    playwright.expect(page.get_by_role("status").filter(has_text=words)).to_be_visible(timeout=SLOW_MS)
+
+
+def test_the_whole_way_and_a_second_browser_and_a_reload(browser: Any, studio: Studio) -> None:
+    page = opened(browser, studio.address)
+    assert "token" not in page.url
+    verdict(page, "times the camera's noise")
+    playwright.expect(page.get_by_text("nothing is wrong with them")).to_be_visible()
+    second = opened(browser, studio.address)
+    verdict(second, "times the camera's noise")
+
+    button(page, "Diagnose").click()
+    playwright.expect(button(second, "Cancel")).to_be_enabled()
+    playwright.expect(button(second, "Diagnose")).to_be_disabled()
+    verdict(page, "zero_order is missing")
+    verdict(second, "zero_order is missing")
+    playwright.expect(page.get_by_text("% of what is left").first).to_be_visible()
+    playwright.expect(page.get_by_alt_text("What zero order would add to the prediction")).to_be_visible()
+    idle(page)
+
+    button(page, "Add zero_order").click()
+    verdict(page, "Nothing is missing")
+    verdict(second, "Nothing is missing")
+    assert "zero_order" in (studio.home / "leaking-model.toml").read_text()
+    ladder = page.locator("svg").filter(has_text="camera noise")
+    playwright.expect(ladder.filter(has_text="+ zero order")).to_be_visible()
+
+    page.reload()
+    verdict(page, "Nothing is missing")
+    button(page, "Undo").click()
+    verdict(second, "times the camera's noise")
+    playwright.expect(button(page, "Undo")).to_be_disabled()
+    button(page, "Redo").click()
+    playwright.expect(page.locator("svg").filter(has_text="+ zero order")).to_be_visible()
+    button(page, "Compare").click()
+    playwright.expect(page.get_by_role("heading", name="Predicted by the other")).to_be_visible()
+    button(page, "Compare no more").click()
+    assert not page.foreign and not second.foreign
+    for one in (page, second):
+        one.context.close()
+
+
+def test_work_is_cancelled_and_a_killed_worker_is_a_sentence(browser: Any, studio: Studio) -> None:
+    page = opened(browser, studio.address)
+    idle(page)
+    path = studio.home / "leaking-model.toml"
+    if path.exists() and "zero_order" in path.read_text():
+        playwright.expect(button(page, "Undo")).to_be_enabled()
+        button(page, "Undo").click()
+    playwright.expect(page.locator("svg").filter(has_text="+ zero order")).to_have_count(0)
+    verdict(page, "times the camera's noise")
+    before = path.read_bytes() if path.exists() else b""
+    button(page, "Explain").click()
+    playwright.expect(button(page, "Cancel")).to_be_enabled()
+    button(page, "Cancel").press("Enter")
+    verdict(page, "Cancelled; the model is as it was.")
+    idle(page)
+    button(page, "Diagnose").click()
+    playwright.expect(button(page, "Cancel")).to_be_enabled()
+    children = Path(f"/proc/{studio.process.pid}/task/{studio.process.pid}/children").read_text().split()
+    busiest = max(children, key=lambda pid: int(pid))  # the worker that was started last does the work
+    for pid in {busiest, *children}:
+        os.kill(int(pid), signal.SIGKILL)
+    verdict(page, "has ended")
+    assert "Traceback" not in page.content()
+    after = path.read_bytes() if path.exists() else b""
+    assert before == after
+    idle(page)
+    page.context.close()
+
+
+def test_everything_works_from_the_keyboard_and_at_twice_the_size(browser: Any, studio: Studio) -> None:
+    page = opened(browser, studio.address)
+    idle(page)
+    for name in ("Diagnose", "Explain", "Compare", "Bench", "No name fits", "Gain", "Catalogue"):
+        one = button(page, name)
+        one.focus()
+        assert page.evaluate(FOCUSED).strip() == name
+    button(page, "Gain").press("Enter")
+    playwright.expect(button(page, "Export")).to_be_visible()
+    button(page, "No name fits").press(" ")
+    playwright.expect(button(page, "Write the effect file")).to_be_visible()
+    button(page, "Bench").press("Enter")
+    page.set_viewport_size({"width": 640, "height": 400})  # what 200 % leaves of 1280 x 800
+    page.wait_for_timeout(500)
+    assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth + 1")
+    playwright.expect(button(page, "Diagnose")).to_be_visible()
+    page.context.close()
+
+
+def test_without_the_token_or_from_elsewhere_it_is_refused(studio: Studio) -> None:
+    def answer(path: str, **headers: str) -> tuple[int, str]:
+        opener = build_opener(HTTPCookieProcessor())
+        try:
+            with opener.open(Request(studio.base + path, headers=headers), timeout=20) as found:
+                return found.status, found.read().decode()
+        except HTTPError as error:
+            return error.code, error.read().decode()
+
+    for path in ("", "?token=wrong", "?token="):
+        status, text = answer(path)
+        assert status == 403 and "needs the token" in text and "Traceback" not in text
+    assert answer(f"?token={TOKEN}")[0] == 200
+    status, text = answer(f"?token={TOKEN}", Host="evil.example")
+    assert status == 403 and "127.0.0.1" in text
+    status, _ = answer("", Cookie="hololoop_studio=wrong")
+    assert status == 403
+
+
+def test_a_websocket_of_a_foreign_origin_is_refused(studio: Studio) -> None:
+    from tornado.httpclient import HTTPClientError, HTTPRequest
+    from tornado.websocket import websocket_connect
+
+    address = studio.base.replace("http", "ws") + "ws"
+    port = studio.base.rstrip("/").rsplit(":", 1)[1]
+    cookie = f"hololoop_studio_{port}={TOKEN}"
+
+    async def code(**headers: str) -> int:
+        try:
+            connection = await websocket_connect(
+                HTTPRequest(address, headers=headers), subprotocols=["bokeh", "none"]
+            )
+        except HTTPClientError as error:
+            return int(error.code)
+        message = await connection.read_message()
+        return 101 if message is not None else 403
+
+    with ThreadPoolExecutor(1) as thread:  # the browser's driver runs a loop in this one
+        for headers in (
+            {"Origin": "http://evil.example", "Cookie": cookie},
+            {"Origin": studio.base.rstrip("/")},
+        ):
+            assert thread.submit(lambda headers=headers: asyncio.run(code(**headers))).result() == 403
+
+
+def test_a_broken_set_is_shown_as_sentences_and_a_click_corrects_it(browser: Any, home: Path) -> None:
+    shutil.copytree(home / "leaking", home / "broken")
+    bench = home / "broken" / "bench.toml"
+    text = bench.read_text()
+    bench.write_text(
+        text.replace("phase_sign = 1", "phase_sign = -1")
+        if "phase_sign" in text
+        else text.replace("[panel]", "[panel]\nphase_sign = -1")
+    )
+    studio = Studio(home, "broken")
+    try:
+        page = opened(browser, studio.address)
+        fix = button(page, "Set phase_sign = 1 in bench.toml")
+        fix.wait_for()
+        playwright.expect(button(page, "Diagnose")).to_be_disabled()
+        fix.click()
+        verdict(page, "The old file is kept as bench.toml.before-1")
+        playwright.expect(page.get_by_text("nothing is wrong with them")).to_be_visible()
+        idle(page)
+        bench.write_text("[panel\n")
+        verdict(page, "bench.toml")
+        assert "Traceback" not in page.content()
+        page.context.close()
+    finally:
+        assert studio.end() in (0, 130)
+
+
+def test_without_captures_a_simulated_bench_is_captured_live(browser: Any, tmp_path: Path) -> None:
+    studio = Studio(tmp_path)
+    try:
+        page = opened(browser, studio.address)
+        page.get_by_label("Path of a folder").fill(str(tmp_path / "nowhere"))
+        button(page, "Open").click()
+        verdict(page, "is not a folder")
+        button(page, "Capture").click()
+        playwright.expect(page.get_by_role("heading", name="Ladder of errors")).to_be_visible(timeout=SLOW_MS)
+        assert list(tmp_path.glob("guess-*/captures.csv"))
+        button(page, "Gain").click()
+        button(page, "Reveal what is hidden").click()
+        playwright.expect(page.get_by_role("heading", name="Hidden in this bench")).to_be_visible()
+        page.context.close()
+    finally:
+        began = time.monotonic()
+        assert studio.end() in (0, 130)
+        assert time.monotonic() - began < 15
+
+
+def test_a_port_in_use_and_no_folder_are_sentences(studio: Studio, tmp_path: Path) -> None:
+    port = studio.base.rstrip("/").rsplit(":", 1)[1]
+    for arguments, said in ((["--port", port], "cannot be used"), (["nowhere"], "is not a folder")):
+        done = subprocess.run(
+            [sys.executable, "-m", "trainer.cli", "studio", *arguments, "--no-browser"],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+        assert done.returncode == 2 and said in done.stderr and done.stderr.count("\n") == 1

@@ -1,0 +1,439 @@
+"""The studio without a browser: steps of a model, corrections, effect files from probes, work in processes, access."""
+
+from __future__ import annotations
+
+import os
+import resource
+import shutil
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("panel", reason="the studio needs the extra 'studio'")
+
+from firmware_iface.errors import InputError
+from runtime.excess import RemovedExcess
+from trainer.captures.capture_set import CaptureSet, read_captures
+from trainer.captures.check_set import check_captures
+from trainer.captures.problems import Problem
+from trainer.diagnosis.probes import ProbeResult
+from trainer.effects.effect_catalogue import catalogue, load_effects
+from trainer.effects.testing import captures_with
+from trainer.model.model import Model, instance_with
+from trainer.model.model_file import read_model, write_model
+from trainer.model.model_stages import ideal_irradiance
+from trainer.studio import colours, gain_tasks, guess_benches, jobs
+from trainer.studio.findings_fixes import fix_of
+from trainer.studio.jobs import CANCELLED, ENDED, WorkerProcess, sentence_of
+from trainer.studio.ladder_view import ladder_rows
+from trainer.studio.model_steps import ModelSteps
+from trainer.studio.probe_template import write_effect_of_probe
+from trainer.studio.project import Project
+from trainer.studio.server import _checked_token, _free_port
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory: pytest.TempPathFactory) -> CaptureSet:
+    """A small set with a leak at the panel."""
+    folder = tmp_path_factory.mktemp("studio") / "leaking"
+    return captures_with(folder, catalogue()["zero_order"], {"leak_real": 0.2}, patterns=6)
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Iterator[Project]:
+    one = Project(tmp_path)
+    yield one
+    one.close()
+
+
+def until(condition: Callable[[], Any], seconds: float = 60) -> Any:
+    """The condition's value as soon as it is true."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        found = condition()
+        if found:
+            return found
+        time.sleep(0.05)
+    raise AssertionError(f"not so after {seconds} s")
+
+
+# Steps of a model
+
+
+def models(captures: CaptureSet, *leaks: float) -> list[Model]:
+    effect = catalogue()["zero_order"]
+    ideal = replace(Model(captures.bench), gain={"green": 1.0})
+    return [ideal, *(ideal.having(instance_with(effect, captures.bench, {"leak_real": v})) for v in leaks)]
+
+
+def test_steps_are_undone_and_redone_and_forgotten(captures: CaptureSet, tmp_path: Path) -> None:
+    steps, known = ModelSteps(tmp_path / "m.toml"), catalogue()
+    ideal, one, two = models(captures, 0.1, 0.2)
+    assert not steps.can_undo() and not steps.can_redo()
+    steps.write(one, ideal, {})
+    steps.write(two, one, {})
+    assert [p.name for p in steps.files()] == ["0001.toml", "0002.toml", "0003.toml"]
+    assert steps.step(-1, known, {}).instance("zero_order").values["leak_real"] == pytest.approx(0.1)
+    assert steps.step(-1, known, {}).names == ()
+    assert not steps.can_undo()
+    with pytest.raises(InputError, match="nothing to undo"):
+        steps.step(-1, known, {})
+    assert steps.step(1, known, {}).names == ("zero_order",)
+    assert steps.can_redo()
+    steps.write(models(captures, 0.3)[1], one, {})
+    assert not steps.can_redo() and len(steps.files()) == 3
+
+
+def test_a_change_by_another_program_is_a_step(captures: CaptureSet, tmp_path: Path) -> None:
+    steps = ModelSteps(tmp_path / "m.toml")
+    ideal, one, two = models(captures, 0.1, 0.2)
+    steps.write(one, ideal, {})
+    write_model(steps.path, two, {"written_by": "somebody"})
+    assert steps.position() is None
+    steps.notice(two, one, {})
+    assert steps.position() == 2 and steps.can_undo()
+
+
+def test_a_model_that_cannot_be_written_leaves_the_old_one(
+    captures: CaptureSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps = ModelSteps(tmp_path / "m.toml")
+    ideal, one, two = models(captures, 0.1, 0.2)
+    steps.write(one, ideal, {})
+    before = steps.path.read_bytes()
+    real = write_model
+
+    def full(path: Path, *rest: Any) -> None:
+        if path == steps.path:
+            raise InputError(f"{path} cannot be written: No space left on device")
+        real(path, *rest)
+
+    monkeypatch.setattr("trainer.studio.model_steps.write_model", full)
+    with pytest.raises(InputError, match="No space left"):
+        steps.write(two, one, {})
+    assert steps.path.read_bytes() == before and len(steps.files()) == 2
+
+
+def test_the_ladder_counts_steps_as_a_person_does() -> None:
+    record = {"nrmse": 0.5, "noise_nrmse": 0.1, "excess": 0.24}
+    history = [
+        {"added": "", **record},
+        {"added": "zero_order", **record},
+        {"added": "", **record},
+        {"added": "", "removed": "iris", **record},
+    ]
+    assert [r["label"] for r in ladder_rows(history)] == ["ideal model", "+ zero order", "− iris"]
+
+
+# Corrections
+
+
+def test_one_click_sets_the_sign_of_the_phase(captures: CaptureSet, tmp_path: Path) -> None:
+    folder = tmp_path / "reversed"
+    shutil.copytree(captures.folder, folder)
+    bench = folder / "bench.toml"
+    bench.write_text("# mine\n" + bench.read_text().replace("phase_sign = 1", "phase_sign = -1"))
+    (problem,) = [p for p in check_captures(folder, ideal_irradiance) if p.kind == "convention"]
+    fix = fix_of(folder, problem)
+    assert fix is not None and fix.what == "Set phase_sign = 1 in bench.toml"
+    kept = fix.apply()
+    assert "phase_sign = -1" in kept.read_text() and "phase_sign = 1" in bench.read_text()
+    assert bench.read_text().startswith("# mine")
+    assert not [p for p in check_captures(folder, ideal_irradiance) if p.kind == "convention"]
+
+
+def test_one_click_removes_a_row(captures: CaptureSet, tmp_path: Path) -> None:
+    folder = tmp_path / "missing"
+    shutil.copytree(captures.folder, folder)
+    lost = captures.captures[2]
+    (folder / "image" / lost.image.name).unlink()
+    (problem,) = [p for p in check_captures(folder, ideal_irradiance) if p.kind == "missing_file"]
+    fix = fix_of(folder, problem)
+    assert fix is not None and lost.capture in fix.what
+    fix.apply()
+    assert len(read_captures(folder)) == len(captures) - 1
+    assert (folder / "captures.csv.before-1").is_file()
+    with pytest.raises(InputError, match="no row"):
+        fix.apply()
+
+
+def test_what_is_no_line_of_a_table_has_no_button(captures: CaptureSet) -> None:
+    for kind in ("too_few", "noise", "no_correlation"):
+        assert fix_of(captures.folder, Problem("warning", kind, "", "more captures")) is None
+
+
+# Effect files from probes
+
+
+@pytest.mark.parametrize("stage", ["drive", "panel", "pupil", "sensor"])
+def test_an_effect_file_is_filled_with_what_the_probe_shows(stage: str, tmp_path: Path) -> None:
+    x = np.arange(120)
+    fringe = 1 + 0.1 * np.cos(2 * np.pi * x[None, :] / 12) * np.ones((90, 1))
+    titles = {
+        "drive": ("response, deviation (green)", 0.1 * np.cos(2 * np.pi * np.arange(33) / 8)),
+        "panel": ("amplitude multiplied", fringe),
+        "pupil": ("amplitude passed, over spatial frequency", fringe),
+        "sensor": ("gain over the picture", fringe),
+    }
+    title, values = titles[stage]
+    found = ProbeResult(stage, RemovedExcess(0.1, 0.001), 0.01, ((title, values, "relative"),))
+    path = write_effect_of_probe(f"odd_{stage}", stage, found, (90, 120), tmp_path, ())
+    text = path.read_text()
+    assert title in text and "amplitude 0.1" in text
+    if stage in ("panel", "sensor"):
+        assert '"period": 12' in text
+    (effect,) = load_effects(path)
+    assert effect.name == f"odd_{stage}" and effect.stage == stage
+
+
+# Work in processes
+
+
+def _echo(say: Any, word: str) -> str:
+    say("progress", (0.5, "half"))
+    return word
+
+
+def _sleep(say: Any) -> None:
+    say("pid", os.getpid())
+    time.sleep(60)
+
+
+def _fails(say: Any, kind: str) -> None:
+    if kind == "input":
+        raise InputError("this is wrong: change that")
+    if kind == "full":
+        raise OSError(28, "No space left on device")
+    if kind == "memory":
+        raise MemoryError
+    raise ValueError("surprise")
+
+
+class Heard:
+    """What a worker has said."""
+
+    def __init__(self) -> None:
+        self.words: list[tuple[str, Any]] = []
+        self.ended = threading.Event()
+
+    def __call__(self, kind: str, value: Any) -> None:
+        self.words.append((kind, value))
+        if kind in ("done", "failed", "cancelled"):
+            self.ended.set()
+
+
+@pytest.fixture(scope="module")
+def worker() -> Iterator[WorkerProcess]:
+    one = WorkerProcess("test")
+    yield one
+    one.close()
+
+
+def test_a_worker_does_tasks_and_says_how_far_it_is(worker: WorkerProcess) -> None:
+    heard = Heard()
+    worker.submit(_echo, ("word",), heard)
+    assert heard.ended.wait(60)
+    assert heard.words == [("progress", (0.5, "half")), ("done", "word")]
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("input", "change that"),
+        ("full", "disk is full"),
+        ("memory", "not enough memory"),
+        ("", "did not work"),
+    ],
+)
+def test_what_goes_wrong_is_one_sentence(worker: WorkerProcess, kind: str, said: str) -> None:
+    heard = Heard()
+    worker.submit(_fails, (kind,), heard)
+    assert heard.ended.wait(60)
+    ((how, sentence),) = heard.words
+    assert how == "failed" and said in sentence and "Traceback" not in sentence and "\n" not in sentence
+
+
+def test_a_task_is_cancelled_and_a_killed_worker_is_replaced(worker: WorkerProcess) -> None:
+    heard = Heard()
+    worker.submit(_sleep, (), heard)
+    until(lambda: heard.words)
+    assert worker.busy
+    with pytest.raises(InputError, match="under way"):
+        worker.submit(_echo, ("no",), Heard())
+    assert worker.cancel()
+    assert heard.words[-1] == ("cancelled", CANCELLED)
+    assert not worker.cancel()
+    heard = Heard()
+    worker.submit(_sleep, (), heard)
+    pid = until(lambda: next((v for k, v in heard.words if k == "pid"), None))
+    os.kill(pid, signal.SIGKILL)
+    assert heard.ended.wait(30)
+    assert heard.words[-1] == ("failed", ENDED)
+    heard = Heard()
+    worker.submit(_echo, ("again",), heard)
+    assert heard.ended.wait(60) and heard.words[-1] == ("done", "again")
+
+
+def test_errors_of_files_name_the_file() -> None:
+    assert "x.png cannot be used" in sentence_of(FileNotFoundError(2, "No such file", "x.png"))
+    assert jobs.sentence_of(OSError(28, "No space left")).startswith("The disk is full")
+
+
+# The project
+
+
+def test_a_project_predicts_adds_undoes_and_sees_the_command_line(
+    project: Project, captures: CaptureSet
+) -> None:
+    project.open_set(captures.folder)
+    until(lambda: project.errors is not None and project.problems is not None)
+    assert project.errors is not None and project.errors.errors.excess > 0.05
+    assert project.problems == [] or all(p.severity == "warning" for p in project.problems or ())
+    path = project.model_path
+    assert path is not None and not path.exists()
+    project.add("zero_order")
+    assert project.work is not None and project.work.name == "Add zero_order"
+    until(lambda: project.model is not None and project.model.names == ("zero_order",))
+    until(lambda: project.diagnosis is not None)
+    assert project.model is not None
+    assert path.is_file()
+    assert project.diagnosis is not None and project.diagnosis.verdict == "complete"
+    until(lambda: project.errors)
+    assert project.errors.errors.excess < 1e-3
+    assert [r["label"] for r in ladder_rows(project.model.history)] == ["ideal model", "+ zero order"]
+    project.undo()
+    assert project.model.names == () and project.can_redo() and read_model(path, catalogue()).names == ()
+    project.redo()
+    assert project.model.names == ("zero_order",)
+    write_model(path, read_model(path, catalogue()).without("zero_order"))
+    until(lambda: "another program" in project.notice[1])
+    assert project.model.names == ()
+
+
+def test_a_broken_set_is_a_sentence(project: Project, captures: CaptureSet, tmp_path: Path) -> None:
+    folder = tmp_path / "broken"
+    shutil.copytree(captures.folder, folder)
+    (folder / "bench.toml").write_text("[panel\n")
+    project.open_set(folder)
+    assert project.captures is None and "bench.toml" in project.set_fault
+    until(lambda: project.problems)
+    (folder / "bench.toml").write_text((captures.folder / "bench.toml").read_text())
+    until(lambda: project.captures is not None)
+    with pytest.raises(InputError, match="is not a folder"):
+        project.open_set(tmp_path / "nowhere")
+
+
+def test_a_saved_effect_file_takes_part_at_once(
+    project: Project, captures: CaptureSet, tmp_path: Path
+) -> None:
+    project.open_set(captures.folder)
+    until(lambda: project.errors)
+    path = write_effect_of_probe("my_stripe", "panel", None, (72, 96), tmp_path, ())
+    project.add_effect_file(path)
+    until(lambda: any(r.effect.name == "my_stripe" for r in project.ranking))
+    assert "my_stripe" in project.previews
+    path.write_text(path.read_text() + "\nthis is not Python\n")
+    until(lambda: project.effects_fault)
+    assert str(path) in project.effects_fault and "line" in project.effects_fault
+
+
+def test_a_full_disk_is_a_sentence_and_the_model_stays(project: Project, captures: CaptureSet) -> None:
+    """A limit on the size of files stands for the full disk."""
+    project.open_set(captures.folder)
+    until(lambda: project.errors)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    try:
+        project.add("zero_order")
+        until(lambda: project.work is None and project.notice[1])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    severity, sentence = project.notice
+    assert severity == "error" and "cannot be written" in sentence and "\n" not in sentence
+    assert project.model is not None and project.model.names == ()
+    assert project.model_path is not None and not project.model_path.exists()
+    project.add("zero_order")
+    until(lambda: project.model is not None and project.model.names == ("zero_order",))
+
+
+# What is gained
+
+
+def test_a_gain_is_displayed_by_the_simulated_bench_kept_and_read_again(tmp_path: Path) -> None:
+    said: list[str] = []
+    folder = guess_benches.capture_guess(
+        lambda kind, value: said.append(kind), "one", 3, tmp_path / "guess-3"
+    )
+    assert said.count("picture") > 10 and guess_benches.noted(folder) == ("one", 3)
+    hidden = guess_benches.hidden_in(folder)
+    assert hidden is not None and len(hidden) == 1
+    model = Model(read_captures(folder).bench)
+    for where in (gain_tasks.OWN, gain_tasks.PREDICTED):
+        found = gain_tasks.show_gain(_quiet, folder, model, "coffee", "green", 18.0, where)
+        assert found.target.shape == found.ideal.shape == (144, 192) and found.ideal_db > 5
+    gain_tasks.keep(found, tmp_path / "kept.npz")
+    again = gain_tasks.recorded(tmp_path / "kept.npz")
+    assert again.where == found.where and np.array_equal(again.explained, found.explained)
+    with pytest.raises(InputError, match="is not that of these captures"):
+        gain_tasks.show_gain(_quiet, folder, model, "coffee", "green", 18.0, "virtual:demo")
+    with pytest.raises(InputError, match="holds no displayed picture"):
+        gain_tasks.recorded(folder / "bench.toml")
+
+
+def _quiet(kind: str, value: Any) -> None:
+    pass
+
+
+# Simulated benches
+
+
+@pytest.mark.parametrize("kind", guess_benches.KINDS.values())
+def test_simulated_benches_hide_what_their_kind_says(kind: str) -> None:
+    counts = {"one": 1, "two": 2, "three": 3, "colours": 1, "outside": 1}
+    for number in range(5):
+        bench = guess_benches.guess_bench(kind, number)
+        assert bench == guess_benches.guess_bench(kind, number)
+        assert len(bench.defects) in ((counts[kind],) if kind in counts else (0, 1))
+
+
+# Access
+
+
+def test_tokens_and_ports() -> None:
+    assert len(_checked_token(None)) > 20
+    assert _checked_token("abcdefgh") == "abcdefgh"
+    for wrong in ("short", "with space!", "äöüäöüäöü"):
+        with pytest.raises(InputError, match="--token"):
+            _checked_token(wrong)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(InputError, match=f"--port {port} cannot be used"):
+            _free_port(port)
+    assert 1024 < _free_port(None) < 65536
+
+
+def test_differences_are_white_at_zero_and_equally_deep_on_both_sides() -> None:
+    palette = [tuple(int(c[k : k + 2], 16) for k in (1, 3, 5)) for c in colours.difference_palette()]
+    assert len(palette) == 255 and min(palette[127]) > 235
+    light = [0.2126 * r + 0.7152 * g + 0.0722 * b for r, g, b in palette]
+    assert all(a < b + 2 for a, b in pairwise(light[:128]))
+    assert light[0] == pytest.approx(light[-1], abs=25)
+
+
+def test_a_notebook_shows_the_same_pictures(captures: CaptureSet, tmp_path: Path) -> None:
+    import hololoop
+
+    hololoop.compare(captures).view().save(tmp_path / "view.html", resources="inline", title="captures")
+    text = (tmp_path / "view.html").read_text(encoding="utf-8")
+    assert "\\u2212 predicted" in text or "Measured − predicted" in text
