@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import param
 from panel.reactive import ReactiveHTML
@@ -18,9 +18,7 @@ class LabelledSlider(ReactiveHTML):
     low, high, step : float
         Range, and the change of one key press.
     value : float
-        Of the slider.
-    typed : float
-        Of the field; follows the slider, and moves it when it is changed.
+        Of the slider and of the field. The browser keeps the two the same, and a number that is typed in the range.
     """
 
     label = param.String(default="value")
@@ -29,19 +27,23 @@ class LabelledSlider(ReactiveHTML):
     high = param.Number(default=1.0)
     step = param.Number(default=0.01)
     value = param.Number(default=0.0)
-    typed = param.Number(default=0.0)
 
     _template = """
     <div id="box" class="labelled-slider" title="{{ about }}">
       <span id="name" class="name">{{ label }}</span>
       <input id="number" class="number" type="number" min="${low}" max="${high}" step="any"
-             value="${typed}" aria-label="{{ label }}, as a number"/>
+             onchange="${script('typed')}" aria-label="{{ label }}, as a number"/>
       <input id="range" class="range" type="range" min="${low}" max="${high}" step="${step}"
-             value="${value}" aria-label="{{ label }}"/>
+             oninput="${script('moved')}" aria-label="{{ label }}"/>
     </div>
     """
-    _priority_changes: ClassVar[list[str]] = ["value", "typed"]  # handled at once, not after panel's 50 ms
-    _dom_events: ClassVar[dict[str, list[str]]] = {"range": ["input"], "number": ["change"]}
+    _scripts: ClassVar[dict[str, str]] = {
+        "render": "number.value = range.value = data.value",
+        "value": "number.value = range.value = data.value",
+        "moved": "data.value = Number(range.value)",
+        "typed": "data.value = Math.min(Math.max(Number(number.value), data.low), data.high); number.value = data.value",
+    }
+    _priority_changes: ClassVar[list[str]] = ["value"]  # handled at once, not after panel's 50 ms
     _stylesheets: ClassVar[list[str]] = [
         """
         .labelled-slider { display: grid; grid-template-columns: 1fr 5.4em; align-items: center; gap: 1px 8px; }
@@ -64,15 +66,3 @@ class LabelledSlider(ReactiveHTML):
         input:focus-visible { outline: 2px solid var(--accent, #2f7fbf); outline-offset: 1px; }
         """
     ]
-
-    def __init__(self, **params: Any) -> None:
-        super().__init__(**{"typed": params.get("value", 0.0), **params})
-
-    @param.depends("value", watch=True)
-    def _follow(self) -> None:
-        self.typed = self.value
-
-    @param.depends("typed", watch=True)
-    def _move(self) -> None:
-        """Take the field's number, as far as it is in the range."""
-        self.value = self.typed = min(max(self.typed, self.low), self.high)
