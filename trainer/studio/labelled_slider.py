@@ -41,7 +41,7 @@ class LabelledSlider(ReactiveHTML):
         "render": "number.value = range.value = data.value",
         "value": "number.value = range.value = data.value",
         "moved": "data.value = Number(range.value)",
-        "typed": "data.value = Math.min(Math.max(Number(number.value), data.low), data.high); number.value = data.value",
+        "typed": "data.value = Math.min(Math.max(number.value, data.low), data.high); number.value = data.value",
     }
     _priority_changes: ClassVar[list[str]] = ["value"]  # handled at once, not after panel's 50 ms
     _stylesheets: ClassVar[list[str]] = [
