@@ -27,7 +27,10 @@ def explained(capsys, captures: Path, folder: Path) -> dict:
     return ran(capsys, "explain", captures, "--out", folder / "model.toml", "--workers", 1)
 
 
-@pytest.mark.parametrize(("key", "stated", "true"), [("pitch_um", 7.9, 8.0), ("wavelength_nm", 522.0, 520.0)])
+@pytest.mark.parametrize(
+    ("key", "stated", "true"),
+    [("pitch_um", 7.9, 8.0), pytest.param("wavelength_nm", 522.0, 520.0, marks=pytest.mark.slow)],
+)
 def test_at_one_plane_the_equivalent_facts_are_said(key, stated, true, tmp_path, capsys) -> None:
     captures = captured(capsys, tmp_path)
     state(captures, key, stated)
@@ -58,7 +61,9 @@ def test_two_planes_show_a_wrong_distance_as_such(tmp_path, capsys) -> None:
     assert found["verdict"] == "complete" and found["equal_facts"] == []
 
 
-@pytest.mark.parametrize(("stated", "true"), [(10, 30), (30, 12), (20, 50)])
+@pytest.mark.parametrize(
+    ("stated", "true"), [(10, 30), (30, 12), pytest.param(20, 50, marks=pytest.mark.slow)]
+)
 def test_a_distance_far_from_the_stated_one_is_found(stated, true, tmp_path, capsys) -> None:
     bench = bench_file(tmp_path, distance_mm=true)
     captures = tmp_path / "captures"
