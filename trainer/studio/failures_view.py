@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import panel as pn
 from bokeh.events import Tap
-from bokeh.models import ColumnDataSource, HoverTool, LinearColorMapper, Range1d
+from bokeh.models import BasicTickFormatter, ColumnDataSource, HoverTool, LinearColorMapper, Range1d
 from bokeh.plotting import figure
 
 from trainer.diagnosis.capture_errors import SetErrors
@@ -285,6 +285,7 @@ class _Time:
 
     def __init__(self, visit: Visit) -> None:
         self.figure = _plot(x_axis_label="time, s", y_axis_label="excess", y_range=Range1d(start=0, end=1))
+        self.figure.yaxis.formatter = BasicTickFormatter(precision=1)
         self.source = ColumnDataSource({k: [0.1, 1.0] for k in ("time", "excess", "gain", "capture")})
         self.figure.line("time", "excess", source=self.source, color=visit.colours["quiet"], line_width=1)
         drawn = self.figure.scatter("time", "excess", source=self.source, color=visit.colours["main"], size=8)

@@ -6,7 +6,7 @@ import csv
 import io
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -71,16 +71,30 @@ def fix_of(folder: Path, problem: Problem) -> Fix | None:
     bench, table = folder / "bench.toml", folder / "captures.csv"
     if problem.kind == "convention":
         found = re.search(r"set phase_sign = (-?1)", problem.message)
-        return _set(bench, "panel", "phase_sign", int(found.group(1))) if found else None
+        return _set(bench, "panel", {"phase_sign": int(found.group(1))}) if found else None
     if problem.kind == "black_level":
         found = re.search(r"repeated patterns points? to (\d+)", problem.message)
-        return _set(bench, "camera", "black_level", int(found.group(1))) if found else None
+        return _set(bench, "camera", {"black_level": int(found.group(1))}) if found else None
     if problem.kind == "bit_depth":
         found = re.search(r"has counts up to (\d+), but", problem.message)
         depth = next((b for b in (8, 10, 12, 14, 16) if found and int(found.group(1)) < 2**b), None)
-        return _set(bench, "camera", "bit_depth", depth) if depth else None
-    if problem.kind == "mismatched" and problem.capture:
-        return None
+        said = re.search(r"write bit_depth = (\d+)", problem.message)
+        depth = int(said.group(1)) if said else depth
+        return _set(bench, "camera", {"bit_depth": depth}) if depth else None
+    if problem.kind == "camera_numbers":
+        found = re.search(r"show full_well_e = (\S+) and read_noise_e = ([\d.]+)", problem.message)
+        if not found:
+            return None
+        return _set(
+            bench, "camera", {"full_well_e": float(found.group(1)), "read_noise_e": float(found.group(2))}
+        )
+    if problem.kind == "mismatched":
+        found = re.search(r"fits the pattern of capture (\S+) \(", problem.message)
+        if not found or not _has_row(table, problem.capture) or not _has_row(table, found.group(1)):
+            return None
+        pair = (problem.capture, found.group(1))
+        what = f"Exchange the images of {pair[0]} and {pair[1]} in captures.csv"
+        return Fix(what, table, lambda text: _exchanged(text, pair))
     if problem.kind in REMOVED_ROWS and problem.capture and _has_row(table, problem.capture):
         name = problem.capture
         return Fix(
@@ -89,15 +103,17 @@ def fix_of(folder: Path, problem: Problem) -> Fix | None:
     return None
 
 
-def _set(path: Path, table: str, key: str, value: int) -> Fix:
+def _set(path: Path, table: str, values: Mapping[str, int | float]) -> Fix:
     def changed(text: str) -> str:
         document = tomlkit.parse(text)
         if table not in document:
             raise InputError(f"{path.name} has no table [{table}]: add it")
-        document[table][key] = value
+        for key, value in values.items():
+            document[table][key] = value
         return tomlkit.dumps(document)
 
-    return Fix(f"Set {key} = {value} in {path.name}", path, changed)
+    words = " and ".join(f"{key} = {value:g}" for key, value in values.items())
+    return Fix(f"Set {words} in {path.name}", path, changed)
 
 
 def _has_row(path: Path, capture: str) -> bool:
@@ -129,6 +145,22 @@ def _without_row(text: str, capture: str) -> str:
         raise InputError(f"captures.csv has no row of {capture} any more: check the captures again")
     line, lines = found
     return "".join(lines[:line] + lines[line + 1 :])
+
+
+def _exchanged(text: str, captures: tuple[str, str]) -> str:
+    """The table with the images of two captures exchanged."""
+    rows = list(csv.reader(io.StringIO(text)))
+    places = [found[0] for name in captures if (found := _place(text, name)) is not None]
+    header = [name.strip() for name in rows[0]] if rows else []
+    if len(places) < 2 or "image" not in header:
+        raise InputError(
+            f"captures.csv has no rows of {' and '.join(captures)} any more: check the captures again"
+        )
+    column, (one, other) = header.index("image"), places
+    rows[one][column], rows[other][column] = rows[other][column], rows[one][column]
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows(rows)
+    return out.getvalue()
 
 
 def _free_name(path: Path) -> Path:

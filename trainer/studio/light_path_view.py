@@ -50,11 +50,14 @@ def _path(project: Project) -> str:
     if project.network is not None:
         names.insert(names.index("sensor"), "network")
     boxes = "".join(_stage(n, model, probes.get(n), excess) for n in names)
-    legend = (
-        "The deeper the colour, the more of the error that is left a free-form probe of the stage would remove."
-        if probes
-        else "Diagnose shows at which stage the error that is left comes in."
-    )
+    if probes:
+        legend = (
+            "The deeper the colour, the more of what is left a free-form probe of the stage would remove."
+        )
+    elif project.diagnosis and project.diagnosis.verdict == "complete":
+        legend = "What is left is too little to come from a stage."
+    else:
+        legend = "Diagnose shows at which stage the error that is left comes in."
     return (
         f"<h2 class='hidden'>Light path</h2><ol class='path'>{boxes}</ol><p class='quiet small'>{legend}</p>"
     )

@@ -22,6 +22,7 @@ pytest.importorskip("panel", reason="the studio needs the extra 'studio'")
 
 from firmware_iface.errors import InputError
 from runtime.excess import RemovedExcess
+from trainer.captures.camera_numbers import numbers_text
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.check_set import check_captures
 from trainer.captures.problems import Problem
@@ -164,6 +165,34 @@ def test_one_click_removes_a_row(captures: CaptureSet, tmp_path: Path) -> None:
     assert (folder / "captures.csv.before-1").is_file()
     with pytest.raises(InputError, match="no row"):
         fix.apply()
+
+
+def test_one_click_exchanges_two_images(captures: CaptureSet, tmp_path: Path) -> None:
+    folder = tmp_path / "swapped"
+    shutil.copytree(captures.folder, folder)
+    table = folder / "captures.csv"
+    right = table.read_text()
+    one, other = (f"image/{c.image.name}" for c in (captures.captures[2], captures.captures[4]))
+    table.write_text(right.replace(one, "?").replace(other, one).replace("?", other))
+    problems = [p for p in check_captures(folder, ideal_irradiance) if p.kind == "mismatched"]
+    assert {p.capture for p in problems} == {captures.captures[2].capture, captures.captures[4].capture}
+    fix = fix_of(folder, problems[0])
+    assert fix is not None and fix.what.startswith("Exchange the images of ")
+    fix.apply()
+    assert table.read_text() == right
+    assert not check_captures(folder, ideal_irradiance)
+
+
+def test_one_click_takes_the_noise_that_repeats_show(captures: CaptureSet, tmp_path: Path) -> None:
+    folder = tmp_path / "noisy"
+    shutil.copytree(captures.folder, folder)
+    camera = captures.bench.camera
+    said = numbers_text(camera, replace(camera, full_well_e=21000.0, read_noise_e=7.5))
+    fix = fix_of(folder, Problem("warning", "camera_numbers", "", said))
+    assert fix is not None and fix.what == "Set full_well_e = 21000 and read_noise_e = 7.5 in bench.toml"
+    fix.apply()
+    found = read_captures(folder).bench.camera
+    assert (found.full_well_e, found.read_noise_e) == (21000.0, 7.5)
 
 
 def test_what_is_no_line_of_a_table_has_no_button(captures: CaptureSet) -> None:
