@@ -46,6 +46,8 @@ class RepeatNoise:
 
     def ratio_to(self, camera: Camera) -> float:
         """Measured noise over that of a camera with other numbers than the stated."""
+        if not self.mean.size:  # too few pixels for a bin
+            return self.ratio
         return float(self.variance.mean() / noise_variance(self.mean - self.black_level, camera).mean())
 
 
