@@ -9,6 +9,7 @@ from typing import Any
 
 import panel as pn
 
+from trainer.studio.catalogue_view import catalogue_view
 from trainer.studio.comparison_view import comparison_view
 from trainer.studio.diagnosis_view import candidates_view, diagnosis_view
 from trainer.studio.failures_view import failures_view
@@ -125,10 +126,4 @@ def _bench(project: Project, visit: Visit) -> Any:
 
 def _catalogue(project: Project, visit: Visit) -> Any:
     """The catalogue of effects, with pictures that move."""
-    try:
-        from trainer.studio.catalogue_view import catalogue_view
-    except ModuleNotFoundError:
-        return pn.pane.HTML(
-            "<p class='quiet'>The catalogue is listed by <code>hololoop-trainer effects</code>.</p>"
-        )
     return catalogue_view(project.known)
