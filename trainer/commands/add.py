@@ -37,7 +37,6 @@ def run(args: Namespace, screen: Screen) -> Result:
     captures, known, model = inputs_of(args)
     note_what_is_used(captures, screen)
     from trainer.captures.capture_origin import origin
-    from trainer.captures.held_out import split
     from trainer.diagnosis.explanation import add
     from trainer.model.model_file import write_model
 
@@ -45,7 +44,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     with screen.progress(f"adding {effect.name}") as progress:
         found = add(captures, model, effect, known, progress)
     write_model(args.out, found.model, origin(captures))
-    return {**found.as_json(), "held_out": split(captures).is_held_out}
+    return found.as_json()
 
 
 def show(result: Result, args: Namespace, screen: Screen) -> None:

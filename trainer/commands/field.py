@@ -30,7 +30,6 @@ def run(args: Namespace, screen: Screen) -> Result:
     captures, _, model = inputs_of(args)
     note_what_is_used(captures, screen)
     from trainer.captures.capture_origin import origin
-    from trainer.captures.held_out import split
     from trainer.fitting.learned_field import learn_field
     from trainer.model.model_file import write_model
 
@@ -38,7 +37,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     with screen.progress("learning the field at the panel") as progress:
         found = learn_field(captures, model, progress)
     write_model(args.out, found.model, origin(captures))
-    return {"model": str(args.out), **found.as_json(), "held_out": split(captures).is_held_out}
+    return {"model": str(args.out), **found.as_json()}
 
 
 def show(result: Result, args: Namespace, screen: Screen) -> None:

@@ -47,45 +47,62 @@ class EqualFact:
         return f"{self.fact} = {number(self.value, 4)} instead of {self.stated:g}"
 
 
-def equal_facts(model: Model, captures: CaptureSet) -> tuple[EqualFact, ...]:
-    """Facts that would explain the captures as well as the model's distance or wavelength does; () for none."""
+@dataclass(frozen=True)
+class EqualFacts:
+    """Facts of bench.toml that would explain captures as well as one effect of a model does.
+
+    Attributes
+    ----------
+    effect : str
+        "distance" or "wavelength"; "" for none.
+    facts : tuple of EqualFact
+        Empty for none.
+    planes_mm : tuple of float, mm
+        Of the captures.
+    """
+
+    effect: str = ""
+    facts: tuple[EqualFact, ...] = ()
+    planes_mm: tuple[float, ...] = ()
+
+    @property
+    def sentence(self) -> str:
+        """Which facts, in one sentence; "" for none."""
+        if not self.facts:
+            return ""
+        facts = " or ".join(map(str, self.facts))
+        if self.effect == "distance":
+            return f"At one plane this distance cannot be told from {facts} in bench.toml."
+        return f"Instead of the wavelength, bench.toml may err in {facts}: that is the same here."
+
+    @property
+    def deciding_captures(self) -> list[str]:
+        """Captures that would tell which fact it is, as sentences."""
+        if not self.facts or len(self.planes_mm) > 1:
+            return []
+        near, far = (f"{self.planes_mm[0] * share:.3g}" for share in PLANES)
+        return [
+            f"the same patterns at {near} mm or {far} mm: a wrong distance, and a wrong wavelength or pitch, differ "
+            "there"
+        ]
+
+
+def equal_facts(model: Model, captures: CaptureSet) -> EqualFacts:
+    """Facts that would explain the captures as well as the model's distance or wavelength does."""
     bench, planes = model.bench, captures.planes
     if "distance" in model.names and len(planes) == 1 and planes[0]:
         ratio = 1 + float(model.instance("distance").values["offset"]) / planes[0]
         if abs(ratio - 1) < LEAST or ratio <= 0:
-            return ()
-        return (*_wavelengths(bench, captures, ratio), _pitch(bench, ratio))
+            return EqualFacts()
+        return EqualFacts("distance", (*_wavelengths(bench, captures, ratio), _pitch(bench, ratio)), planes)
     if "wavelength" in model.names:
         common = _common_ratio(model, captures)
         if common is None or abs(common - 1) < LEAST:
-            return ()
-        return (
-            _pitch(bench, common),
-            EqualFact("propagation.distance_mm", bench.distance_mm, bench.distance_mm * common),
-        )
-    return ()
-
-
-def equal_facts_text(model: Model, captures: CaptureSet) -> str:
-    """The same in one sentence; "" for none."""
-    facts = equal_facts(model, captures)
-    if not facts:
-        return ""
-    if "distance" in model.names and len(captures.planes) == 1:
-        where = "At one plane this distance cannot be told from "
-        return where + " or ".join(map(str, facts)) + " in bench.toml."
-    return f"Instead of the wavelength, bench.toml may err in {' or '.join(map(str, facts))}: that is the same here."
-
-
-def captures_that_decide(model: Model, captures: CaptureSet) -> list[str]:
-    """Captures that would tell which fact it is, as sentences."""
-    if not equal_facts(model, captures) or len(captures.planes) > 1:
-        return []
-    plane = captures.planes[0]
-    near, far = (f"{plane * share:.3g}" for share in PLANES)
-    return [
-        f"the same patterns at {near} mm or {far} mm: a wrong distance, and a wrong wavelength or pitch, differ there"
-    ]
+            return EqualFacts()
+        stated = bench.distance_mm
+        facts = (_pitch(bench, common), EqualFact("propagation.distance_mm", stated, stated * common))
+        return EqualFacts("wavelength", facts, planes)
+    return EqualFacts()
 
 
 def _wavelengths(bench: Bench, captures: CaptureSet, ratio: float) -> list[EqualFact]:

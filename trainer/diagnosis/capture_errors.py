@@ -13,7 +13,7 @@ from runtime.excess import PredictionErrors, joined
 from trainer.captures.batches import load_batch
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.capture_table import Capture
-from trainer.diagnosis.localise import CaptureResidual, FieldSums, FrequencySums
+from trainer.diagnosis.localise import CaptureResidual, FieldSums, FrequencySums, residual_of
 from trainer.fitting.predictor import Predictor
 from trainer.model.model import Model
 
@@ -76,12 +76,9 @@ def capture_errors(
     batch = load_batch(captures, [capture])
     with torch.no_grad():
         prediction = Predictor(model, batch).predict(model)
-    tensors = (batch.signal, prediction, batch.noise, batch.mask)
-    residual = CaptureResidual(*(t[0].double().numpy() for t in tensors))
+    residual = residual_of(batch, prediction)
     if not bool(batch.mask.any()):
         return residual, None
-    square = float((residual.mask * residual.predicted**2).sum())
-    product = float((residual.mask * residual.predicted * residual.measured).sum())
     field, frequency = FieldSums(captures.bench.camera.shape), FrequencySums(captures.bench.camera.shape)
     field.add(residual)
     frequency.add(residual)
@@ -94,7 +91,7 @@ def capture_errors(
         capture.plane_mm,
         capture.time_s,
         batch.errors(prediction),
-        product / square if square > 0 else None,
+        residual.gain,
         field.tile,
         np.array(tiles),
         np.array(rings),

@@ -19,17 +19,17 @@ from runtime.program.progress import Progress
 from trainer.captures.batches import load_batch
 from trainer.captures.bench_file import Camera
 from trainer.captures.camera_noise import compare_repeats
+from trainer.captures.camera_numbers import repeated_pairs
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.capture_table import Capture
 from trainer.captures.held_out import capture_roles, split
 from trainer.diagnosis.error_budget import ErrorBudget
-from trainer.diagnosis.localise import BrightnessSums, CaptureResidual, FieldSums, FrequencySums
+from trainer.diagnosis.localise import BrightnessSums, FieldSums, FrequencySums, residual_of
 from trainer.fitting.gains import with_gains
 from trainer.fitting.predictor import Predictor
 from trainer.model.model import Model
 
 PICTURES = 3  # held-out captures whose pictures are kept for the report
-PAIRS = 12  # pairs of repeats that the noise is checked on
 
 
 @dataclass(frozen=True)
@@ -237,13 +237,10 @@ class _Sums:
             return
         prediction = Predictor(model, batch).predict(model)
         errors = batch.errors(prediction)
-        tensors = (batch.signal, prediction, batch.noise, batch.mask)
-        residual = CaptureResidual(*(t[0].double().numpy() for t in tensors))
+        residual = residual_of(batch, prediction)
         self.errors.append(errors)
         self.used.append(capture)
-        square = float((residual.mask * residual.predicted**2).sum())
-        product = float((residual.mask * residual.predicted * residual.measured).sum())
-        self.gains.append(product / square if square > 0 else None)
+        self.gains.append(residual.gain)
         for sums in (self.field, self.frequency, self.brightness):
             sums.add(residual)
         if capture.capture in self.kept:
@@ -301,14 +298,9 @@ def noise_from_repeats(captures: CaptureSet) -> float | None:
 
     Up to a dozen pairs, a change of brightness between the two taken out; None where no pattern is repeated.
     """
-    last: dict[tuple[str, float, str, float], Capture] = {}
-    ratios: list[float] = []
-    for capture in captures.captures:
-        key = (capture.channel, capture.plane_mm, capture.pattern, capture.exposure_ms)
-        if key in last and len(ratios) < PAIRS:
-            first, second = captures.counts(last[key]), captures.counts(capture)
-            repeats = compare_repeats(first, second, captures.bench.camera)
-            if repeats is not None:
-                ratios.append(repeats.ratio)
-        last[key] = capture
+    ratios = []
+    for one, other in repeated_pairs(captures.captures):
+        repeats = compare_repeats(captures.counts(one), captures.counts(other), captures.bench.camera)
+        if repeats is not None:
+            ratios.append(repeats.ratio)
     return float(np.mean(ratios)) if ratios else None

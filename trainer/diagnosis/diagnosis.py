@@ -14,7 +14,7 @@ from trainer.captures.bench_file import Camera
 from trainer.captures.camera_numbers import camera_of_residual
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import CaptureRoles, capture_roles, scenes
-from trainer.diagnosis.bench_facts import EqualFact, captures_that_decide, equal_facts, equal_facts_text
+from trainer.diagnosis.bench_facts import EqualFacts, equal_facts
 from trainer.diagnosis.probes import ProbeResult, probe
 from trainer.diagnosis.ranking import RankedEffect, rank, try_all, try_together_with_present
 from trainer.diagnosis.screen import ScreenResult, screen
@@ -54,11 +54,9 @@ class Diagnosis:
         All candidates by what the screen expects of them, best first.
     is_held_out : bool
         False where there is only one pattern, so that what is judged is what was fitted.
-    equal_facts : tuple of EqualFact
+    equal_facts : EqualFacts
         Facts of bench.toml that would explain the captures as well as the model's, or the best candidate's, distance
         or wavelength does.
-    equal_facts_text : str
-        The same in one sentence; "" for none.
     """
 
     model: Model
@@ -72,8 +70,7 @@ class Diagnosis:
     thresholds: Thresholds
     screened: tuple[ScreenResult, ...] = field(default=())
     is_held_out: bool = True
-    equal_facts: tuple[EqualFact, ...] = ()
-    equal_facts_text: str = ""
+    equal_facts: EqualFacts = field(default_factory=EqualFacts)
 
     @property
     def best(self) -> RankedEffect | None:
@@ -95,7 +92,7 @@ class Diagnosis:
         if self.verdict == "complete":
             return (
                 f"Nothing is missing: what remains above the camera's noise is {left} of the signal's variance."
-                + f" {self.equal_facts_text}".rstrip()
+                + f" {self.equal_facts.sentence}".rstrip()
             )
         if self.best is None:
             where = f" It is at the {self.stage} stage." if self.stage else " No stage's probe shows where."
@@ -106,8 +103,8 @@ class Diagnosis:
         also = ""
         if best.indistinguishable_from:
             also = f" These captures cannot tell it from {' or '.join(best.indistinguishable_from)}."
-        if self.equal_facts_text:
-            also += f" {self.equal_facts_text}"
+        if self.equal_facts.facts:
+            also += f" {self.equal_facts.sentence}"
         gain = f"it explains {min(share, 100):.0f} % of the excess {left}"
         return f"{best.effect.name} is missing ({size}): {gain}.{also}"
 
@@ -129,7 +126,7 @@ class Diagnosis:
             "ideal_excess": self.ideal_excess,
             "thresholds": self.thresholds.as_json(),
             "screen": [{"effect": s.effect, "excess_removed": s.removed_excess} for s in self.screened],
-            "equal_facts": [f.as_json() for f in self.equal_facts],
+            "equal_facts": [f.as_json() for f in self.equal_facts.facts],
             "sentence": self.sentence,
         }
 
@@ -201,7 +198,6 @@ def diagnose(
             thresholds,
             is_held_out=roles.is_held_out,
             equal_facts=equal_facts(model, captures),
-            equal_facts_text=equal_facts_text(model, captures),
         )
 
     candidates = [e for e in known.values() if e.name not in model.names and tells(e, captures)]
@@ -236,8 +232,8 @@ def diagnose(
         # A probe of a few thousand numbers that removes nothing on held-out captures points nowhere.
         telling = [p for p in probes if thresholds.worth_adding(p.removed, ideal_excess, len(probes))]
         stage = max(telling, key=lambda p: p.removed.value).stage if telling else None
-    explained = ranking[0].model if verdict == "missing" else model
-    suggestions = captures_that_decide(explained, captures) + suggest(roles, verdict, ranking)
+    same = equal_facts(ranking[0].model if verdict == "missing" else model, captures)
+    suggestions = same.deciding_captures + suggest(roles, verdict, ranking)
     report(1.0, "done")
     return Diagnosis(
         model,
@@ -251,8 +247,7 @@ def diagnose(
         thresholds,
         tuple(order),
         roles.is_held_out,
-        equal_facts(explained, captures),
-        equal_facts_text(explained, captures),
+        same,
     )
 
 

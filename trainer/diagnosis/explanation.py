@@ -41,20 +41,24 @@ class Addition:
         With the effect, and everything refitted.
     before, after : PredictionErrors
         On the held-out captures, without and with the effect.
+    is_held_out : bool
+        False where there is only one pattern, so that what is judged is what was fitted.
     """
 
     effect: str
     model: Model
     before: PredictionErrors
     after: PredictionErrors
+    is_held_out: bool = True
 
     def as_json(self) -> dict[str, Any]:
-        """The object that `add --json` prints: keys `before`, `after` and `parameters`."""
+        """The object that `add --json` prints: keys `before`, `after`, `parameters` and `held_out`."""
         present = self.model.instance(self.effect)
         return {
             "before": self.before.as_json(),
             "after": self.after.as_json(),
             "parameters": json_values(present, self.model.bench),
+            "held_out": self.is_held_out,
         }
 
 
@@ -129,7 +133,7 @@ class Explanation:
             "suggested_captures": list(
                 dict.fromkeys(s for d in self.diagnoses for s in d.suggested_captures)
             ),
-            "equal_facts": [f.as_json() for f in self.diagnosis.equal_facts],
+            "equal_facts": [f.as_json() for f in self.diagnosis.equal_facts.facts],
         }
 
 
@@ -162,7 +166,7 @@ def add(
     after = evaluate_captures(captures, roles.held_out, added)
     added = recorded(added, effect.name, after)
     report(1.0, "done")
-    return Addition(effect.name, added, before, after)
+    return Addition(effect.name, added, before, after, roles.is_held_out)
 
 
 def add_from(roles: CaptureRoles, model: Model, start: EffectInstance) -> Model:

@@ -11,8 +11,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from runtime.excess import tile_sums
+from trainer.captures.batches import Batch
 
 CELLS = 16  # tiles along the longer side of the picture
 RINGS = 0.025  # width of a ring of spatial frequencies, cycles/pixel
@@ -45,6 +47,18 @@ class CaptureResidual:
     def residual(self) -> Array:
         """Measured less predicted, counts; 0 where saturated."""
         return (self.measured - self.predicted) * self.mask
+
+    @property
+    def gain(self) -> float | None:
+        """Least-squares factor from prediction to measurement; None where nothing was predicted."""
+        square = float((self.mask * self.predicted**2).sum())
+        return float((self.mask * self.predicted * self.measured).sum()) / square if square > 0 else None
+
+
+def residual_of(batch: Batch, prediction: Tensor) -> CaptureResidual:
+    """The residual of a batch of one capture, from its predicted counts [1, h, w]."""
+    tensors = (batch.signal, prediction, batch.noise, batch.mask)
+    return CaptureResidual(*(t[0].double().numpy() for t in tensors))
 
 
 class FieldSums:

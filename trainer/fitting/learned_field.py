@@ -51,14 +51,17 @@ class PanelFieldFit:
         With the field.
     before, after : PredictionErrors
         Without and with the field.
+    is_held_out : bool
+        False where there is only one pattern, so that what is judged is what was fitted.
     """
 
     model: Model
     before: PredictionErrors
     after: PredictionErrors
+    is_held_out: bool = True
 
     def as_json(self) -> dict[str, Any]:
-        """Keys `before` and `after` (errors), and `maps`: `lowest` and `highest` of each over the panel's pixels."""
+        """Keys `before` and `after` (errors), `held_out`, and `maps`: `lowest` and `highest` of each over the panel."""
         assert self.model.panel_field is not None
         maps = {
             f"{name}_{unit}" if unit != "1" else name: {
@@ -67,7 +70,12 @@ class PanelFieldFit:
             }
             for name, unit in UNITS.items()
         }
-        return {"before": self.before.as_json(), "after": self.after.as_json(), "maps": maps}
+        return {
+            "before": self.before.as_json(),
+            "after": self.after.as_json(),
+            "maps": maps,
+            "held_out": self.is_held_out,
+        }
 
 
 def learn_field(captures: CaptureSet, model: Model, progress: Progress | None = None) -> PanelFieldFit:
@@ -90,7 +98,7 @@ def learn_field(captures: CaptureSet, model: Model, progress: Progress | None = 
     before = evaluate_captures(captures, divided.held_out, model)
     learned = with_learned_field(captures, divided.fitted, model, progress)
     after = evaluate_captures(captures, divided.held_out, learned)
-    return PanelFieldFit(recorded(learned, NAME, after), before, after)
+    return PanelFieldFit(recorded(learned, NAME, after), before, after, divided.is_held_out)
 
 
 def with_learned_field(

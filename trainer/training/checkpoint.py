@@ -55,17 +55,17 @@ def refuse_other_run(folder: Path, settings: dict[str, Any]) -> None:
     InputError
         As `read_checkpoint`.
     """
-    state = _read(folder, torch.device("cpu"))
+    state = _read(folder, torch.device("cpu"), mapped=True)  # the weights stay on the disk
     if state is not None:
         _refuse_other(folder, state["settings"], settings, list(settings))
 
 
-def _read(folder: Path, device: torch.device) -> dict[str, Any] | None:
+def _read(folder: Path, device: torch.device, mapped: bool = False) -> dict[str, Any] | None:
     path = folder / CHECKPOINT
     if not path.is_file():
         return None
     try:
-        state: dict[str, Any] = torch.load(path, map_location=device, weights_only=True)
+        state: dict[str, Any] = torch.load(path, map_location=device, weights_only=True, mmap=mapped)
         _ = state["settings"].items()
     except Exception as error:
         reason = str(error).splitlines()[0][:80] if str(error) else type(error).__name__

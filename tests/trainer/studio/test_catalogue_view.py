@@ -5,11 +5,11 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.trainer.studio.chromium import CHROMIUM, FLAGS, MISSING
 from trainer.effects import catalogue
 
 pn = pytest.importorskip("panel", reason="panel is not installed: pip install hololoop[studio]")
@@ -18,16 +18,6 @@ from trainer.studio.catalogue_view import catalogue_view, effect_words  # noqa: 
 from trainer.studio.formula_svg import formula_svg  # noqa: E402
 
 KNOWN = {name: one for name, one in catalogue().items() if one.source == "built in"}
-CHROMIUM = Path("/usr/bin/chromium")
-OPTIONS = [
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
 SOURCE = "[...Bokeh.documents[0]._all_models.values()].find(m => m.type == 'ColumnDataSource' && 'ideal' in m.data)"
 LARGEST = f"() => Math.max(...Array.from({SOURCE}.data.difference[0], Math.abs))"
 
@@ -56,8 +46,8 @@ def test_each_effect_can_be_chosen() -> None:
 @pytest.fixture(scope="module")
 def page() -> Iterator[Any]:
     api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    if not CHROMIUM.exists():
-        pytest.skip(f"no browser at {CHROMIUM}: apt install chromium")
+    if CHROMIUM is None:
+        pytest.skip(MISSING)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -67,7 +57,7 @@ def page() -> Iterator[Any]:
     )  # fmt: skip
     try:
         with api.sync_playwright() as playwright:
-            browser = playwright.chromium.launch(executable_path=str(CHROMIUM), args=OPTIONS)
+            browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
             opened = browser.new_page(viewport={"width": 1280, "height": 800})
             requests: list[str] = []
             opened.on("request", lambda request: requests.append(request.url))

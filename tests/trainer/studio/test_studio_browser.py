@@ -19,6 +19,7 @@ from urllib.request import HTTPCookieProcessor, Request, build_opener
 import pytest
 
 from firmware_iface.virtual import BenchDescription, VirtualHeadset, make_defect
+from tests.trainer.studio.chromium import CHROMIUM, FLAGS, MISSING
 from trainer.captures.acquire import acquire_captures
 from trainer.captures.open_bench import nominal_bench
 
@@ -26,16 +27,6 @@ pytest.importorskip("panel", reason="the studio needs the extra 'studio'")
 playwright = pytest.importorskip("playwright.sync_api", reason="browser tests need playwright (extra 'dev')")
 
 ROOT = Path(__file__).resolve().parent.parent.parent.parent
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-FLAGS = [
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
 TOKEN = "for-this-test-alone"
 SLOW_MS = 90_000
 FOCUSED = """() => {
@@ -45,9 +36,7 @@ FOCUSED = """() => {
 }"""
 
 playwright.expect.set_options(timeout=SLOW_MS)
-pytestmark = pytest.mark.skipif(
-    CHROMIUM is None, reason="no Chromium is installed (Debian: apt install chromium)"
-)
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
 
 
 class Studio:
