@@ -68,7 +68,7 @@ def serve(
         Where the port is in use, the token cannot stand in an address, or the captures are not a folder.
     """
     token = _checked_token(token)
-    port = _free_port(port)
+    asked, port = port, _free_port(port)
     prepare()
     project = Project(Path.cwd(), effects)
     try:
@@ -76,7 +76,12 @@ def serve(
             project.open_set(captures, model)
         elif model is not None:
             raise InputError(f"--model {model} needs the captures that it explains: give their folder first")
-        server = make_server(project, port, token)
+        server = None
+        while server is None:
+            try:
+                server = make_server(project, port, token)
+            except OSError:  # another program took it in the meantime
+                port = _free_port(asked)
         address = f"http://{ADDRESS}:{port}/?token={token}"
         server.start()
         if ready is not None:
