@@ -7,7 +7,7 @@
      "arrays": {field of LightPath: name of an array}}
 
 Fields that are None in a LightPath are not listed; `crosstalk` is two arrays, crosstalk_rows and
-crosstalk_columns. Arrays that several planes or colours share are stored once.
+crosstalk_columns, and `modulation` three: modulation_ends, modulation_factors and modulation_shares. Arrays that several planes or colours share are stored once.
 """
 
 from __future__ import annotations
@@ -25,11 +25,14 @@ from runtime.lightpath.light_path import LightPath
 
 COMPLEX, REAL = np.dtype(np.complex64), np.dtype(np.float32)
 NEEDED = ("response", "source", "transfers", "weights", "aperture")
-OPTIONAL = ("gain", "leak", "crosstalk_rows", "crosstalk_columns", "irradiance_filter")
+CROSSTALK = ("crosstalk_rows", "crosstalk_columns")
+MODULATION = ("modulation_ends", "modulation_factors", "modulation_shares")
+OPTIONAL = ("gain", "leak", *CROSSTALK, *MODULATION, "irradiance_filter")
 TYPES = {
     "source": COMPLEX,
     "leak": COMPLEX,
     "transfers": COMPLEX,
+    "modulation_factors": COMPLEX,
 }  # the filter is either; all others are real
 LARGEST = 1 << 15  # samples an axis
 
@@ -96,7 +99,9 @@ def _fields(path: LightPath) -> dict[str, np.ndarray]:
         "irradiance_filter": path.irradiance_filter,
     }
     if path.crosstalk is not None:
-        fields["crosstalk_rows"], fields["crosstalk_columns"] = path.crosstalk
+        fields.update(zip(CROSSTALK, path.crosstalk, strict=True))
+    if path.modulation is not None:
+        fields.update(zip(MODULATION, path.modulation, strict=True))
     return {name: array for name, array in fields.items() if array is not None}
 
 
@@ -156,7 +161,8 @@ def load_light_path(bundle: Bundle, channel: str | None = None, plane_mm: float 
             raise InputError(f"{MANIFEST}: {where} has an array '{field}' that this release does not know")
     arrays = {field: _array(bundle, names.get(field), field, where) for field in NEEDED + OPTIONAL}
     _check_shapes(arrays, grid, where)
-    rows, columns = arrays["crosstalk_rows"], arrays["crosstalk_columns"]
+    rows, columns = (arrays[name] for name in CROSSTALK)
+    ends, factors, shares = (arrays[name] for name in MODULATION)
     return LightPath(
         grid=grid,
         response=arrays["response"],
@@ -168,6 +174,7 @@ def load_light_path(bundle: Bundle, channel: str | None = None, plane_mm: float 
         leak=arrays["leak"],
         aperture=(arrays["aperture"][0], arrays["aperture"][1]),  # type: ignore[index]
         irradiance_filter=arrays["irradiance_filter"],
+        modulation=None if ends is None or factors is None or shares is None else (ends, factors, shares),
     )
 
 
@@ -267,3 +274,19 @@ def _check_shapes(arrays: Mapping[str, np.ndarray | None], grid: Grid, where: st
             raise InputError(f"{ARRAYS}: {field} of {where} is not a table [sub-pixels, odd number of taps]")
     if (arrays["crosstalk_rows"] is None) != (arrays["crosstalk_columns"] is None):
         raise InputError(f"{MANIFEST}: {where} has crosstalk along one axis only: export the bundle again")
+    ends, factors, shares = (arrays[name] for name in MODULATION)
+    if ends is None and factors is None and shares is None:
+        return
+    if ends is None or factors is None or shares is None:
+        raise InputError(f"{MANIFEST}: {where} has only parts of a modulation: export the bundle again")
+    if (
+        ends.shape != (2,)
+        or not ends[0] < ends[1]
+        or factors.ndim != 2
+        or factors.shape[1] < 2
+        or shares.shape != factors.shape[:1]
+    ):
+        raise InputError(
+            f"{ARRAYS}: the modulation of {where} is not two phases, a table [states, phases] and a share a state: "
+            "export the bundle again"
+        )

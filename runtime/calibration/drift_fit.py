@@ -28,6 +28,7 @@ from runtime.lightpath.light_path import (
     panel_phase,
     panel_spectrum,
 )
+from runtime.lightpath.modulation import states
 from runtime.program.progress import Progress, no_progress, part_of
 
 SETTLED = 0.3  # a step that lowers chi squared by less, per parameter, is the last
@@ -198,16 +199,18 @@ def _columns(
     """Derivatives of a prediction, [h, w], with the place of each in the vector."""
     path = drifted(base.path, shot.channel, base.wavelength_nm, estimate.drift)
     phase = panel_phase(path, shot.gray.astype(np.int64))
-    spectrum = panel_spectrum(path, phase)
-    modes = range(path.transfers.shape[0])
-    fields = [image_field(path, spectrum, m) for m in modes]
+    exposure = list(states(path))  # the panel's states, whose irradiances add
+    spectra = [panel_spectrum(state, phase) for state in exposure]
+    parts = [(k, m) for k in range(len(exposure)) for m in range(path.transfers.shape[0])]
+    weights = [float(exposure[k].weights[m]) for k, m in parts]
+    fields = [image_field(path, spectra[k], m) for k, m in parts]
     even = estimate.view.evenness().astype(np.float32)
 
-    def change(moved: Callable[[int], np.ndarray]) -> np.ndarray:
-        """2 Re(z* dz) summed over modes, as the camera sees it; `moved` gives a mode's dz."""
+    def change(moved: Callable[[int, int], np.ndarray]) -> np.ndarray:
+        """2 Re(z* dz) summed over states and modes, as the camera sees it; `moved` gives the dz of both."""
         total = sum(
-            float(path.weights[m]) * 2 * (z.real * d.real + z.imag * d.imag)
-            for m, z, d in ((m, fields[m], moved(m)) for m in modes)
+            w * 2 * (z.real * d.real + z.imag * d.imag)
+            for w, z, d in ((w, z, moved(*part)) for w, z, part in zip(weights, fields, parts, strict=True))
         )
         light = sample(filter_irradiance(path, np.asarray(total)))
         return light * even + estimate.view.stray * light.mean()
@@ -216,8 +219,8 @@ def _columns(
         """For a relative change [H, W] of the field that leaves the panel."""
         factor = factor.astype(path.source.dtype)
         leak = None if path.leak is None else path.leak * factor
-        moved = panel_spectrum(replace(path, source=path.source * factor, leak=leak), phase)
-        return change(lambda m: image_field(path, moved, m))
+        moved = [panel_spectrum(replace(one, source=one.source * factor, leak=leak), phase) for one in exposure]
+        return change(lambda k, m: image_field(path, moved[k], m))
 
     shape, place = path.grid.shape, int(layout.edges[1])
     if layout.wavefront:
@@ -230,10 +233,11 @@ def _columns(
     place = int(layout.edges[2])
     turned = path.transfers * (1j * axial_phase(path, base.wavelength_nm)).astype(path.transfers.dtype)
     away = replace(path, transfers=turned)
-    yield place, change(lambda m: image_field(away, spectrum, m))
+    yield place, change(lambda k, m: image_field(away, spectra[k], m))
 
     image = filter_irradiance(
-        path, np.asarray(sum(float(path.weights[m]) * np.abs(fields[m]) ** 2 for m in modes), np.float32)
+        path,
+        np.asarray(sum(w * np.abs(z) ** 2 for w, z in zip(weights, fields, strict=True)), np.float32),
     )
     place = int(layout.edges[3])
     light = views[0][1][shot.channel](image)

@@ -5,7 +5,7 @@ in `light_path_adjoint`. The one other copy, in place and for the solver alone, 
 All that a bench does to the light is in the arrays of a `LightPath`, for one colour and one plane:
 
     phi = gain * response[gray]                     drive (and, finer than a pixel, `crosstalk`)
-    u   = source * exp(j phi) + leak                panel, convolved with the pixel's aperture
+    u   = source * m(phi) exp(j phi) + leak         panel, convolved with the pixel's aperture
     z_m = IFFT(FFT(u) * transfer_m)                 pupil, one transfer function a mode
     I   = filter * sum_m weight_m |z_m|^2           irradiance, on a grid twice as fine as the panel's
 
@@ -32,6 +32,7 @@ from runtime.lightpath.grid import (
     image_frequencies,
     image_window,
 )
+from runtime.lightpath.modulation import Modulation, factor_at, states
 from runtime.lightpath.periodic_axis import take
 
 Array = Any
@@ -60,6 +61,10 @@ class LightPath:
         Light that the pattern does not modulate.
     aperture : (float, float)
         Side of a pixel's active area as a share of the pitch (rows, columns); their product is the fill factor.
+    modulation : (float array [2], complex array [K, N], float array [K]) or None
+        Factor m on the field as it depends on the pixel's phase: the phases (rad, before `gain`) of the first and
+        last sample, the factor at N phases evenly between them in each of K states, and each state's share of the
+        exposure. The states' irradiances add.
     irradiance_filter : array or None
         A transfer function of irradiance over the `rfft2` frequencies of the fine grid, which acts on what the eye
         gets too.
@@ -79,6 +84,7 @@ class LightPath:
     aperture: tuple[Array, Array] | tuple[float, float] = (1.0, 1.0)
     irradiance_filter: Array | None = None
     far_field: tuple[Array, Array] | None = None
+    modulation: Modulation | None = None
 
 
 def panel_phase(path: LightPath, gray: Array) -> Array:
@@ -89,15 +95,27 @@ def panel_phase(path: LightPath, gray: Array) -> Array:
 
 
 def panel_field(path: LightPath, phase: Array) -> Array:
-    """Field [..., H, W] that leaves the panel's pixels at a phase (rad), before their aperture."""
+    """Field [..., H, W] that leaves the panel's pixels at a phase (rad), before their aperture, in its first state."""
     xp = array_namespace(phase)
     # Cosine and sine written apart cost a fraction of a complex exponential.
     field = path.source * (xp.cos(phase) + 1j * xp.sin(phase))
+    if path.modulation is not None:
+        field = field * factor_at(path.modulation, nominal_phase(path, phase))
     return field if path.leak is None else field + path.leak
 
 
+def nominal_phase(path: LightPath, phase: Array) -> Array:
+    """Phase (rad) that a pixel of nominal gain would have: what its modulation depends on."""
+    return phase if path.gain is None else phase / path.gain
+
+
 def panel_spectrum(path: LightPath, phase: Array) -> Array:
-    """Spectrum of the field that leaves the panel, over the band: [..., H, W] real to [..., n, m] complex."""
+    """Spectrum of the field that leaves the panel in its first state, over the band: [..., H, W] real to complex.
+
+    Returns
+    -------
+    complex array [..., n, m]
+    """
     if path.crosstalk is None:
         rows = _row_spectrum(path.grid, panel_field(path, phase))
         return aperture_spectrum(path, phase, (1, 1)) * _column_spectrum(path.grid, rows)
@@ -131,7 +149,10 @@ def image_field(path: LightPath, spectrum: Array, mode: int) -> Array:
 
 def irradiance(path: LightPath, phase: Array) -> Array:
     """Irradiance on the fine image grid for panel phase [..., H, W]: [..., *grid.image_shape]."""
-    return filter_irradiance(path, mode_irradiance(path, panel_spectrum(path, phase)))
+    image = 0
+    for state in states(path):
+        image = image + mode_irradiance(state, panel_spectrum(state, phase))
+    return filter_irradiance(path, image)
 
 
 def mode_irradiance(path: LightPath, spectrum: Array) -> Array:

@@ -19,12 +19,14 @@ from runtime.lightpath.light_path import (
     aperture_spectrum,
     filter_irradiance,
     image_field,
+    nominal_phase,
     panel_field,
     panel_spectrum,
     pixel_area_spectrum,
     sub_pixel_offset,
     sum_modes,
 )
+from runtime.lightpath.modulation import factor_at, slope_at, states
 from runtime.lightpath.periodic_axis import put
 
 Array = Any
@@ -56,19 +58,26 @@ def irradiance_and_pullback(
     ----------
     Chakravarthula et al. 2020, eq. 20-23.
     """
-    spectrum = panel_spectrum(path, phase)
-    fields = [image_field(path, spectrum, mode) for mode in range(path.transfers.shape[0])]
+    image, kept = 0, []
+    for state in states(path):
+        spectrum = panel_spectrum(state, phase)
+        fields = [image_field(state, spectrum, mode) for mode in range(path.transfers.shape[0])]
+        image = image + sum_modes(state, fields)
+        kept.append((state, fields))
 
     def pullback(gradient: Array) -> Array:
         xp = array_namespace(gradient)
         if path.irradiance_filter is not None:
             gradient = irfft2(rfft2(gradient) * xp.conj(path.irradiance_filter), path.grid.image_shape)
-        back = 0
-        for mode, z in enumerate(fields):
-            back = back + _image_field_adjoint(path, 2 * path.weights[mode] * gradient * z, mode)
-        return _panel_spectrum_adjoint(path, phase, back, factor)
+        total = 0
+        for state, fields in kept:
+            back = 0
+            for mode, z in enumerate(fields):
+                back = back + _image_field_adjoint(state, 2 * state.weights[mode] * gradient * z, mode)
+            total = total + _panel_spectrum_adjoint(state, phase, back, factor)
+        return total
 
-    return filter_irradiance(path, sum_modes(path, fields)), pullback
+    return filter_irradiance(path, image), pullback
 
 
 def pixel_irradiance_adjoint(path: LightPath, gradient: Array) -> Array:
@@ -103,6 +112,11 @@ def _panel_spectrum_adjoint(path: LightPath, phase: Array, spectrum: Array, fact
         if factor:
             return xp.conj(panel_field(path, driven)) * field_gradient
         turned = xp.conj(path.source) * field_gradient
+        if path.modulation is not None:
+            # The derivative of m(phi) exp(j phi) is (m' + j m) exp(j phi).
+            at = nominal_phase(path, driven)
+            slope = slope_at(path.modulation, at) / (1 if path.gain is None else path.gain)
+            turned = xp.conj(factor_at(path.modulation, at) - 1j * slope) * turned
         return xp.cos(driven) * xp.imag(turned) - xp.sin(driven) * xp.real(turned)
 
     if path.crosstalk is None:

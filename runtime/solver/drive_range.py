@@ -52,7 +52,7 @@ class DriveRange:
         # Where a whole turn is covered, phases beyond the ends come back inside; one step is no gap.
         gap = 2 * math.pi - np.min(self.high - self.low)
         self.gapless = bool(gap <= 1.5 * step)
-        self.bounded = path.crosstalk is not None or not self.gapless
+        self.bounded = path.crosstalk is not None or path.modulation is not None or not self.gapless
         self.table = None
         if self.gain is None and not self.bounded:
             turn = np.arange(TURN_STEPS, dtype=response.dtype) * (2 * math.pi / TURN_STEPS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,8 @@ class ImagePlane:
     Parameters
     ----------
     path : LightPath
+    weights : sequence of float
+        Of every mode in every state of the panel.
     fine : int
         Samples a panel pixel, an axis.
     margin : int
@@ -39,7 +42,14 @@ class ImagePlane:
     """
 
     def __init__(
-        self, path: LightPath, fine: int, margin: int, columns: Band, spectrum: Array, backend: Backend
+        self,
+        path: LightPath,
+        weights: Sequence[float],
+        fine: int,
+        margin: int,
+        columns: Band,
+        spectrum: Array,
+        backend: Backend,
     ) -> None:
         xp, grid = backend.xp, path.grid
         real, pair = path.response.dtype, path.source.dtype
@@ -47,10 +57,10 @@ class ImagePlane:
         padded = (fine * grid.padded[0], fine * grid.padded[1])
         height, width = (fine * n + 2 * margin for n in grid.shape)
         self.shape = (height, width)
-        self.weights = [float(w) for w in path.weights]
+        self.weights = [float(w) for w in weights]
         self.down, self.across = _window(margin, height, padded[0]), _window(margin, width, padded[1])
         self.dark = slice(width - margin, padded[1] - margin)  # of the period: what the window leaves out
-        self.fields = [xp.zeros((height, width), pair) for _ in path.weights]
+        self.fields = [xp.zeros((height, width), pair) for _ in weights]
         self.strip = min(backend.strip_rows(padded[1]), height)
         self.row = [xp.zeros((self.strip, padded[1]), pair) for _ in range(backend.threads)]
         self.part = [xp.empty((self.strip, width), real) for _ in range(backend.threads)]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from runtime.lightpath.light_path import LightPath
+from runtime.lightpath.light_path import LightPath, nominal_phase
+from runtime.lightpath.modulation import factor_at, slope_at, states
 from runtime.solver.array_backend import Backend
 from runtime.solver.in_place_crosstalk import Crosstalk
 from runtime.solver.iris_band import Band, Run
@@ -27,18 +29,22 @@ class Panel:
         What `forward` fills and `adjoint` uses up.
     runs : tuple of Run
         Where the band's rows are in it.
+    states : list of LightPath
+        The panel's states during an exposure; one where nothing modulates the light besides its phase.
     """
 
     def __init__(self, path: LightPath, rows: Band, columns: Band, backend: Backend) -> None:
         xp, grid = backend.xp, path.grid
         real, pair = path.response.dtype, path.source.dtype
         self.backend, self.rows, self.columns = backend, rows, columns
+        self.states, self.state = [_on(backend, state) for state in states(path)], 0
         self.shape = height, width = grid.shape
         self.source = None if np.all(path.source == 1) else xp.asarray(path.source)
         self.leak = None if path.leak is None else xp.asarray(path.leak)
         self.strip = min(backend.strip_rows(grid.padded[1]), height)
         room = (self.strip, grid.padded[1])
-        self.lit = xp.zeros((height, grid.padded[1]), pair)  # source exp(j phase); dark beyond the panel
+        # source m(phase) exp(j phase); dark beyond the panel
+        self.lit = xp.zeros((height, grid.padded[1]), pair)
         self.row = [xp.zeros(room, pair) for _ in range(backend.threads)]
         self.part = [xp.empty((self.strip, width), real) for _ in range(backend.threads)]
         self.crosstalk = None if path.crosstalk is None else Crosstalk(path, rows, columns, backend)
@@ -48,7 +54,7 @@ class Panel:
         if self.crosstalk:  # in the band's own order, whose frequencies are each there once
             self.runs = tuple(Run(run.band, run.band, run.image, False) for run in rows.runs)
 
-    def forward(self, phase: Array, columns: bool = True) -> None:
+    def forward(self, phase: Array, columns: bool = True, state: int = 0) -> None:
         """Fill `spectrum` from a phase.
 
         Parameters
@@ -56,8 +62,10 @@ class Panel:
         phase : float array [H, W], rad
         columns : bool
             Whether the columns are transformed too; a caller may do that itself.
+        state : int
+            Which of `states` the panel is in.
         """
-        mixing = self.crosstalk
+        mixing, self.state = self.crosstalk, state
         if mixing is None:
             self._rows_forward(phase, self.spectrum, None)
             if columns:
@@ -73,7 +81,7 @@ class Panel:
             for run in self.rows.runs:
                 self.spectrum[run.band] += mixing.columns[run.panel] * down[run.band]
 
-    def adjoint(self, phase: Array, gradient: Array, columns: bool = True) -> None:
+    def adjoint(self, phase: Array, gradient: Array, columns: bool = True, state: int = 0) -> None:
         """Fill the gradient of a loss over phase from its gradient over `spectrum`, which is used up.
 
         Parameters
@@ -82,14 +90,14 @@ class Panel:
             That of the last `forward`.
         gradient : float array [H, W]
             The result.
-        columns : bool
+        columns, state
             As in `forward`.
         """
-        mixing = self.crosstalk
+        mixing, self.state = self.crosstalk, state
         if mixing is None:
             if columns:
                 self.backend.columns_fft(self.spectrum, False)
-            self._rows_adjoint(self.spectrum, None, gradient)
+            self._rows_adjoint(self.spectrum, None, phase, gradient)
             return
         gradient[...] = 0
         for i, down in enumerate(mixing.down):
@@ -100,8 +108,9 @@ class Panel:
             self.backend.columns_fft(mixing.columns, False)
             mixing.back[...] = 0
             for j, across in enumerate(mixing.across):
-                self._light_all(mixing.mix_across(mixed, j))
-                self._rows_adjoint(mixing.columns, across, mixing.one)
+                driven = mixing.mix_across(mixed, j)
+                self._light_all(driven)
+                self._rows_adjoint(mixing.columns, across, driven, mixing.one)
                 mixing.unmix_across(mixing.one, j, mixing.back)
             mixing.unmix_down(mixing.back, i, gradient)
 
@@ -127,8 +136,11 @@ class Panel:
 
         self.backend.over_rows(self.shape[0], self.strip, work)
 
-    def _light(self, worker: int, rows: slice, phase: Array) -> None:
-        """source exp(j phase): cosine and sine apart cost a fraction of a complex exponential."""
+    def _light(self, worker: int, rows: slice, phase: Array, slope: bool = False) -> None:
+        """source m(phase) exp(j phase): cosine and sine apart cost a fraction of a complex exponential.
+
+        With `slope`, its derivative over phase, divided by j: source (m - j m') exp(j phase).
+        """
         xp = self.backend.xp
         lit, part = self.lit[rows, : self.shape[1]], self.part[worker][: rows.stop - rows.start]
         xp.cos(phase[rows], out=part)
@@ -137,6 +149,14 @@ class Panel:
         lit.imag[...] = part
         if self.source is not None:
             lit *= self.source[rows]
+        path = self.states[self.state]
+        if path.modulation is not None:
+            here = path if path.gain is None else replace(path, gain=path.gain[rows])
+            at = nominal_phase(here, phase[rows])
+            factor = factor_at(path.modulation, at)
+            if slope:
+                factor = factor - 1j * slope_at(path.modulation, at) / (1 if here.gain is None else here.gain)
+            lit *= factor
 
     def _rows_forward(self, phase: Array, spectrum: Array, turned: Array | None) -> None:
         """Write the rows' spectra over the band's columns, or add them times `turned` [columns]."""
@@ -175,14 +195,25 @@ class Panel:
         self.backend.rows_fft(row, row, False)
         return row[:, : self.shape[1]]
 
-    def _rows_adjoint(self, spectrum: Array, turned: Array | None, gradient: Array) -> None:
+    def _rows_adjoint(self, spectrum: Array, turned: Array | None, phase: Array, gradient: Array) -> None:
         """Re(-j exp(-j phase) ...) with the illuminating field (Chakravarthula et al. 2020, eq. 22-23)."""
-        xp = self.backend.xp
+        xp, modulated = self.backend.xp, self.states[self.state].modulation is not None
 
         def work(worker: int, rows: slice) -> None:
             row = self._row_back(worker, rows, spectrum, turned)
             xp.conjugate(row, out=row)
+            if modulated:
+                self._light(worker, rows, phase, slope=True)
             row *= self.lit[rows, : self.shape[1]]
             xp.negative(row.imag, out=gradient[rows])
 
         self.backend.over_rows(self.shape[0], self.strip, work)
+
+
+def _on(backend: Backend, path: LightPath) -> LightPath:
+    """A state's path with what its modulation needs in the backend's memory."""
+    if path.modulation is None:
+        return path
+    ends, factors, shares = (backend.xp.asarray(a) for a in path.modulation)
+    gain = None if path.gain is None else backend.xp.asarray(path.gain)
+    return replace(path, modulation=(ends, factors, shares), gain=gain)

@@ -78,8 +78,10 @@ class Optics:
             self.spectrum = xp.zeros((fine * grid.padded[0], len(self.columns.frequencies)), pair)
         margin = fine * grid.margin if integrate else 0
         self.at_pixels = tuple(slice(margin, margin + fine * n, fine) for n in grid.shape)
-        self.image_plane = ImagePlane(path, fine, margin, self.columns, self.spectrum, backend)
+        weights = [w for state in self.panel.states for w in state.weights]
+        self.image_plane = ImagePlane(path, weights, fine, margin, self.columns, self.spectrum, backend)
         self.strip = self.image_plane.strip
+        self.one = xp.zeros(grid.shape if len(self.panel.states) > 1 else (0, 0), real)
         self.image = None
         if integrate:
             transfer = xp.asarray(pixel_filter(path, fine).astype(pair))
@@ -90,14 +92,15 @@ class Optics:
     def forward(self, phase: Array, light: Array) -> None:
         """Fill `light` [H, W] from phase (rad) [H, W]; the fields are kept for `adjoint`."""
         image = light if self.image is None else self.image
-        self.panel.forward(phase, columns=not self.in_place)
-        for mode in range(len(self.transfers)):
-            if self.in_place:
-                self._through_columns(self.transfers[mode])
-            else:
-                self._through_pupil(mode)
-                self.backend.columns_fft(self.spectrum, False)
-            self.image_plane.forward(mode, image)
+        for state in range(len(self.panel.states)):
+            self.panel.forward(phase, not self.in_place, state)
+            for mode in range(len(self.transfers)):
+                if self.in_place:
+                    self._through_columns(self.transfers[mode])
+                else:
+                    self._through_pupil(mode)
+                    self.backend.columns_fft(self.spectrum, False)
+                self.image_plane.forward(state * len(self.transfers) + mode, image)
         if self.image is not None:
             self.backend.filter(image, self.filter, self.half_spectrum)
             light[...] = image[self.at_pixels]
@@ -120,12 +123,20 @@ class Optics:
         ----------
         Chakravarthula et al. 2020, eq. 20-23.
         """
-        self._back(slope)
-        self.panel.adjoint(phase, gradient, columns=not self.in_place)
+        image = self._slope_over_image(slope)
+        for state in range(len(self.panel.states)):
+            self._back(image, state)
+            onto = gradient if state == 0 else self.one
+            self.panel.adjoint(phase, onto, not self.in_place, state)
+            if state > 0:
+                gradient += onto
 
     def adjoint_wave(self, slope: Array, wave: Array) -> None:
-        """Fill `wave` [H, W] with the field that reaches the panel: that of `adjoint` before it becomes phase."""
-        self._back(slope)
+        """Fill `wave` [H, W] with the field that reaches the panel: that of `adjoint` before it becomes phase.
+
+        Where the panel has several states, that of the first.
+        """
+        self._back(self._slope_over_image(slope), 0)
         self.panel.field_from_spectrum(wave, columns=not self.in_place)
 
     def wave_at_panel(self, wave: Array) -> None:
@@ -141,16 +152,19 @@ class Optics:
         self._back_through_pupil(mode, again=False)
         self.panel.field_from_spectrum(wave, columns=not self.in_place)
 
-    def _back(self, slope: Array) -> None:
-        """Fill the panel's spectrum with 2 slope z of every mode, back through the pupil."""
-        image = slope
-        if self.image is not None:
-            image = self.image
-            image[...] = 0
-            image[self.at_pixels] = slope
-            self.backend.filter(image, self.filter_back, self.half_spectrum)
+    def _slope_over_image(self, slope: Array) -> Array:
+        """A gradient over light [H, W] as one over the image's own samples."""
+        if self.image is None:
+            return slope
+        self.image[...] = 0
+        self.image[self.at_pixels] = slope
+        self.backend.filter(self.image, self.filter_back, self.half_spectrum)
+        return self.image
+
+    def _back(self, image: Array, state: int) -> None:
+        """Fill the panel's spectrum with 2 slope z of every mode of a state, back through the pupil."""
         for mode in range(len(self.transfers)):
-            self.image_plane.adjoint(mode, image)
+            self.image_plane.adjoint(state * len(self.transfers) + mode, image)
             self._back_through_pupil(mode, again=mode > 0)
 
     def _through_columns(self, transfer: Array) -> None:

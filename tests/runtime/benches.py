@@ -21,6 +21,7 @@ ARRAYS = (
     "leak",
     "aperture",
     "irradiance_filter",
+    "modulation",
 )
 
 
@@ -38,7 +39,7 @@ def ideal_path(
 def random_path(
     shape: tuple[int, int] = (24, 30), half_width: float = 0.8, dtype: type = np.float64, **without: None
 ) -> LightPath:
-    """Gain, crosstalk, leak, three modes and an irradiance filter at once, without those that `without` names."""
+    """All that a path may have at once, with three modes and two states, without what `without` names."""
     rng = np.random.default_rng(3)
     path = ideal_path(shape, 0.005, half_width)
     grid = path.grid
@@ -56,8 +57,16 @@ def random_path(
         crosstalk=(_taps(rng, 3, 5), _taps(rng, 2, 3)),
         aperture=(0.9, 0.8),
         irradiance_filter=np.fft.rfft2(rng.normal(size=grid.image_shape) / grid.image_shape[0]),
+        modulation=_modulation(),
     )
     return converted(replace(full, **without), dtype)
+
+
+def _modulation() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Two smooth states over phases that the tests' own reach: absorption, and a swing of the phase."""
+    at = np.linspace(-40, 40, 4001)
+    factors = np.stack([1 - 0.3 * np.sin(at / 3) ** 2, (0.8 + 0.1 * np.cos(at)) * np.exp(0.1j * at)])
+    return np.array([-40.0, 40.0]), factors.astype(complex), np.array([0.7, 0.3])
 
 
 def _taps(rng: np.random.Generator, sub: int, taps: int) -> np.ndarray:

@@ -94,7 +94,7 @@ def noisy(rng: np.random.Generator, prediction: np.ndarray) -> Batch:
     kinds = [torch.as_tensor(a, dtype=torch.float32) for a in (signal, np.ones_like(signal), variance)]
     gray = torch.zeros((len(prediction), 1, 1), dtype=torch.int32)
     return Batch(
-        "green", 10.0, tuple(map(str, range(len(prediction)))), gray, *kinds, torch.ones(len(prediction))
+        "green", 10.0, tuple(map(str, range(len(prediction)))), gray, *kinds, torch.ones(len(prediction)), lambda: gray[:, None]
     )
 
 

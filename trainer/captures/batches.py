@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from trainer.captures.held_out import scenes
 
 # Panel pixels beyond the panel's border that are compared. The splines' reach beyond them is computed too.
 PAST_BORDER = MARGIN - 8
+EARLIER = 2  # patterns before a capture's own that a slow panel may still show
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,9 @@ class Batch:
     noise : Tensor [B, h, w], counts^2
         Expected variance of the camera's noise.
     exposure : Tensor [B], ms
+    shown_before : callable
+        Gives the patterns shown before each capture, the last one first: int Tensor [B, EARLIER, H, W]. They are read
+        when first asked for.
     """
 
     channel: str
@@ -50,6 +54,7 @@ class Batch:
     mask: Tensor
     noise: Tensor
     exposure: Tensor
+    shown_before: Callable[[], Tensor]
 
     def errors(self, prediction: Tensor) -> PredictionErrors:
         """Errors of predicted counts above black, Tensor [B, h, w]."""
@@ -124,4 +129,15 @@ def load_batch(captures: CaptureSet, chosen: list[Capture], dtype: torch.dtype =
         torch.as_tensor(np.stack(weights), dtype=dtype),
         torch.as_tensor(captures.noise_variance(signal), dtype=dtype),
         torch.tensor([c.exposure_ms for c in chosen], dtype=dtype),
+        cache(lambda: _shown_before(captures, chosen)),
     )
+
+
+def _shown_before(captures: CaptureSet, chosen: list[Capture]) -> Tensor:
+    """Patterns before each capture, in the order in which they were taken; the first one's own before it."""
+    order = {c.capture: k for k, c in enumerate(captures.captures)}
+    earlier = []
+    for c in chosen:
+        places = [max(order[c.capture] - back, 0) for back in range(1, EARLIER + 1)]
+        earlier.append(np.stack([captures.gray(captures.captures[k]).astype(np.int32) for k in places]))
+    return torch.as_tensor(np.stack(earlier))

@@ -19,6 +19,7 @@ from torch import Tensor
 from runtime.excess import PredictionErrors, RemovedExcess, joined, removed_excess
 from runtime.lightpath.legendre import legendre_count, legendre_curve, legendre_surface
 from runtime.lightpath.light_path import mode_irradiance, panel_phase, panel_spectrum
+from runtime.lightpath.modulation import states
 from trainer.captures.batches import Batch, load, load_batch
 from trainer.captures.capture_set import chosen, opened
 from trainer.captures.capture_table import Capture
@@ -167,7 +168,8 @@ def _spread_in_time(scene: Scene, stages: Stages, gray: Tensor, tensors: Tensors
     path = light_path(scene, stages)
     phase = panel_phase(path, gray)
     swings = [phase * (1 + s * tensors["spread"]) for s in (-1, 1)]
-    return 0.5 * sum(mode_irradiance(path, panel_spectrum(path, swing)) for swing in swings)
+    parts = [(state, swing) for state in states(path) for swing in swings]
+    return 0.5 * sum(mode_irradiance(state, panel_spectrum(state, swing)) for state, swing in parts)
 
 
 def _panel(model: Model, batch: Batch) -> FreeFormStage:

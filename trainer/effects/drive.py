@@ -10,7 +10,7 @@ from torch import Tensor
 
 from runtime.lightpath.legendre import legendre_count, legendre_curve, legendre_surface
 from trainer.effects.definition import Parameter, effect
-from trainer.effects.term_names import curve_terms, surface_terms
+from trainer.effects.term_names import curve_terms, driver_terms, surface_terms
 from trainer.prediction.stages import Drive
 
 SUB_PIXELS = 4  # of a pixel along each axis; 3 leave an excess of 9e-4, 5 gain nothing visible to a camera
@@ -157,6 +157,88 @@ def crosstalk(
     arXiv:2408.07672.
     """
     return replace(drive, crosstalk=(_taps(width_y, asymmetry_y), _taps(width_x, asymmetry_x)))
+
+
+@effect(
+    stage="drive",
+    acts_on="display",
+    parameters=[
+        Parameter(
+            "columns_offset",
+            "rad",
+            scale=0.02,
+            low=-2,
+            high=2,
+            count=5,
+            about="phase that repeats every 2, 3 and 4 columns",
+            typical=(-0.3, 0.3),
+            example=(0.2,),
+            terms=driver_terms,
+        ),
+        Parameter(
+            "rows_offset",
+            "rad",
+            scale=0.02,
+            low=-2,
+            high=2,
+            count=5,
+            about="phase that repeats every 2, 3 and 4 rows",
+            typical=(-0.3, 0.3),
+            terms=driver_terms,
+        ),
+        Parameter(
+            "columns_gain",
+            "1",
+            scale=0.01,
+            low=-0.5,
+            high=0.5,
+            count=5,
+            about="relative gain of the phase that repeats every 2, 3 and 4 columns",
+            typical=(-0.1, 0.1),
+            terms=driver_terms,
+        ),
+        Parameter(
+            "rows_gain",
+            "1",
+            scale=0.01,
+            low=-0.5,
+            high=0.5,
+            count=5,
+            about="relative gain of the phase that repeats every 2, 3 and 4 rows",
+            typical=(-0.1, 0.1),
+            terms=driver_terms,
+        ),
+    ],
+    formula=(
+        r"\varphi' = (1 + a_x + a_y)\,\varphi + o_x + o_y, \qquad o_x = \sum_{p=2}^{4}\,c_p \cos\tfrac{2\pi x}{p}"
+        r" + s_p \sin\tfrac{2\pi x}{p}"
+    ),
+)
+def drivers(
+    drive: Drive, columns_offset: Tensor, rows_offset: Tensor, columns_gain: Tensor, rows_gain: Tensor
+) -> Drive:
+    """Offset and gain of the drive repeat every few columns or rows.
+
+    Neighbouring columns of a panel are driven by different amplifiers, and rows by different phases of a clock. Their
+    small differences repeat every two, three or four lines and throw light into faint copies beside the picture.
+
+    References
+    ----------
+    Armitage, Underwood and Wu 2006, Introduction to Microdisplays.
+    """
+    rows, columns = (_repeating(n, drive.level.dtype) for n in drive.y.shape)
+    offset = (rows_offset @ rows)[:, None] + (columns_offset @ columns)[None, :]
+    gain = (rows_gain @ rows)[:, None] + (columns_gain @ columns)[None, :]
+    return drive.advanced(offset).scaled(1 + gain)
+
+
+def _repeating(lines: int, dtype: torch.dtype) -> Tensor:
+    """Waves that repeat every 2, 3 and 4 lines: [5, lines]."""
+    line = torch.arange(lines, dtype=dtype)
+    angles = {period: 2 * math.pi / period * line for period in (2, 3, 4)}
+    return torch.stack(
+        [torch.cos(angles[2])] + [wave(angles[p]) for p in (3, 4) for wave in (torch.cos, torch.sin)]
+    )
 
 
 def _taps(width: Tensor, asymmetry: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import ModuleType
 
 from firmware_iface.errors import InputError
-from trainer.effects import drive, panel, pupil, sensor
+from trainer.effects import drive, modulation, panel, pupil, sensor
 from trainer.effects.definition import Effect
 from trainer.effects.own_effect import line_in_file
 
@@ -23,6 +23,11 @@ BUILT_IN: tuple[Effect, ...] = (
     drive.phase_response,
     drive.phase_nonuniformity,
     drive.crosstalk,
+    drive.drivers,
+    modulation.amplitude_modulation,
+    modulation.polarisation_leak,
+    modulation.slow_response,
+    modulation.phase_ripple,
     panel.zero_order,
     panel.illumination,
     panel.panel_wavefront,

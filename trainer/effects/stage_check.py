@@ -126,6 +126,10 @@ def _drive(drive: Drive) -> dict[str, _Wanted]:
         "response": _Wanted(levels, f"[{levels[0]}], one phase for each gray level", exact=True),
         "gain": _Wanted(surface, f"[H, W] = {list(surface)}"),
         "crosstalk": _Wanted(None, "[sub-pixels, taps]", count=2),
+        "offset": _Wanted(surface, f"[H, W] = {list(surface)}"),
+        "factors": _Wanted(None, "[K, levels]", complex=True),
+        "shares": _Wanted(None, "[K]"),
+        "persistence": _Wanted((1,), "of one number"),
     }
 
 

@@ -26,6 +26,16 @@ def curve_terms(order: int) -> tuple[str, ...]:
     return tuple(_legendre(n) for n in range(order))
 
 
+def bent_curve_terms(order: int) -> tuple[str, ...]:
+    """Names of the numbers of a Legendre curve without its mean."""
+    return tuple(_legendre(n + 1) for n in range(order))
+
+
+def driver_terms(order: int) -> tuple[str, ...]:
+    """Names of the numbers of a step that repeats every 2, 3 and 4 lines."""
+    return "every 2", "every 3, cosine", "every 3, sine", "every 4, cosine", "every 4, sine"
+
+
 def surface_terms(order: int) -> tuple[str, ...]:
     """Names of the numbers of a Legendre surface without its mean."""
     return tuple(_product(i, j) for i, j in legendre_products(order))

@@ -82,7 +82,8 @@ class FreeFormBatch:
         stages = free.apply(self.stages, tensors)
         before = Trace(self.base.spectrum[k : k + 1], self.base.image[k : k + 1])
         if free.irradiance is None:
-            image = trace(scene, stages, gray, free.stage, before).image
+            earlier = self.predictor.earlier(stages, k)
+            image = trace(scene, stages, gray, free.stage, before, earlier).image
         else:
             image = free.irradiance(scene, stages, gray, tensors)
         light = light_on_camera(scene, stages, image)

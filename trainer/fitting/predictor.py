@@ -44,8 +44,13 @@ class Predictor:
         parts = []
         for k in range(self.batch.gray.shape[0]):
             one = None if before is None else Trace(before.spectrum[k : k + 1], before.image[k : k + 1])
-            parts.append(trace(self.scene, stages, self.batch.gray[k : k + 1], start, one))
+            gray, earlier = self.batch.gray[k : k + 1], self.earlier(stages, k)
+            parts.append(trace(self.scene, stages, gray, start, one, earlier))
         return Trace(torch.cat([p.spectrum for p in parts]), torch.cat([p.image for p in parts]))
+
+    def earlier(self, stages: Stages, k: int) -> Tensor | None:
+        """Patterns shown before capture k [1, n, H, W], where the panel still shows something of them."""
+        return None if stages.drive.persistence is None else self.batch.shown_before()[k : k + 1]
 
     def light(self, model: Model, point: Trace) -> Tensor:
         """Irradiance on the camera [B, h, w]."""

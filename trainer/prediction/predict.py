@@ -25,24 +25,29 @@ from runtime.camera.sampling import (
 from runtime.lightpath.fft import rfft2
 from runtime.lightpath.grid import FINE
 from runtime.lightpath.light_path import LightPath, mode_irradiance, panel_phase, panel_spectrum
+from runtime.lightpath.modulation import Modulation, states
 from runtime.lightpath.propagation import (
     band_limit,
     far_field_matrix,
     transfer_function,
 )
 from trainer.prediction.scene import Scene, Stages, bare_stages
-from trainer.prediction.stages import Pupil, Sensor
+from trainer.prediction.stages import Drive, Pupil, Sensor
 
+MODULATION_SAMPLES = 512  # over phase: a linear step between them errs by 1e-5
 FINER = 2  # times as many samples for the splines: exact up to half of the band that they hold
 
 
 def light_path(scene: Scene, stages: Stages) -> LightPath:
     """Drive, panel and pupil as arrays, ready for `runtime.lightpath.light_path`."""
     transfers, weights = pupil_modes(scene, stages.pupil)
+    source, offset = stages.panel.source, stages.drive.offset
+    if offset is not None:
+        source = source * torch.polar(torch.ones_like(offset), offset)
     return LightPath(
         grid=scene.grid,
         response=stages.drive.response,
-        source=stages.panel.source,
+        source=source,
         transfers=transfers,
         weights=weights,
         gain=stages.drive.gain,
@@ -51,7 +56,43 @@ def light_path(scene: Scene, stages: Stages) -> LightPath:
         aperture=(stages.panel.aperture[0], stages.panel.aperture[1]),
         irradiance_filter=display_filter(stages),
         far_field=_far_field(scene, stages.pupil) if scene.method == "fraunhofer" else None,
+        modulation=_modulation(stages.drive),
     )
+
+
+def _modulation(drive: Drive) -> Modulation | None:
+    """Factors over gray level as factors over the phase that the level is driven to."""
+    if drive.factors is None or drive.shares is None:
+        return None
+    phases, order = torch.sort(drive.response.detach())
+    factors = drive.factors[:, order]
+    factors = factors if factors.is_complex() else torch.complex(factors, torch.zeros_like(factors))
+    share = torch.linspace(0, 1, MODULATION_SAMPLES, dtype=phases.dtype)
+    at = phases[0] + share * (phases[-1] - phases[0])
+    above = torch.clamp(torch.searchsorted(phases, at), 1, len(phases) - 1)
+    gap = torch.clamp(phases[above] - phases[above - 1], min=1e-9)
+    way = torch.clamp((at - phases[above - 1]) / gap, 0, 1)
+    table = factors[:, above - 1] + way * (factors[:, above] - factors[:, above - 1])
+    return phases[[0, -1]], table, drive.shares
+
+
+def driven_phase(path: LightPath, stages: Stages, gray: Tensor, earlier: Tensor | None) -> Tensor:
+    """Phase (rad) of each pixel while a pattern is shown, with what is left of the patterns before it.
+
+    Parameters
+    ----------
+    gray : int Tensor [B, H, W]
+    earlier : int Tensor [B, n, H, W] or None
+        Patterns shown before each, the last one first; None where nothing is known of them.
+    """
+    phase = panel_phase(path, gray)
+    left = stages.drive.persistence
+    if left is None or earlier is None:
+        return phase
+    before = panel_phase(path, earlier[:, -1])
+    for k in reversed(range(earlier.shape[1] - 1)):
+        before = panel_phase(path, earlier[:, k]) * (1 - left) + before * left
+    return phase * (1 - left) + before * left
 
 
 def _far_field(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
@@ -175,8 +216,8 @@ class Trace:
 
     Attributes
     ----------
-    spectrum : complex Tensor
-        The panel's.
+    spectrum : complex Tensor [B, K, n, m]
+        The panel's, in each of its states.
     image : Tensor
         Irradiance before filters.
     """
@@ -186,7 +227,12 @@ class Trace:
 
 
 def trace(
-    scene: Scene, stages: Stages, gray: Tensor, start: str = "drive", before: Trace | None = None
+    scene: Scene,
+    stages: Stages,
+    gray: Tensor,
+    start: str = "drive",
+    before: Trace | None = None,
+    earlier: Tensor | None = None,
 ) -> Trace:
     """Spectrum and irradiance of patterns.
 
@@ -200,6 +246,8 @@ def trace(
         The first stage that has changed since `before`.
     before : Trace, optional
         What earlier stages gave.
+    earlier : int Tensor [B, n, H, W], optional
+        Patterns shown before, as in `driven_phase`.
 
     Returns
     -------
@@ -208,11 +256,15 @@ def trace(
     if before is not None and start == "sensor":
         return before
     path = light_path(scene, stages)
+    exposure = list(states(path))
     if before is not None and start == "pupil":
         spectrum = before.spectrum
     else:
-        spectrum = panel_spectrum(path, panel_phase(path, gray))
-    return Trace(spectrum, mode_irradiance(path, spectrum))
+        phase = driven_phase(path, stages, gray, earlier)
+        spectra = [panel_spectrum(state, phase) for state in exposure]
+        spectrum = spectra[0][:, None] if len(spectra) == 1 else torch.stack(spectra, 1)
+    parts = [mode_irradiance(state, spectrum[:, k]) for k, state in enumerate(exposure)]
+    return Trace(spectrum, parts[0] if len(parts) == 1 else torch.stack(parts).sum(0))
 
 
 def light_on_camera(scene: Scene, stages: Stages, image: Tensor) -> Tensor:

@@ -35,6 +35,14 @@ class Drive:
         Factor on the phase.
     crosstalk : (Tensor, Tensor) or None
         Tap tables of rows and columns, each [sub-pixels, taps].
+    offset : Tensor [H, W] or None, rad
+        Phase that is added whatever the pattern shows.
+    factors : complex Tensor [K, levels] or None
+        Factor on the field at each level, besides its phase, in each of K states during an exposure.
+    shares : Tensor [K] or None
+        Of each state in the exposure; their irradiances add.
+    persistence : Tensor or None
+        Share of the phase shown before that is still there.
     """
 
     channel: str
@@ -47,10 +55,29 @@ class Drive:
     response: Tensor
     gain: Tensor | None = None
     crosstalk: tuple[Tensor, Tensor] | None = None
+    offset: Tensor | None = None
+    factors: Tensor | None = None
+    shares: Tensor | None = None
+    persistence: Tensor | None = None
 
     def scaled(self, factor: Tensor) -> Drive:
         """The drive with the phase's gain multiplied by a map [H, W]."""
         return replace(self, gain=factor if self.gain is None else self.gain * factor)
+
+    def advanced(self, phase: Tensor) -> Drive:
+        """The drive with a phase [H, W], rad, added whatever the pattern shows."""
+        return replace(self, offset=phase if self.offset is None else self.offset + phase)
+
+    def modulated(self, factor: Tensor) -> Drive:
+        """The drive with the light of each level multiplied by a factor [levels], real or complex."""
+        return self.varying(factor[None, :], torch.ones(1, dtype=self.level.dtype))
+
+    def varying(self, factors: Tensor, shares: Tensor) -> Drive:
+        """The drive with each state of the exposure split into states with factors [K, levels] and shares [K]."""
+        if self.factors is None or self.shares is None:
+            return replace(self, factors=factors, shares=shares)
+        both = (self.factors[:, None, :] * factors[None, :, :]).reshape(-1, factors.shape[-1])
+        return replace(self, factors=both, shares=(self.shares[:, None] * shares[None, :]).reshape(-1))
 
 
 @dataclass(frozen=True)
