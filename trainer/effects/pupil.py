@@ -141,22 +141,72 @@ def pupil_aberration(pupil: Pupil, zernike: Tensor, *, order: int) -> Pupil:
         ),
         Parameter("centre_y", "share of band", scale=0.02, low=-0.9, high=0.9, typical=(-0.4, 0.4)),
         Parameter("centre_x", "share of band", scale=0.02, low=-0.9, high=0.9, typical=(-0.4, 0.4)),
+        Parameter(
+            "roundness",
+            "1",
+            scale=0.1,
+            absent=lambda bench: 1.0 if bench.iris.shape == "circle" else 0.0,
+            low=0,
+            high=1,
+            starts=(0.0, 1.0),
+            about="0 a rectangle, 1 an ellipse, between them round corners",
+        ),
+        Parameter(
+            "stretch",
+            "1",
+            scale=0.02,
+            low=-0.8,
+            high=0.8,
+            about="how much wider along x, and narrower along y",
+            typical=(-0.4, 0.4),
+        ),
+        Parameter("rotation", "deg", scale=2.0, low=-90, high=90, about="from x towards y"),
+        Parameter(
+            "edge",
+            "share of band",
+            scale=0.02,
+            low=0,
+            high=1,
+            about="width over which the edge goes from passing to blocking",
+            typical=(0, 0.3),
+        ),
     ],
-    formula=r"A(u,v) = \mathrm{rect}\dfrac{u - c_x}{2w}\;\mathrm{rect}\dfrac{v - c_y}{2w}",
+    formula=(
+        r"A(u,v) = \mathrm{clip}\bigl[\tfrac12 - d\bigl(R_\theta(\mathbf{u} - \mathbf{c});\, w(1 \pm s),"
+        r"\, \rho\bigr) / e\bigr]"
+    ),
 )
-def iris(pupil: Pupil, half_width: Tensor, centre_y: Tensor, centre_x: Tensor) -> Pupil:
-    """The filter in the Fourier plane has another size or place than stated.
+def iris(
+    pupil: Pupil,
+    half_width: Tensor,
+    centre_y: Tensor,
+    centre_x: Tensor,
+    roundness: Tensor,
+    stretch: Tensor,
+    rotation: Tensor,
+    edge: Tensor,
+) -> Pupil:
+    """The filter in the Fourier plane has another size, place or shape than stated.
 
     The opening in the Fourier plane that blocks the panel's higher orders is smaller, larger or beside its place.
-    It removes fine detail that the model still expects, or lets through light that the model blocks. The formula is
-    that of a square; a round one has a radius.
+    It removes fine detail that the model still expects, or lets through light that the model blocks. In the formula d
+    is the distance beyond the edge of a rectangle with half sides w(1 + s) and w(1 - s), whose corners are round by
+    the share rho.
 
     References
     ----------
     Goodman, Introduction to Fourier Optics, chapter 6.
     """
     centre = (pupil.centre[0] + centre_y, pupil.centre[1] + centre_x)
-    return replace(pupil, half_width=half_width, centre=centre)
+    return replace(
+        pupil,
+        half_width=half_width,
+        centre=centre,
+        roundness=roundness,
+        stretch=stretch,
+        rotation=math.pi / 180 * rotation,
+        edge=edge,
+    )
 
 
 @effect(

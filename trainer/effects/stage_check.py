@@ -146,6 +146,10 @@ def _pupil(pupil: Pupil) -> dict[str, _Wanted]:
     return {
         "distance": number,
         "half_width": number,
+        "roundness": number,
+        "stretch": number,
+        "rotation": number,
+        "edge": number,
         "centre": _Wanted((1,), "of one number", count=2),
         "path_difference": _Wanted(band, f"[n, m] = {list(band)}"),
         "transmission": _Wanted(band, f"[n, m] = {list(band)}", complex=True),

@@ -201,13 +201,29 @@ def iris_opening(scene: Scene, pupil: Pupil) -> Tensor:
     beyond = [1 / (2 * n) for n in panel]  # share of the band
     bins = [2 / n for n in scene.grid.padded]  # width of a frequency sample, share of the band
     v, u = pupil.v - pupil.centre[0], pupil.u - pupil.centre[1]
-    if pupil.shape == "circle":
-        width = math.sqrt(bins[0] * bins[1])
-        edge = pupil.half_width + math.sqrt(beyond[0] * beyond[1])
-        return torch.clamp((edge - torch.sqrt(v**2 + u**2 + 1e-12)) / width + 0.5, 0, 1)
-    rows = torch.clamp((pupil.half_width + beyond[0] - torch.abs(v)) / bins[0] + 0.5, 0, 1)
-    columns = torch.clamp((pupil.half_width + beyond[1] - torch.abs(u)) / bins[1] + 0.5, 0, 1)
-    return rows * columns
+    rows = pupil.half_width * (1 - pupil.stretch) + beyond[0]
+    columns = pupil.half_width * (1 + pupil.stretch) + beyond[1]
+    if not any(bool(x != 0) for x in (pupil.roundness, pupil.rotation, pupil.edge)):
+        passed = [
+            torch.clamp((side - torch.abs(f)) / width + 0.5, 0, 1)
+            for side, f, width in ((rows, v, bins[0]), (columns, u, bins[1]))
+        ]
+        return passed[0] * passed[1]
+    cosine, sine = torch.cos(pupil.rotation), torch.sin(pupil.rotation)
+    along, across = cosine * u + sine * v, cosine * v - sine * u
+    # Signed distance to a rounded square of half side 1, in units of the iris's own sides.
+    y, x = torch.abs(across) / rows, torch.abs(along) / columns
+    corner = torch.clamp(pupil.roundness, 1e-6, 1)
+    beyond_y, beyond_x = torch.clamp(y - 1 + corner, min=0), torch.clamp(x - 1 + corner, min=0)
+    reach = torch.sqrt(beyond_y**2 + beyond_x**2 + 1e-12)
+    inside = torch.clamp(torch.maximum(y, x) - 1 + corner, max=0)
+    outside = reach + inside - corner
+    # One unit is as long as the iris's half side where the nearest edge is, and a sample as wide as it is there.
+    slope_y = torch.where(reach > 2e-6, beyond_y / reach, (y > x).to(y.dtype))
+    slope_x = torch.where(reach > 2e-6, beyond_x / reach, (y <= x).to(y.dtype))
+    unit = 1 / torch.sqrt((slope_y / rows) ** 2 + (slope_x / columns) ** 2 + 1e-12)
+    width = torch.sqrt((slope_y * bins[0]) ** 2 + (slope_x * bins[1]) ** 2) + pupil.edge
+    return torch.clamp(0.5 - outside * unit / width, 0, 1)
 
 
 @dataclass(frozen=True)

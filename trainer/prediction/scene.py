@@ -149,7 +149,10 @@ def bare_stages(scene: Scene) -> Stages:
         torch.tensor(scene.plane_mm * 1e-3, dtype=dtype),
         torch.tensor(bench.iris.half_width, dtype=dtype),
         (zero, zero),
-        bench.iris.shape,
+        torch.tensor(1.0 if bench.iris.shape == "circle" else 0.0, dtype=dtype),
+        zero,
+        zero,
+        zero,
     )
     sensor = Sensor(
         scene.channel,

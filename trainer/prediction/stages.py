@@ -142,8 +142,14 @@ class Pupil:
         Of the iris, share of the band.
     centre : (Tensor, Tensor)
         Of the iris (v, u), share of the band.
-    shape : str
-        Of the iris, "square" or "circle".
+    roundness : Tensor
+        Of the iris: 0 a rectangle, 1 an ellipse, between them a rectangle with round corners.
+    stretch : Tensor
+        How much wider than `half_width` the iris is along u, and narrower along v, as a share.
+    rotation : Tensor, rad
+        Of the iris, from u to v.
+    edge : Tensor
+        Width over which the iris's edge goes from passing to blocking, share of the band.
     path_difference : Tensor [n, m] or None, m
         The same for every colour.
     transmission : complex Tensor [n, m] or None
@@ -166,7 +172,10 @@ class Pupil:
     distance: Tensor
     half_width: Tensor
     centre: tuple[Tensor, Tensor]
-    shape: str
+    roundness: Tensor
+    stretch: Tensor
+    rotation: Tensor
+    edge: Tensor
     path_difference: Tensor | None = None
     transmission: Tensor | None = None
     lines: tuple[Tensor, Tensor] | None = None
