@@ -1,7 +1,8 @@
 """A virtual headset: devices with a simulated bench behind them that has hidden defects.
 
-The simulation is in `bench_optics`, `simulated_drive`, `simulated_panel`, `simulated_sensor` and
-`subpixel_propagation`. Hidden defects are defined in `defects` and combined to benches in `named_benches`.
+The simulation is in `bench_optics`, `simulated_drive`, `simulated_panel`, `rough_surface`, `iris_opening`,
+`simulated_sensor`, `camera_motion` and `subpixel_propagation`. Hidden defects are defined in `defects` and
+`further_defects`, and combined to benches in `named_benches`.
 `virtual_headset` is opened in Python; `emulated_hardware` answers the real vendor libraries, byte by byte
 (`i2c`, `usb`, `oak`). Faults of emulated devices are in `fault_injection`.
 """
