@@ -236,6 +236,15 @@ def test_a_second_path_interferes_and_its_sign_flips_with_its_phase():
     assert ((term[0] + term[1]) / 2).sum() == pytest.approx(0.12**2 * whole, rel=0.01)
 
 
+def test_the_delay_of_the_second_path_counts_as_a_gray_levels_does():
+    """Of a blaze of 16 columns, a copy 4 columns on is a quarter of a wave behind; the delay brings it back."""
+    light = {}
+    for phase in (90, -90):
+        ghost = make_defect("coherent_ghost", phase_deg=phase, shift_y_px=0.0, shift_x_px=4.0)
+        light[phase] = samples(small(NARROW, ghost), grating(16), Z)[0].sum()
+    assert light[90] / light[-90] == pytest.approx((1.12 / 0.88) ** 2, rel=0.1)
+
+
 def test_vibration_widens_a_spot_along_its_direction():
     d = make_defect("vibration", rms_px=1.5, spread=0.0)
     still, moved = (moments(spot(*more).expected_counts(uniform(), "green") - 64) for more in ((), (d,)))

@@ -210,14 +210,25 @@ def test_devices_refuse_what_they_cannot_do():
         device.oracle_pattern(np.ones((3, 3)), "green")
 
 
-@pytest.mark.skipif(
-    not (SHARED / "practice" / "ideal").is_dir(), reason="no practice sets beside the repository"
+@pytest.mark.parametrize(
+    ("practice", "name"),
+    [
+        pytest.param(
+            practice,
+            name,
+            marks=pytest.mark.skipif(
+                not (SHARED / "practice" / practice).is_dir(),
+                reason="no practice sets beside the repository",
+            ),
+        )
+        for practice, name in (("ideal", "ideal"), ("ripple", "phase_ripple"))
+    ],
 )
-def test_an_independent_simulation_of_the_ideal_bench_is_reproduced():
+def test_an_independent_simulation_is_reproduced(practice, name):
     """Captures of another sub-pixel simulation: the excess over the camera's noise is below 1e-4."""
     image = pytest.importorskip("PIL.Image")
-    folder = SHARED / "practice" / "ideal"
-    device = open_headset("virtual:ideal")
+    folder = SHARED / "practice" / practice
+    device = open_headset(f"virtual:{name}")
     predicted, seen = [], []
     with (folder / "captures.csv").open(newline="") as file:
         for row in csv.DictReader(file):
