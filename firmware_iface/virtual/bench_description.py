@@ -11,7 +11,8 @@ from typing import Any, TypeVar
 
 from firmware_iface.errors import InputError, nearest
 from firmware_iface.toml_tables import check_instance, parameter, read_table
-from firmware_iface.virtual.defects import Defect, read_defect
+from firmware_iface.virtual.defect_kind import Defect
+from firmware_iface.virtual.defects import read_defect
 
 D = TypeVar("D", bound=Defect)
 

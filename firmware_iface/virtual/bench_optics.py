@@ -9,21 +9,24 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_iface.errors import InputError
 from firmware_iface.virtual.bench_description import BenchDescription
 from firmware_iface.virtual.defects import (
     Convention,
     Distance,
-    Iris,
     PupilAberration,
     SpatialCoherence,
     TemporalCoherence,
 )
-from firmware_iface.virtual.simulated_drive import Drive
-from firmware_iface.virtual.simulated_panel import Surface, tilt_factor
+from firmware_iface.virtual.further_defects import CoherentGhost, SourceLines
+from firmware_iface.virtual.iris_opening import iris_opening
+from firmware_iface.virtual.simulated_drive import Component, Drive, Moment
+from firmware_iface.virtual.simulated_panel import REFERENCE_NM, Surface, tilt_factor
 from firmware_iface.virtual.subpixel_propagation import Band, walk_px
 
 Single = NDArray[np.float32]
@@ -58,24 +61,29 @@ class OpticalPath:
         distance = plane_mm + (offset.offset_mm if offset else 0.0)
         if convention:
             distance *= convention.distance_sign
-        iris = bench.defect(Iris)
-        half = iris.half_width if iris else bench.iris.half_width
-        centre = (iris.centre_y_share, iris.centre_x_share) if iris else (0.0, 0.0)
-        half_band = 0.5 * (half + max(abs(centre[0]), abs(centre[1])))
+        opening = iris_opening(bench)
+        half_band = 0.5 * (opening.reach + max(abs(opening.centre[0]), abs(opening.centre[1])))
+        ghost = bench.defect(CoherentGhost)
         q, pitch = bench.simulation.subpixels, bench.panel.pitch_um
         border = 16 + bench.simulation.padding * walk_px(wavelength, pitch, distance, half_band)
+        if ghost:
+            border += max(abs(ghost.shift_y_px), abs(ghost.shift_x_px))
         self.band = Band((bench.panel.height, bench.panel.width), q, border, half_band)
-        passed = iris_mask(self.band, bench.iris.shape, half, centre)
+        passed = opening.mask(2 * self.band.fy, 2 * self.band.fx)
         delay = relay_path_nm(bench.defect(PupilAberration), self.band)
         self.lines = [
             SpectralLine(
                 wl,
                 share,
-                (passed * np.exp(2j * np.pi * delay / wl) * self.band.transfer(wl, pitch, distance)).astype(
-                    np.complex64
-                ),
+                (
+                    passed
+                    * np.exp(2j * np.pi * delay / wl)
+                    * self.band.transfer(wl, pitch, distance)
+                    * second_path(ghost, self.band, wl)
+                ).astype(np.complex64),
             )
-            for wl, share in spectral_lines(wavelength, bench.defect(TemporalCoherence))
+            for centre, of_power in source_lines(wavelength, bench.defect(SourceLines))
+            for wl, share in spectral_lines(centre, bench.defect(TemporalCoherence), of_power)
         ]
         to_cycles = pitch / wavelength  # 1 mrad in cycles a pixel
         points = source_points(bench.defect(SpatialCoherence))
@@ -83,13 +91,13 @@ class OpticalPath:
         self.wavelength_nm = wavelength
 
 
-def iris_mask(band: Band, shape: str, half_width: float, centre: tuple[float, float]) -> NDArray[np.bool_]:
-    """Which frequencies pass, [Fy, Fx]; half_width and centre (y, x) are shares of the band, edges pass."""
-    y, x = np.abs(2 * band.fy - centre[0])[:, None], np.abs(2 * band.fx - centre[1])[None, :]
-    limit = half_width * (1 + 1e-9) + 1e-12
-    if shape == "circle":
-        return np.asarray(np.hypot(y, x) <= limit)
-    return np.asarray((y <= limit) & (x <= limit))
+def second_path(d: CoherentGhost | None, band: Band, wavelength_nm: float) -> NDArray[np.complexfloating]:
+    """Effect of a displaced and delayed copy on the field's spectrum, [Fy, Fx]."""
+    if d is None:
+        return np.ones((1, 1), np.complex128)
+    delay = np.deg2rad(d.phase_deg) * REFERENCE_NM / wavelength_nm
+    shift = band.fy[:, None] * d.shift_y_px + band.fx[None, :] * d.shift_x_px
+    return np.asarray(1 + d.amplitude * np.exp(1j * (delay - 2 * np.pi * shift)))
 
 
 def relay_path_nm(d: PupilAberration | None, band: Band) -> NDArray[np.float64]:
@@ -108,15 +116,26 @@ def relay_path_nm(d: PupilAberration | None, band: Band) -> NDArray[np.float64]:
     )
 
 
-def spectral_lines(wavelength_nm: float, d: TemporalCoherence | None) -> list[tuple[float, float]]:
-    """(wavelength nm, share of the power) of the lines that approximate a Gaussian line, out to 2.5 sigma."""
-    if d is None or d.lines == 1 or d.linewidth_nm == 0:
+def source_lines(wavelength_nm: float, d: SourceLines | None) -> list[tuple[float, float]]:
+    """(wavelength nm, share of the power) of the source's lines, the nominal one first."""
+    if d is None:
         return [(wavelength_nm, 1.0)]
+    others = ((d.separation_nm, d.share), (d.third_separation_nm, d.third_share))
+    lines = [(wavelength_nm + apart, share) for apart, share in others if share > 0]
+    return [(wavelength_nm, 1 - d.share - d.third_share), *lines]
+
+
+def spectral_lines(
+    wavelength_nm: float, d: TemporalCoherence | None, power: float = 1.0
+) -> list[tuple[float, float]]:
+    """(wavelength nm, share) of the lines that approximate a Gaussian line of this power, out to 2.5 sigma."""
+    if d is None or d.lines == 1 or d.linewidth_nm == 0:
+        return [(wavelength_nm, power)]
     sigma = d.linewidth_nm / 2.3548
     at = np.linspace(-2.5, 2.5, d.lines)
     shares = np.exp(-0.5 * at**2)
     shares /= shares.sum()
-    return [(wavelength_nm + float(a) * sigma, float(s)) for a, s in zip(at, shares, strict=True)]
+    return [(wavelength_nm + float(a) * sigma, power * float(s)) for a, s in zip(at, shares, strict=True)]
 
 
 def source_points(d: SpatialCoherence | None) -> list[tuple[float, float]]:
@@ -176,9 +195,43 @@ class BenchOptics:
         turned = _turn(np.float32(drive.sign * colour) * phase)
         return np.repeat(np.repeat(turned, drive.q, 0), drive.q, 1)
 
-    def irradiance(self, gray: NDArray[np.generic], channel: str, plane_mm: float) -> Single:
-        """Irradiance samples over the padded window, [sY, sX], of gray levels [H, W] (fractions allowed)."""
-        return self._run(gray, channel, plane_mm, keep=False)[0]
+    def turned(
+        self, gray: NDArray[np.generic], before: NDArray[np.float64] | None
+    ) -> NDArray[np.float64] | None:
+        """How far the panel has turned after one more capture, for the next one; None where it is not slow.
+
+        Parameters
+        ----------
+        gray : array [H, W]
+        before : float64 array [H, W], optional
+            What this returned for the capture before.
+        """
+        drive = self.drive(self.bench.channels[0].name)  # a share of one wave is the same in all colours
+        return drive.turned(np.asarray(gray, np.float64), before) if drive.slow else None
+
+    def irradiance(
+        self,
+        gray: NDArray[np.generic],
+        channel: str,
+        plane_mm: float,
+        before: NDArray[np.float64] | None = None,
+    ) -> Single:
+        """Irradiance samples over the padded window.
+
+        Parameters
+        ----------
+        gray : array [H, W]
+            Fractions allowed.
+        channel : str
+        plane_mm : float, mm
+        before : float64 array [H, W], optional
+            What `turned` returned for the capture before; None: the gray levels have been shown for long.
+
+        Returns
+        -------
+        float32 array [sY, sX]
+        """
+        return self._run(gray, channel, plane_mm, before)
 
     def irradiance_and_pullback(
         self, gray: NDArray[np.generic], channel: str, plane_mm: float
@@ -196,47 +249,107 @@ class BenchOptics:
         -------
         (float32 array [sY, sX], callable)
             Irradiance samples; from d f / d irradiance [sY, sX] to d f / d gray [H, W].
+
+        Raises
+        ------
+        InputError
+            Where the panel is slow.
         """
-        irradiance, modes = self._run(gray, channel, plane_mm, keep=True)
         drive, path = self.drive(channel), self.path(channel, plane_mm)
-        slope = drive.slope(np.asarray(gray, np.float64))
+        if drive.slow:
+            raise InputError(
+                f"bench '{self.bench.name}' cannot be differentiated: with the defect slow_response its light depends "
+                "on the captures before; take the defect out of the bench."
+            )
+        kept: list[_Mode] = []
+        irradiance = self._run(gray, channel, plane_mm, None, kept)
+        levels = np.asarray(gray, np.float64)
+        slope, amplitude = drive.slope(levels), drive.amplitude(levels)
 
         def pullback(gradient: Single) -> NDArray[np.float64]:
-            total = np.zeros((drive.q * gray.shape[0], drive.q * gray.shape[1]), np.float32)
-            for line, tilt, share, z, lit in modes:
-                g = path.band.field_adjoint((2 * np.float32(share) * gradient) * z)
-                g = path.band.spectrum_adjoint(g * line.transfer.conj())
-                if tilt is not None:
-                    g = g * tilt.conj()
-                turn = np.float32(path.wavelength_nm / line.wavelength_nm)
-                total += turn * (g.imag * lit.real - g.real * lit.imag)
-            return (drive.spread_adjoint(total) * slope).astype(np.float64)
+            size = (drive.q * gray.shape[0], drive.q * gray.shape[1])
+            total, reflected = np.zeros(size, np.float32), np.zeros(size, np.float32)
+            for mode in kept:
+                g = path.band.field_adjoint((2 * np.float32(mode.share) * gradient) * mode.z)
+                g = path.band.spectrum_adjoint(g * mode.line.transfer.conj())
+                if mode.tilt is not None:
+                    g = g * mode.tilt.conj()
+                for turn, lit in mode.components:
+                    total += turn * (g.imag * lit.real - g.real * lit.imag)
+                    if drive.absorbs:
+                        reflected += (g.real * lit.real + g.imag * lit.imag) / amplitude
+            found = (drive.spread_adjoint(total) * slope).astype(np.float64)
+            return found + drive.amplitude_adjoint(reflected, levels) if drive.absorbs else found
 
         return irradiance, pullback
 
     def _run(
-        self, gray: NDArray[np.generic], channel: str, plane_mm: float, keep: bool
-    ) -> tuple[Single, list[tuple[SpectralLine, Complex | None, float, Complex, Complex]]]:
+        self,
+        gray: NDArray[np.generic],
+        channel: str,
+        plane_mm: float,
+        before: NDArray[np.float64] | None,
+        kept: list[_Mode] | None = None,
+    ) -> Single:
+        """Irradiance samples; the modes are appended to `kept`."""
         drive, path = self.drive(channel), self.path(channel, plane_mm)
-        phase = drive.magnitude(np.asarray(gray, np.float64))
+        levels = np.asarray(gray, np.float64)
+        phase = drive.magnitude(levels, before)
         total = np.zeros(path.band.samples, np.float32)
-        kept = []
         for line in path.lines:
+            colour = path.wavelength_nm / line.wavelength_nm
             surface = self.surface(line.wavelength_nm)
-            lit = surface.lit * self._turn(drive, phase, path.wavelength_nm / line.wavelength_nm)
-            field = lit if surface.dark else lit + surface.unlit
-            for fy, fx in path.tilts:
-                tilt = None
-                if fy or fx:
-                    colour = path.wavelength_nm / line.wavelength_nm
-                    tilt = tilt_factor(gray.shape, drive.q, (fy * colour, fx * colour)).astype(np.complex64)
-                share = line.share / len(path.tilts)
-                spectrum = path.band.spectrum(field if tilt is None else field * tilt)
-                z = path.band.field(spectrum * line.transfer)
-                total += np.float32(share) * (z.real**2 + z.imag**2)
-                if keep:
-                    kept.append((line, tilt, share, z, lit))
-        return total, kept
+            reflecting = surface.lit * drive.amplitude(levels) if drive.absorbs else surface.lit
+            for moment, (number, components) in product(drive.moments, enumerate(drive.fields)):
+                parts = self._parts(drive, phase, reflecting, moment, components, colour)
+                field = sum((lit for _, lit in parts[1:]), parts[0][1])
+                if number == 0 and not surface.dark:
+                    field = field + surface.unlit
+                for fy, fx in path.tilts:
+                    tilt = None
+                    if fy or fx:
+                        tilt = tilt_factor(gray.shape, drive.q, (fy * colour, fx * colour)).astype(
+                            np.complex64
+                        )
+                    share = line.share * moment.share / len(path.tilts)
+                    spectrum = path.band.spectrum(field if tilt is None else field * tilt)
+                    z = path.band.field(spectrum * line.transfer)
+                    total += np.float32(share) * (z.real**2 + z.imag**2)
+                    if kept is not None:
+                        kept.append(_Mode(line, tilt, share, z, parts))
+        return total
+
+    def _parts(
+        self,
+        drive: Drive,
+        phase: Single,
+        reflecting: Complex,
+        moment: Moment,
+        components: tuple[Component, ...],
+        colour: float,
+    ) -> list[tuple[np.float32, Complex]]:
+        """Of each component: its phase over the pattern's, and its field on sub-pixels, [qH, qW]."""
+        if moment != Moment():
+            phase = np.float32(moment.gain) * phase + np.float32(moment.offset_rad)
+        parts = []
+        for component in components:
+            turn = colour * component.gain
+            lit = reflecting * self._turn(drive, phase, turn)
+            if component.factor != 1:
+                lit = np.complex64(component.factor) * lit
+            parts.append((np.float32(turn * moment.gain), lit))
+        return parts
+
+
+@dataclass(frozen=True)
+class _Mode:
+    """What the derivative needs of one field that travelled coherently."""
+
+    line: SpectralLine
+    tilt: Complex | None
+    share: float
+    z: Complex
+    components: list[tuple[np.float32, Complex]]
 
 
 def _turn(phase: Single) -> Complex:

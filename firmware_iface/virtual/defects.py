@@ -1,34 +1,31 @@
 """Hidden defects of a simulated bench: one frozen dataclass for each kind, parameters in physical units.
 
-The first eighteen kinds carry the names of the catalogue of effects. `specks`, `fringes`, `stripes` are
-outside the catalogue, and `convention` is a bench described the wrong way. Lateral parameters that scale with
-the panel are shares of its half width or half height (suffix `_share`); `_px` is panel pixels.
+The first eighteen kinds carry the names of the catalogue of effects, and `further_defects` has ten more. `specks`,
+`fringes`, `stripes` are outside both, and `convention` is a bench described the wrong way. Lateral parameters that
+scale with the panel are shares of its half width or half height (suffix `_share`); `_px` is panel pixels.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from firmware_iface.errors import InputError, nearest
 from firmware_iface.toml_tables import parameter, read_table
-
-
-@dataclass(frozen=True)
-class Defect:
-    """Base of all defects.
-
-    Attributes
-    ----------
-    kind : str
-        The name in TOML.
-    stage : str
-        Where in the light path it acts.
-    """
-
-    kind: ClassVar[str] = ""
-    stage: ClassVar[str] = ""
+from firmware_iface.virtual.defect_kind import Defect
+from firmware_iface.virtual.further_defects import (
+    AmplitudeModulation,
+    CoherentGhost,
+    Drivers,
+    FixedPattern,
+    FrameMotion,
+    PhaseRipple,
+    PolarisationLeak,
+    SlowResponse,
+    SourceLines,
+    Vibration,
+)
 
 
 @dataclass(frozen=True)
@@ -99,6 +96,10 @@ class Illumination(Defect):
     centre_x_share: float = parameter(0.25, "beam centre", -3, 3)
     centre_y_share: float = parameter(-0.2, "beam centre", -3, 3)
     ring: float = parameter(0.03, "amplitude of the ring", 0, 0.5)
+    rough_rms: float = parameter(0.0, "rms of a rough surface that is added to the log amplitude", 0, 2)
+    rough_nodes_y: int = parameter(7, "random nodes of the rough surface from edge to edge", 2, 200)
+    rough_nodes_x: int = parameter(9, "random nodes of the rough surface from edge to edge", 2, 200)
+    rough_seed: int = parameter(1, "seed of the nodes", 0)
 
 
 @dataclass(frozen=True)
@@ -109,6 +110,10 @@ class PanelWavefront(Defect):
     stage = "panel"
     peak_to_valley_nm: float = parameter(520.0, "path difference over the panel, peak to valley", 0, 20000)
     orientation_deg: float = parameter(25.0, "of the saddle")
+    rough_rms_rad: float = parameter(0.0, "rms of a rough surface that is added, at 520 nm", 0, 50)
+    rough_nodes_y: int = parameter(7, "random nodes of the rough surface from edge to edge", 2, 200)
+    rough_nodes_x: int = parameter(9, "random nodes of the rough surface from edge to edge", 2, 200)
+    rough_seed: int = parameter(1, "seed of the nodes", 0)
 
 
 @dataclass(frozen=True)
@@ -137,13 +142,21 @@ class PupilAberration(Defect):
 
 @dataclass(frozen=True)
 class Iris(Defect):
-    """The filter's true size and place."""
+    """The filter's true size, place and shape; it turns about its own centre.
+
+    The edge's transmitted amplitude is a raised cosine, 1/2 where a hard edge would be.
+    """
 
     kind = "iris"
     stage = "pupil"
     half_width: float = parameter(0.8, "share of the panel's band, replaces the nominal one", 0.02, 2)
     centre_x_share: float = parameter(0.08, "offset, share of the panel's band", -1, 1)
     centre_y_share: float = parameter(-0.05, "offset, share of the panel's band", -1, 1)
+    shape: str = parameter("", "outline; empty: the nominal one", choices=("", "square", "circle"))
+    half_width_x: float = parameter(0.0, "half width along x, share of the band; 0: half_width", 0, 2)
+    half_width_y: float = parameter(0.0, "half width along y, share of the band; 0: half_width", 0, 2)
+    rotation_deg: float = parameter(0.0, "from x towards y")
+    soft_edge_share: float = parameter(0.0, "width of the edge, share of the band", 0, 1)
 
 
 @dataclass(frozen=True)
@@ -316,8 +329,21 @@ _CATALOGUE: tuple[type[Defect], ...] = (
     Ghost,
 )
 CATALOGUE_KINDS: tuple[str, ...] = tuple(c.kind for c in _CATALOGUE)
+_GROWN: tuple[type[Defect], ...] = (
+    AmplitudeModulation,
+    PolarisationLeak,
+    SlowResponse,
+    PhaseRipple,
+    Drivers,
+    CoherentGhost,
+    SourceLines,
+    Vibration,
+    FrameMotion,
+    FixedPattern,
+)
+GROWN_KINDS: tuple[str, ...] = tuple(c.kind for c in _GROWN)
 _OUTSIDE: tuple[type[Defect], ...] = (Specks, Fringes, Stripes, Convention)
-DEFECT_KINDS: dict[str, type[Defect]] = {c.kind: c for c in _CATALOGUE + _OUTSIDE}
+DEFECT_KINDS: dict[str, type[Defect]] = {c.kind: c for c in _CATALOGUE + _GROWN + _OUTSIDE}
 
 
 def make_defect(kind: str, where: str = "a defect", **parameters: Any) -> Defect:

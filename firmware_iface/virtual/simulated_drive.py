@@ -1,25 +1,59 @@
-"""The drive of a simulated panel: gray levels to phase on sub-pixels, and the derivative back.
+"""The drive of a simulated panel: gray levels to phase and amplitude on sub-pixels, and the derivative back.
 
 Arrays are [row, column]; [H, W] is panel pixels, [qH, qW] sub-pixels.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.virtual.bench_description import BenchDescription
 from firmware_iface.virtual.defects import Convention, Crosstalk, PhaseNonuniformity, PhaseResponse
+from firmware_iface.virtual.further_defects import (
+    AmplitudeModulation,
+    Drivers,
+    PhaseRipple,
+    PolarisationLeak,
+    SlowResponse,
+)
 from firmware_iface.virtual.simulated_panel import share_grid
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
 
-class Drive:
-    """Gray levels to phase on sub-pixels, for one channel, and the derivative back.
+@dataclass(frozen=True)
+class Moment:
+    """One share of an exposure, in which the phase is gain * phase + offset."""
 
-    A pixel's phase is sign * thickness(x, y) * 2 pi gain s(gray / levels); a fringing field smears the profile.
+    gain: float = 1.0
+    offset_rad: float = 0.0
+    share: float = 1.0
+
+
+@dataclass(frozen=True)
+class Component:
+    """One component of the field that the panel reflects: factor * exp(j gain * phase)."""
+
+    gain: float = 1.0
+    factor: complex = 1.0
+
+
+class Drive:
+    """Gray levels to phase and amplitude on sub-pixels, for one channel, and the derivative back.
+
+    A pixel's phase is sign * (thickness(x, y) * 2 pi gain s(gray / levels) + offset(x, y)); a fringing field smears
+    the profile. Its amplitude depends on the gray level asked for, and is smeared likewise.
+
+    Attributes
+    ----------
+    moments : tuple of Moment
+        Parts of an exposure; their irradiances add.
+    fields : tuple of tuple of Component
+        Fields whose irradiances add, each the sum of components. The first holds the pattern's own.
     """
 
     def __init__(self, bench: BenchDescription, wavelength_nm: float) -> None:
@@ -34,7 +68,13 @@ class Drive:
             self._full *= (
                 self._curve.gain * (self._curve.reference_nm / wavelength_nm) ** self._curve.dispersion
             )
-        self._thickness = _thickness(bench.defect(PhaseNonuniformity), panel.height, panel.width)
+        gain, self._offset = driver_errors(bench.defect(Drivers), panel.height, panel.width)
+        self._thickness = _thickness(bench.defect(PhaseNonuniformity), panel.height, panel.width) * gain
+        slow = bench.defect(SlowResponse)
+        self._left = slow.share if slow else 0.0
+        self._absorption = bench.defect(AmplitudeModulation)
+        self.moments = _moments(bench.defect(PhaseRipple))
+        self.fields = _fields(bench.defect(PolarisationLeak))
         crosstalk = bench.defect(Crosstalk)
         self._smear_y = self._smear_x = None
         if crosstalk:
@@ -46,9 +86,53 @@ class Drive:
         """Whether sub-pixels of one pixel differ in phase."""
         return self._smear_x is not None
 
-    def magnitude(self, gray: NDArray[np.floating]) -> Single:
-        """Phase of each pixel before its sign, rad; `gray` may be fractional."""
-        return (self._full * self._thickness * self._shape(gray)).astype(np.float32)
+    @property
+    def slow(self) -> bool:
+        """Whether the phase depends on what was shown before."""
+        return self._left > 0
+
+    @property
+    def absorbs(self) -> bool:
+        """Whether the amplitude depends on the gray level."""
+        return self._absorption is not None
+
+    def turned(self, gray: NDArray[np.floating], before: Array | None = None) -> Array:
+        """How far the pixels' cells have turned, as a share of one wave before gain and thickness, [H, W].
+
+        Parameters
+        ----------
+        gray : array [H, W]
+            Fractions allowed.
+        before : float64 array [H, W], optional
+            What this returned for the capture before; None: the gray levels have been shown for long.
+        """
+        settled = self._shape(gray)
+        if before is None or not self.slow:
+            return settled
+        return (1 - self._left) * settled + self._left * before
+
+    def magnitude(self, gray: NDArray[np.floating], before: Array | None = None) -> Single:
+        """Phase of each pixel before its sign, rad; arguments as of `turned`."""
+        phase = self._full * self._thickness * self.turned(gray, before)
+        return (phase if self._offset is None else phase + self._offset).astype(np.float32)
+
+    def amplitude(self, gray: NDArray[np.floating]) -> Single:
+        """Amplitude on sub-pixels, [qH, qW], where the drive absorbs."""
+        d = self._absorption
+        if d is None:
+            return np.ones((1, 1), np.float32)
+        t = np.asarray(gray, np.float64) / 255
+        amplitude = 1 - d.fall * (t + d.curvature * t * (1 - t))
+        return np.float32(self.sign) * self.spread(amplitude.astype(np.float32))
+
+    def amplitude_adjoint(self, gradient: Single, gray: NDArray[np.floating]) -> Array:
+        """From d f / d amplitude, [qH, qW], to its part of d f / d gray, [H, W]."""
+        d = self._absorption
+        if d is None:
+            return np.zeros(np.shape(gray))
+        t = np.asarray(gray, np.float64) / 255
+        slope = -d.fall * (1 + d.curvature * (1 - 2 * t)) / 255
+        return np.asarray(self.sign * self.spread_adjoint(gradient) * slope, np.float64)
 
     def slope(self, gray: NDArray[np.floating]) -> Single:
         """d magnitude / d gray, rad a gray level."""
@@ -61,6 +145,9 @@ class Drive:
 
     def gray_of(self, magnitude: Array) -> Array:
         """Fractional gray, 0..255, of each pixel's phase before its sign, rad; inverse of `magnitude`."""
+        if self._offset is not None:
+            magnitude = magnitude - self._offset
+            magnitude = np.where(magnitude < 0, magnitude + 2 * np.pi, magnitude)
         table = np.arange(256.0)
         return np.interp(magnitude / (self._full * self._thickness), self._shape(table), table)
 
@@ -115,6 +202,37 @@ class Drive:
         else:
             out = _smear_adjoint(_smear_adjoint(phase.T, self._smear_x).T, self._smear_y)
         return np.float32(self.sign) * out
+
+
+def driver_errors(d: Drivers | None, height: int, width: int) -> tuple[Array, Array | None]:
+    """Gain [H, W] and offset [H, W], rad, of the phase; without the defect 1 as [1, 1], and None."""
+    if d is None:
+        return np.ones((1, 1)), None
+    rng = np.random.default_rng([d.seed, 53])
+
+    def repeated(period: int, size: int, rms: float) -> Array:
+        # of mean 0 and exactly this rms: a mean would be a piston or the phase response's gain
+        values = rng.standard_normal(period)
+        values -= values.mean()
+        return np.resize(rms * values / np.sqrt(np.mean(values**2)), size)
+
+    columns = [repeated(d.column_period, width, rms) for rms in (d.column_offset_rad, d.column_gain)]
+    rows = [repeated(d.row_period, height, rms) for rms in (d.row_offset_rad, d.row_gain)]
+    offset, gain = (r[:, None] + c[None, :] for r, c in zip(rows, columns, strict=True))
+    return 1 + gain, offset
+
+
+def _moments(d: PhaseRipple | None) -> tuple[Moment, ...]:
+    if d is None:
+        return (Moment(),)
+    return tuple(Moment(1 + d.depth * u, d.offset_rad * u, 0.2) for u in (-1, -0.5, 0, 0.5, 1))
+
+
+def _fields(d: PolarisationLeak | None) -> tuple[tuple[Component, ...], ...]:
+    if d is None:
+        return ((Component(),),)
+    leak = Component(d.gain, complex(d.amplitude * np.exp(1j * np.deg2rad(d.phase_deg))))
+    return ((Component(), leak),) if d.interferes else ((Component(),), (leak,))
 
 
 def _thickness(d: PhaseNonuniformity | None, height: int, width: int) -> Array:

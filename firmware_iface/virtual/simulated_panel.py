@@ -16,11 +16,15 @@ from firmware_iface.virtual.defects import (
     Stripes,
     ZeroOrder,
 )
+from firmware_iface.virtual.rough_surface import rough_surface
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 Complex = NDArray[np.complex64]
 Complex128 = NDArray[np.complex128]
+
+
+REFERENCE_NM = 520.0  # wavelength at which phases of path differences are given
 
 
 def share_grid(height: int, width: int) -> tuple[Array, Array]:
@@ -87,11 +91,14 @@ def beam_amplitude(d: Illumination | None, height: int, width: int) -> Array:
     y, x = share_grid(height, width)
     r2 = ((x - d.centre_x_share) / d.waist_x_share) ** 2 + ((y - d.centre_y_share) / d.waist_y_share) ** 2
     amplitude = np.exp(-r2) * (1 + d.ring * np.cos(9 * r2 + 1))
+    if d.rough_rms:
+        nodes = (d.rough_nodes_y, d.rough_nodes_x)
+        amplitude = amplitude * np.exp(d.rough_rms * rough_surface(nodes, d.rough_seed, height, width))
     return amplitude / np.sqrt(np.mean(amplitude**2))
 
 
 def panel_path_nm(d: PanelWavefront | None, height: int, width: int, aspect: float) -> Array:
-    """Path difference over the panel, nm, [height, width]: a saddle, a bend, a trefoil and a dent."""
+    """Path difference over the panel, nm, [height, width]: a saddle, a bend, a trefoil, a dent, and roughness."""
     if d is None:
         return np.zeros((1, 1))
     y, x = share_grid(height, width)
@@ -100,7 +107,11 @@ def panel_path_nm(d: PanelWavefront | None, height: int, width: int, aspect: flo
     a, b = x * np.cos(turn) + y * np.sin(turn), y * np.cos(turn) - x * np.sin(turn)
     dent = np.exp(-((x + 0.4) ** 2 + (y - 0.2) ** 2) / 0.08)
     path = (a**2 - 0.8 * b**2) + 0.25 * (a**3 - 3 * a * b**2) + 0.15 * np.cos(3 * a + b) - 0.12 * dent
-    return d.peak_to_valley_nm * path / np.ptp(path)
+    path = d.peak_to_valley_nm * path / np.ptp(path)
+    if d.rough_rms_rad:
+        rough = rough_surface((d.rough_nodes_y, d.rough_nodes_x), d.rough_seed, height, width)
+        path = path + d.rough_rms_rad * REFERENCE_NM / (2 * np.pi) * rough
+    return path
 
 
 def _stripes(d: Stripes | None, width: int, q: int) -> Array:

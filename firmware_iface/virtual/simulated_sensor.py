@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.virtual.bench_description import BenchDescription
+from firmware_iface.virtual.camera_motion import CameraMotion
 from firmware_iface.virtual.defects import (
     Convention,
     Fringes,
@@ -21,6 +22,7 @@ from firmware_iface.virtual.defects import (
     StrayLight,
     Vignetting,
 )
+from firmware_iface.virtual.further_defects import FixedPattern
 from firmware_iface.virtual.simulated_panel import share_grid
 
 Array = NDArray[np.float64]
@@ -44,6 +46,7 @@ class Integrator:
         self.bench, self.samples, self.s = bench, samples, oversampling
         fy: Array = np.asarray(np.fft.fftfreq(samples[0]) * oversampling, np.float64)[:, None]
         fx: Array = np.asarray(np.fft.rfftfreq(samples[1]) * oversampling, np.float64)[None, :]
+        self._fy, self._fx = fy, fx
         ghost = ghost_filter(bench.defect(Ghost), fy, fx)
         lens = lens_filter(bench.defect(SensorBlur), fy, fx)
         side = bench.camera.pixel_um / bench.panel.pitch_um
@@ -62,9 +65,11 @@ class Integrator:
         wide[: self.s * h : self.s, : self.s * w : self.s] = gradient
         return np.fft.irfft2(np.fft.rfft2(wide) * self._display.conj(), s=self.samples).astype(np.float32)
 
-    def camera(self, irradiance: Single) -> Array:
+    def camera(self, irradiance: Single, motion: CameraMotion | None = None) -> Array:
         """Irradiance on camera pixels, [h, w]: through the lens, at the camera's true position."""
         spectrum = np.fft.rfft2(irradiance) * self._camera
+        if motion is not None:
+            spectrum = spectrum * motion.filter(self._fy, self._fx)
         if self._where is None:
             return self._on_grid(spectrum).astype(np.float64)
         up = max(1, round(4 / self.s))
@@ -163,6 +168,7 @@ class Sensor:
         self.gain = sensitivity(bench.defect(Vignetting), h, w) * fringes(bench.defect(Fringes), h, w)
         full_counts = 2**bench.camera.bit_depth - 1 - bench.camera.black_level
         self.stray_e = stray_counts(bench.defect(StrayLight), h, w) / full_counts * bench.camera.full_well_e
+        self.pixel_gain, self.pixel_counts = fixed_pattern(bench.defect(FixedPattern), h, w)
         self._response = bench.defect(SensorResponse)
         self._convention = bench.defect(Convention)
 
@@ -188,7 +194,7 @@ class Sensor:
         signal = (
             np.clip(irradiance, 0, None) * self.gain * self.bench.simulation.signal_share * camera.full_well_e
         )
-        return dose * (signal + self.stray_e)
+        return dose * (signal + self.stray_e) * self.pixel_gain
 
     def respond(self, electrons: Array) -> Array:
         """Electrons as the read-out reports them, after a response that may be nonlinear."""
@@ -202,7 +208,8 @@ class Sensor:
         """Counts of reported electrons, neither rounded nor clipped."""
         camera = self.bench.camera
         full = 2**camera.bit_depth - 1
-        return camera.black_level + (full - camera.black_level) * electrons / camera.full_well_e
+        counts = camera.black_level + (full - camera.black_level) * electrons / camera.full_well_e
+        return counts + self.pixel_counts
 
     def expose(self, electrons: Array, rng: np.random.Generator) -> NDArray[np.uint16]:
         """One noisy read-out, [h, w], of mean electrons (response applied), rounded and clipped."""
@@ -245,6 +252,14 @@ def stray_counts(d: StrayLight | None, height: int, width: int) -> Array:
     first = np.exp(-((x - 0.5) ** 2 + (y + 0.35) ** 2) / d.radius_share**2)
     second = np.exp(-((x + 0.7) ** 2 + 0.4 * (y - 0.6) ** 2) / (0.6 * d.radius_share) ** 2)
     return d.glow_counts * first + d.second_glow_counts * second
+
+
+def fixed_pattern(d: FixedPattern | None, height: int, width: int) -> tuple[Array, Array]:
+    """Gain and offset, counts, of each camera pixel, [height, width]."""
+    if d is None:
+        return np.ones((1, 1)), np.zeros((1, 1))
+    gain, offset = np.random.default_rng([d.seed, 73]).standard_normal((2, height, width))
+    return np.clip(1 + d.gain_rms * gain, 0, None), d.offset_counts * offset
 
 
 class Drift:

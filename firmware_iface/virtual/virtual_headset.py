@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections import OrderedDict
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +21,30 @@ from firmware_iface.panel.panel import Gray, checked_gray
 from firmware_iface.virtual.bench_description import BenchDescription
 from firmware_iface.virtual.bench_loading import load_bench
 from firmware_iface.virtual.bench_optics import BenchOptics
+from firmware_iface.virtual.camera_motion import CameraMotion, camera_motion
 from firmware_iface.virtual.defects import LaserDrift
 from firmware_iface.virtual.oracle_pattern import descend
 from firmware_iface.virtual.simulated_sensor import Drift, Integrator, Sensor
 from firmware_iface.virtual.virtual_devices import VirtualCamera, VirtualLasers, VirtualPanel
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What the camera saw last of a channel, and why."""
+
+    gray: Gray
+    plane_mm: float
+    before: NDArray[np.float64] | None
+    motion: CameraMotion | None
+    light: NDArray[np.float32]
+    seen: NDArray[np.float64]
+
+    def holds(self, gray: Gray, plane_mm: float, before: NDArray[np.float64] | None) -> bool:
+        """Whether the light is still the same."""
+        same = (self.before is None) == (before is None) and (
+            self.before is None or before is None or np.array_equal(self.before, before)
+        )
+        return same and self.plane_mm == plane_mm and np.array_equal(self.gray, gray)
 
 
 class VirtualHeadset:
@@ -65,7 +86,9 @@ class VirtualHeadset:
         self._optics = BenchOptics(description)
         self._sensor = Sensor(description)
         self._drift = Drift(description.defect(LaserDrift), seed)
-        self._recent: dict[str, tuple[Gray, float, NDArray[np.float64]]] = {}
+        # how far a slow panel has turned after the last capture; None: as far as it was asked to
+        self._turned = self._optics.turned(self.panel.gray, None)
+        self._recent: dict[str, _Seen] = {}
         self._integrators: OrderedDict[tuple[int, int, int], Integrator] = OrderedDict()
 
     def move_to_plane(self, plane_mm: float) -> None:
@@ -80,12 +103,15 @@ class VirtualHeadset:
 
     def _capture(self) -> NDArray[np.uint16]:
         dose = self.camera.exposure_ms / 10 * self._drift.gain(self.captures)
+        motion = camera_motion(self.description, self.seed, self.captures)
         electrons = np.zeros(self.camera.shape)
+        gray = self.panel.gray
         for channel in self.lasers.channels:
             power = self.lasers.power(channel)
             if power > 0:
-                seen = self._camera_irradiance(self.panel.gray, channel, self.plane_mm)
+                seen = self._camera_irradiance(gray, channel, self.plane_mm, motion, self._turned)
                 electrons = electrons + self._sensor.electrons(seen, dose * power)
+        self._turned = self._optics.turned(gray, self._turned)
         rng = np.random.default_rng([self.seed, 11, self.captures])
         counts = self._sensor.expose(self._sensor.respond(electrons), rng)
         self.time_s += max(self.description.simulation.capture_interval_s, self.camera.exposure_ms * 1e-3)
@@ -95,9 +121,14 @@ class VirtualHeadset:
     def expected_counts(
         self, gray: NDArray[np.generic], channel: str, plane_mm: float | None = None
     ) -> NDArray[np.float64]:
-        """Noise-free counts [h, w] at full power and 10 ms: without drift, not rounded, not clipped."""
+        """Noise-free counts [h, w] at full power and 10 ms: without drift, not rounded, not clipped.
+
+        The pattern has been shown for long, and the camera moves as it does in the mean.
+        """
         gray, plane = checked_gray(gray, self.panel.shape), self._plane(plane_mm)
-        electrons = self._sensor.electrons(self._camera_irradiance(gray, channel, plane), 1.0)
+        motion = camera_motion(self.description, self.seed, None)
+        seen = self._camera_irradiance(gray, channel, plane, motion)
+        electrons = self._sensor.electrons(seen, 1.0)
         return self._sensor.counts(self._sensor.respond(electrons))
 
     def true_irradiance(
@@ -105,7 +136,7 @@ class VirtualHeadset:
     ) -> NDArray[np.float64]:
         """Noise-free irradiance over panel-sized pixels, [H, W], before any fault of the camera.
 
-        A perfect panel under a uniform beam gives about 1.
+        A perfect panel under a uniform beam gives about 1. A slow panel has shown the pattern for long.
 
         Raises
         ------
@@ -146,6 +177,11 @@ class VirtualHeadset:
         Returns
         -------
         uint8 array [H, W]
+
+        Raises
+        ------
+        InputError
+            For a target that is no picture of the panel's size, or a bench with the defect slow_response.
         """
         target = np.asarray(target_irradiance, np.float64)
         if (
@@ -174,15 +210,25 @@ class VirtualHeadset:
     def _plane(self, plane_mm: float | None) -> float:
         return self.plane_mm if plane_mm is None else checked_plane(plane_mm)
 
-    def _camera_irradiance(self, gray: Gray, channel: str, plane_mm: float) -> NDArray[np.float64]:
+    def _camera_irradiance(
+        self,
+        gray: Gray,
+        channel: str,
+        plane_mm: float,
+        motion: CameraMotion | None,
+        before: NDArray[np.float64] | None = None,
+    ) -> NDArray[np.float64]:
         """Irradiance on camera pixels; kept for each channel, since a running camera repeats most of it."""
         last = self._recent.get(channel)
-        if last is not None and last[1] == plane_mm and np.array_equal(last[0], gray):
-            return last[2]
-        optics = self._optics.irradiance(gray, channel, plane_mm)
-        seen = self._integrator(channel, plane_mm).camera(optics)
+        if last is None or not last.holds(gray, plane_mm, before):
+            light = self._optics.irradiance(gray, channel, plane_mm, before)
+        elif last.motion == motion:
+            return last.seen
+        else:
+            light = last.light
+        seen = self._integrator(channel, plane_mm).camera(light, motion)
         seen.flags.writeable = False
-        self._recent[channel] = gray.copy(), plane_mm, seen
+        self._recent[channel] = _Seen(gray.copy(), plane_mm, before, motion, light, seen)
         return seen
 
     def _integrator(self, channel: str, plane_mm: float) -> Integrator:

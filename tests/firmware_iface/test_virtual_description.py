@@ -11,7 +11,14 @@ import pytest
 
 import firmware_iface
 from firmware_iface import InputError
-from firmware_iface.virtual import CATALOGUE_KINDS, DEFECT_KINDS, load_bench, make_defect, named_benches
+from firmware_iface.virtual import (
+    CATALOGUE_KINDS,
+    DEFECT_KINDS,
+    GROWN_KINDS,
+    load_bench,
+    make_defect,
+    named_benches,
+)
 
 BENCH = """
 schema = 1
@@ -90,8 +97,9 @@ def test_unknown_benches_are_refused_with_the_nearest_name():
 
 def test_one_bench_for_every_effect_of_the_catalogue():
     assert len(CATALOGUE_KINDS) == 18
-    assert set(CATALOGUE_KINDS) <= set(named_benches())
-    for kind in CATALOGUE_KINDS:
+    assert len(GROWN_KINDS) == 10 and not set(GROWN_KINDS) & set(CATALOGUE_KINDS)
+    assert {*CATALOGUE_KINDS, *GROWN_KINDS} <= set(named_benches())
+    for kind in CATALOGUE_KINDS + GROWN_KINDS:
         assert [d.kind for d in load_bench(f"virtual:{kind}").defects] == [kind]
 
 

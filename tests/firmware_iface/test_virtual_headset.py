@@ -135,12 +135,26 @@ def test_conventions():
 def test_camera_faults_do_not_change_what_the_eye_sees():
     gray = picture_gray()
     plain = headset().true_irradiance(gray, "green")
-    for name in ("sensor_blur", "misregistration", "vignetting", "stray_light", "sensor_response", "fringes"):
+    for name in (
+        "sensor_blur",
+        "misregistration",
+        "vignetting",
+        "stray_light",
+        "sensor_response",
+        "fringes",
+        "vibration",
+        "frame_motion",
+        "fixed_pattern",
+    ):
         np.testing.assert_allclose(headset(name).true_irradiance(gray, "green"), plain)
     assert np.abs(headset("ghost").true_irradiance(gray, "green") - plain).max() > 0.05
 
 
-@pytest.mark.parametrize("name", [n for n in named_benches() if n not in ("ideal", "laser_drift")])
+# what shows only in how captures differ from one another
+IN_ORDER = ("laser_drift", "slow_response", "frame_motion")
+
+
+@pytest.mark.parametrize("name", [n for n in named_benches() if n not in ("ideal", *IN_ORDER)])
 def test_every_named_bench_differs_from_the_ideal_by_more_than_noise(name):
     noise = np.random.default_rng(3).integers(0, 256, (H, W), dtype=np.uint8)
     bench = load_bench(f"virtual:{name}").resized(H, W, 30.0)
@@ -196,14 +210,25 @@ def test_devices_refuse_what_they_cannot_do():
         device.oracle_pattern(np.ones((3, 3)), "green")
 
 
-@pytest.mark.skipif(
-    not (SHARED / "practice" / "ideal").is_dir(), reason="no practice sets beside the repository"
+@pytest.mark.parametrize(
+    ("practice", "name"),
+    [
+        pytest.param(
+            practice,
+            name,
+            marks=pytest.mark.skipif(
+                not (SHARED / "practice" / practice).is_dir(),
+                reason="no practice sets beside the repository",
+            ),
+        )
+        for practice, name in (("ideal", "ideal"), ("ripple", "phase_ripple"))
+    ],
 )
-def test_an_independent_simulation_of_the_ideal_bench_is_reproduced():
+def test_an_independent_simulation_is_reproduced(practice, name):
     """Captures of another sub-pixel simulation: the excess over the camera's noise is below 1e-4."""
     image = pytest.importorskip("PIL.Image")
-    folder = SHARED / "practice" / "ideal"
-    device = open_headset("virtual:ideal")
+    folder = SHARED / "practice" / practice
+    device = open_headset(f"virtual:{name}")
     predicted, seen = [], []
     with (folder / "captures.csv").open(newline="") as file:
         for row in csv.DictReader(file):

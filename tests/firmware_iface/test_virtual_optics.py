@@ -13,6 +13,7 @@ from firmware_iface.virtual.bench_optics import BenchOptics
 from firmware_iface.virtual.simulated_drive import Drive, smear_weights
 from firmware_iface.virtual.simulated_sensor import Integrator, interpolate
 from firmware_iface.virtual.subpixel_propagation import Band
+from tests.firmware_iface.padded_light import samples
 
 H, W, Z = 64, 96, 12.0
 NARROW = make_defect(
@@ -25,25 +26,12 @@ def small(*defects, distance_mm=Z, **changes) -> BenchDescription:
     return replace(bench, defects=tuple(defects), **changes)
 
 
-def samples(bench: BenchDescription, gray, plane_mm=Z):
-    """Irradiance over the padded window and the coordinates of its samples, panel pixels from the centre."""
-    optics = BenchOptics(bench)
-    light = optics.irradiance(gray, "green", plane_mm).astype(float)
-    band = optics.path("green", plane_mm).band
-    grids = []
-    for n, whole in zip((H, W), band.padded, strict=True):
-        at = np.arange(band.oversampling * whole) / band.oversampling
-        at = np.where(at > n + (whole - n) / 2, at - whole, at)  # the window wraps round
-        grids.append(at - (n - 1) / 2)
-    return light, grids[0][:, None], grids[1][None, :], band.oversampling**2
-
-
 def random_gray(seed=0):
     return np.random.default_rng(seed).integers(0, 256, (H, W), dtype=np.uint8)
 
 
 def test_all_light_of_a_beam_that_clears_the_iris_arrives():
-    light, _, _, per_pixel = samples(small(NARROW), np.zeros((H, W), np.uint8))
+    light, _, _, per_pixel = samples(small(NARROW), np.zeros((H, W), np.uint8), Z)
     assert light.sum() / per_pixel == pytest.approx(H * W, rel=1e-4)
 
 
@@ -58,7 +46,7 @@ def test_of_a_random_pattern_the_share_in_the_pixels_central_lobe_arrives(distan
 @pytest.mark.parametrize("period", [8, -16])
 def test_a_grating_sends_light_where_geometry_says(period):
     gray = (256 * np.arange(W) / period % 256).astype(np.uint8)[None, :].repeat(H, 0)
-    light, y, x, _ = samples(small(NARROW), gray)
+    light, y, x, _ = samples(small(NARROW), gray, Z)
     sine = 520e-9 / (period * 8e-6)
     expected = Z * 1e-3 * sine / np.sqrt(1 - sine**2) / 8e-6
     assert (light * x).sum() / light.sum() == pytest.approx(expected, rel=0.01)
@@ -84,7 +72,7 @@ def test_a_sources_extent_blurs_by_distance_times_angle():
     radius_px = Z * 0.8e-3 / 8e-3
 
     def spread(bench):
-        light, _, x, _ = samples(bench, gray)
+        light, _, x, _ = samples(bench, gray, Z)
         return (light * x**2).sum() / light.sum()
 
     grown = spread(small(NARROW, make_defect("spatial_coherence", radius_mrad=0.8))) - spread(small(NARROW))

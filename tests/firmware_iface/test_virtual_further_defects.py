@@ -1,0 +1,451 @@
+"""Physics of what real panels, sources and cameras do beside the first kinds of defects, on a simulated bench."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from firmware_iface import InputError
+from firmware_iface.virtual import BenchDescription, VirtualHeadset, load_bench, make_defect
+from firmware_iface.virtual.bench_description import CameraDescription, ChannelDescription, IrisDescription
+from firmware_iface.virtual.bench_optics import BenchOptics
+from firmware_iface.virtual.iris_opening import iris_opening
+from firmware_iface.virtual.rough_surface import rough_surface, spline_weights
+from firmware_iface.virtual.simulated_panel import beam_amplitude, panel_path_nm
+from tests.firmware_iface.padded_light import samples
+
+H, W, Z = 48, 64, 12.0
+FAR = 30.0  # where orders of a grating of 4 columns lie 61 pixels apart
+ORDER_PX = FAR / np.sqrt((32e-3 / 520e-6) ** 2 - 1) / 8e-3
+NARROW = make_defect(
+    "illumination", waist_x_share=0.3, waist_y_share=0.3, centre_x_share=0, centre_y_share=0, ring=0
+)
+SPOT = replace(NARROW, waist_x_share=0.2, waist_y_share=0.2)
+LINEAR = {"s_curvature": 0.0, "lopsidedness": 0.0}
+
+
+def small(*defects, **changes) -> BenchDescription:
+    bench = load_bench("virtual:ideal").resized(H, W, Z)
+    return replace(bench, defects=tuple(defects), **changes)
+
+
+def quiet(*defects) -> VirtualHeadset:
+    """A headset whose camera has hardly any noise, with the laser on."""
+    camera = CameraDescription(W, H, bit_depth=16, full_well_e=1e9, read_noise_e=0.0)
+    headset = VirtualHeadset(small(*defects, camera=camera))
+    headset.lasers.set_power("green", 1.0)
+    return headset
+
+
+def spot(*defects) -> VirtualHeadset:
+    """The same, with a spot of light that does not saturate."""
+    headset = quiet(SPOT, *defects)
+    headset.camera.exposure_ms = 0.5
+    return headset
+
+
+def uniform(level=0):
+    return np.full((H, W), level, np.uint8)
+
+
+def random_gray(seed=0):
+    return np.random.default_rng(seed).integers(0, 256, (H, W), dtype=np.uint8)
+
+
+def grating(period):
+    return (256 * np.arange(W) / period % 256).astype(np.uint8)[None, :].repeat(H, 0)
+
+
+def order_power(bench, gray, order):
+    """Light in an order of a grating of 4 columns, over the light on the panel; order may be a fraction."""
+    light, y, x, per_pixel = samples(bench, gray, FAR)
+    near = (np.abs(x - order * ORDER_PX) < 16) & (np.abs(y) < 20)
+    return float((light * near).sum() / per_pixel / (H * W))
+
+
+def moments(picture):
+    """Centroid (y, x) and second moments (yy, xx, xy) about it, pixels."""
+    light = picture / picture.sum()
+    y, x = np.mgrid[0:H, 0:W]
+    cy, cx = (light * y).sum(), (light * x).sum()
+    v, u = y - cy, x - cx
+    return (cy, cx), ((light * v * v).sum(), (light * u * u).sum(), (light * v * u).sum())
+
+
+def test_a_uniform_patterns_energy_follows_the_amplitude_curve():
+    d = make_defect("amplitude_modulation")
+    for level in (0, 100, 255):
+        light, whole = (samples(small(NARROW, *more), uniform(level), Z)[0].sum() for more in ((d,), ()))
+        t = level / 255
+        expected = (1 - d.fall * (t + d.curvature * t * (1 - t))) ** 2
+        assert light / whole == pytest.approx(expected, rel=1e-4)
+    assert (1 - d.fall) ** 2 == pytest.approx(0.82**2)
+
+
+def test_crosstalk_smears_the_amplitude_as_it_smears_the_phase():
+    step = uniform()
+    step[:, W // 2 :] = 255
+    absorbing = make_defect("amplitude_modulation", fall=0.5)
+    smear = make_defect("crosstalk", width_x_px=0.8, asymmetry_x=0)
+    sharp, smeared = (
+        BenchOptics(small(absorbing, *more)).drive("green").amplitude(step) for more in ((), (smear,))
+    )
+    for amplitude in (sharp, smeared):
+        assert amplitude[:, 8].mean() == pytest.approx(1) and amplitude[:, -8].mean() == pytest.approx(0.5)
+    middle = slice(4 * W // 2 - 4, 4 * W // 2 + 4)
+    assert sharp.shape[1] == 1 or np.ptp(sharp[0, middle]) == 0.5
+    falls = np.diff(smeared[0, middle])
+    assert np.all(falls < -0.02) and np.all(falls > -0.2)
+
+
+@pytest.mark.parametrize("interferes", [True, False])
+def test_a_leak_fills_the_orders_that_its_weaker_phase_gives(interferes):
+    leak = make_defect("polarisation_leak", amplitude=0.3, interferes=interferes)
+    k = np.arange(4)
+    # of four columns of a blaze, each a quarter of the leak's phase apart: its amplitude in an order
+    weak = {m: np.exp(2j * np.pi * k * (leak.gain - m) / 4).mean() for m in (0, 1, -1)}
+    factor = leak.amplitude * np.exp(1j * np.deg2rad(leak.phase_deg))
+    for order, own in ((0, 0.0), (1, 1.0), (-1, 0.0)):
+        second = factor * weak[order]
+        expected = abs(own + second) ** 2 if interferes else own + abs(second) ** 2
+        plain = order_power(small(NARROW), grating(4), 1)
+        found = order_power(small(NARROW, leak), grating(4), order) / plain
+        assert found * np.sinc(0.25) ** 2 == pytest.approx(expected * np.sinc(order / 4) ** 2, abs=2e-3)
+
+
+def test_a_slow_panel_still_shows_a_share_of_what_was_before():
+    share = 0.08
+    headset = quiet(make_defect("slow_response"))
+    first, second = random_gray(1), random_gray(2)
+    seen = []
+    for gray in (first, second, second):
+        headset.panel.show(gray)
+        seen.append(headset.camera.capture().astype(float))
+    ideal = quiet()
+    asked = np.zeros(
+        (H, W)
+    )  # the panel begins with gray 0; its phase is straight, so gray levels mix as phases do
+    for gray, counts in zip((first, second, second), seen, strict=True):
+        asked = (1 - share) * gray + share * asked
+        light = ideal._optics.irradiance(asked, "green", Z)
+        electrons = ideal._sensor.electrons(ideal._integrator("green", Z).camera(light), 1.0)
+        np.testing.assert_allclose(counts, ideal._sensor.counts(electrons), rtol=5e-3, atol=5)
+    assert np.abs(seen[2] - seen[1]).mean() > 0.02 * seen[1].mean()
+
+
+def test_what_a_slow_panel_shows_depends_on_its_history_and_forgets_it():
+    pictures = []
+    for history in ((random_gray(3),), (random_gray(4),)):
+        headset = quiet(make_defect("slow_response", share=0.3))
+        for gray in history:
+            headset.panel.show(gray)
+            headset.camera.capture()
+        headset.panel.show(random_gray(5))
+        pictures.append([headset.camera.capture().astype(float) for _ in range(9)])
+    difference = [np.abs(a - b).mean() for a, b in zip(*pictures, strict=True)]
+    assert difference[0] > 0.1 * pictures[0][0].mean()
+    assert difference[8] < 1e-3 * difference[0]
+    settled = quiet().expected_counts(random_gray(5), "green")
+    np.testing.assert_allclose(pictures[0][8], settled, rtol=5e-3, atol=10)
+
+
+def test_ripple_is_the_mean_of_five_gains():
+    gray = random_gray(6)
+    seen = VirtualHeadset(small(make_defect("phase_ripple"))).true_irradiance(gray, "green")
+    gains = [
+        VirtualHeadset(small(make_defect("phase_response", gain=1 + 0.14 * u, **LINEAR))).true_irradiance(
+            gray, "green"
+        )
+        for u in (-1, -0.5, 0, 0.5, 1)
+    ]
+    np.testing.assert_allclose(seen, np.mean(gains, 0), atol=2e-5)
+    assert np.abs(seen - gains[2]).max() > 0.05
+
+
+def test_a_rippling_offset_shows_against_light_that_is_not_modulated():
+    surface = make_defect("zero_order", fill_factor=1.0, surface_amplitude=0.4, surface_phase_deg=0.0)
+    ripple = make_defect("phase_ripple", depth=0.0, offset_rad=1.2)
+
+    def centre(*defects):
+        return (
+            VirtualHeadset(small(*defects, propagation=replace(small().propagation, distance_mm=0.3)))
+            .true_irradiance(uniform(), "green")[16:-16, 16:-16]
+            .mean()
+        )
+
+    expected = np.mean([abs(np.exp(1.2j * u) + 0.4) ** 2 for u in (-1, -0.5, 0, 0.5, 1)])
+    assert centre(surface, ripple) == pytest.approx(expected, rel=5e-3)
+    assert centre(ripple) == pytest.approx(centre(), rel=1e-4)
+
+
+def test_drivers_send_light_into_orders_of_their_period():
+    plain = order_power(small(NARROW), uniform(), 0)
+    found = {}
+    for period in (2, 3, 4):
+        bench = small(NARROW, make_defect("drivers", column_period=period, row_offset_rad=0.0))
+        assert 1 - order_power(bench, uniform(), 0) / plain == pytest.approx(0.12**2, rel=0.05)
+        found[period] = [order_power(bench, uniform(), order) for order in (1, -1, 4 / 3, -4 / 3)]
+    assert min(found[4][:2]) > 100 * max(found[2][:2])  # a quarter of a cycle a column
+    assert min(found[4][:2]) > 3 * max(found[3][:2])  # the skirts of their orders overlap
+    assert min(found[3][2:]) > 3 * max(found[4][2:])  # a third
+    # at gray 128 the gains count as well: of half a wave
+    for gains in (0.0, 0.03):
+        bench = small(
+            NARROW,
+            make_defect(
+                "drivers", column_offset_rad=0.0, row_offset_rad=0.0, row_gain=0.0, column_gain=gains
+            ),
+        )
+        lost = 1 - order_power(bench, uniform(128), 0) / plain
+        assert lost == pytest.approx((np.pi * gains) ** 2, rel=0.05, abs=1e-5)
+
+
+def test_drivers_repeat_along_rows_too_and_other_seeds_differ():
+    offsets = [
+        BenchOptics(small(make_defect("drivers", seed=seed))).drive("green").magnitude(np.zeros((H, W)))
+        for seed in (1, 2)
+    ]
+    for offset in offsets:
+        np.testing.assert_array_equal(offset[:, 4:], offset[:, :-4])
+        np.testing.assert_array_equal(offset[2:], offset[:-2])
+        assert offset.mean(0).std() == pytest.approx(0.12, rel=1e-4)
+        assert offset.mean(1).std() == pytest.approx(0.06, rel=1e-4)
+    assert np.abs(offsets[0] - offsets[1]).max() > 0.05
+
+
+def test_a_second_path_interferes_and_its_sign_flips_with_its_phase():
+    def seen(amplitude, phase_deg, shift):
+        ghost = make_defect(
+            "coherent_ghost", amplitude=amplitude, phase_deg=phase_deg, shift_y_px=shift, shift_x_px=-shift
+        )
+        return samples(small(SPOT, ghost), uniform(), 0.5)
+
+    whole = samples(small(SPOT), uniform(), 0.5)[0].sum()
+    for phase in (0, 90, 180):
+        light = seen(0.12, phase, 0.0)[0].sum()
+        assert light / whole == pytest.approx(abs(1 + 0.12 * np.exp(1j * np.deg2rad(phase))) ** 2, rel=1e-3)
+    near, opposite, none = (seen(a, phase, 4.0)[0] for a, phase in ((0.12, 0), (0.12, 180), (0.0, 0)))
+    light, y, x, _ = seen(0.12, 50, 40.0)
+    copy = light * (np.hypot(y - 40, x + 40) < 12)  # far apart, the copy has its share whatever its phase
+    assert copy.sum() / whole == pytest.approx(0.12**2, rel=0.02)
+    term = near - none, opposite - none
+    interference = (term[0] - term[1]) / 2
+    assert interference.sum() > 0.05 * whole
+    assert ((term[0] + term[1]) / 2).sum() == pytest.approx(0.12**2 * whole, rel=0.01)
+
+
+def test_the_delay_of_the_second_path_counts_as_a_gray_levels_does():
+    """Of a blaze of 16 columns, a copy 4 columns on is a quarter of a wave behind; the delay brings it back."""
+    light = {}
+    for phase in (90, -90):
+        ghost = make_defect("coherent_ghost", phase_deg=phase, shift_y_px=0.0, shift_x_px=4.0)
+        light[phase] = samples(small(NARROW, ghost), grating(16), Z)[0].sum()
+    assert light[90] / light[-90] == pytest.approx((1.12 / 0.88) ** 2, rel=0.1)
+
+
+def test_vibration_widens_a_spot_along_its_direction():
+    d = make_defect("vibration", rms_px=1.5, spread=0.0)
+    still, moved = (moments(spot(*more).expected_counts(uniform(), "green") - 64) for more in ((), (d,)))
+    np.testing.assert_allclose(still[0], moved[0], atol=1e-3)
+    turn = np.deg2rad(d.direction_deg)
+    expected = 1.5**2 * np.array([np.sin(turn) ** 2, np.cos(turn) ** 2, np.sin(turn) * np.cos(turn)])
+    np.testing.assert_allclose(np.subtract(moved[1], still[1]), expected, atol=0.02)
+
+
+def test_vibration_differs_from_capture_to_capture():
+    def grown(spread):
+        headset = spot(make_defect("vibration", rms_px=1.5, spread=spread))
+        pictures = [headset.camera.capture() - 64.0 for _ in range(60)]
+        return np.array([sum(moments(p)[1][:2]) for p in pictures])
+
+    base = sum(moments(spot().expected_counts(uniform(), "green") - 64)[1][:2])
+    assert np.ptp(grown(0.0)) < 0.02
+    rms = np.sqrt(np.clip(grown(0.4) - base, 0, None))
+    assert rms.mean() == pytest.approx(1.5, rel=0.15) and rms.std() == pytest.approx(0.6, rel=0.25)
+
+
+def test_the_camera_moves_from_frame_to_frame():
+    def centroids(seed=1, turns=60):
+        headset = spot(make_defect("frame_motion", seed=seed))
+        return np.array([moments(headset.camera.capture() - 64.0)[0] for _ in range(turns)])
+
+    rest = moments(spot().expected_counts(uniform(), "green") - 64)[0]
+    moved = centroids() - rest
+    assert np.abs(moved.mean(0)).max() < 3 * 0.3 / np.sqrt(60)
+    np.testing.assert_allclose(np.sqrt((moved**2).mean(0)), 0.3, rtol=0.25)
+    assert abs(np.corrcoef(moved[1:, 0], moved[:-1, 0])[0, 1]) < 0.4
+    np.testing.assert_array_equal(centroids(turns=3), centroids()[:3])
+    assert np.abs(centroids(2, 3) - centroids(turns=3)).max() > 0.05
+
+
+def test_the_fixed_pattern_is_in_every_capture_and_another_cameras_differs():
+    plain = quiet().expected_counts(uniform(), "green") - 64
+    found = []
+    for seed in (1, 1, 2):
+        headset = quiet(make_defect("fixed_pattern", seed=seed, offset_counts=0.0))
+        headset.camera.capture()
+        found.append(((headset.camera.capture() - 64.0) / plain - 1)[8:-8, 8:-8].ravel())
+    assert found[0].std() == pytest.approx(0.03, rel=0.05)
+    assert np.corrcoef(found[0], found[1])[0, 1] > 0.99
+    assert abs(np.corrcoef(found[0], found[2])[0, 1]) < 0.08
+    dark = quiet(make_defect("fixed_pattern", offset_counts=6.0))
+    dark.lasers.off()
+    offset = dark.camera.capture() - 64.0
+    assert offset.std() == pytest.approx(6.0, rel=0.05) and abs(offset.mean()) < 0.5
+    np.testing.assert_array_equal(dark.camera.capture() - 64.0, offset)
+
+
+def test_several_lines_are_the_sum_of_benches_of_one():
+    gray = random_gray(7)
+    d = make_defect("source_lines", third_separation_nm=-5.0, third_share=0.2)
+    seen = VirtualHeadset(small(d)).true_irradiance(gray, "green")
+    parts = []
+    for apart in (0.0, 6.0, -5.0):
+        # the path difference of a gray level is the panel's: its phase is less for a longer wave
+        response = make_defect("phase_response", gain=520 / (520 + apart), reference_nm=520 + apart, **LINEAR)
+        bench = small(response, channels=(ChannelDescription("green", 520 + apart),))
+        parts.append(VirtualHeadset(bench).true_irradiance(gray, "green"))
+    expected = 0.5 * parts[0] + 0.3 * parts[1] + 0.2 * parts[2]
+    np.testing.assert_allclose(seen, expected, atol=2e-3)
+    assert np.abs(seen - parts[0]).max() > 0.05
+
+
+def passes(iris, fy, fx, nominal="square"):
+    bench = small(iris, iris=IrisDescription(nominal, 1.0))
+    return float(iris_opening(bench).mask(np.array([fy]), np.array([fx]))[0, 0])
+
+
+def test_the_iris_has_a_shape_sides_and_a_rotation_of_its_own():
+    centred = {"half_width": 0.6, "centre_x_share": 0.0, "centre_y_share": 0.0}
+    circle = make_defect("iris", shape="circle", **centred)
+    assert passes(circle, 0.0, 0.55) == 1 and passes(circle, 0.55, 0.55) == 0
+    assert passes(make_defect("iris", shape="square", **centred), 0.55, 0.55, "circle") == 1
+    assert passes(make_defect("iris", **centred), 0.55, 0.55, "circle") == 0  # as bench.toml says
+    oblong = make_defect("iris", half_width_x=0.3, **centred)
+    assert passes(oblong, 0.55, 0.25) == 1 and passes(oblong, 0.25, 0.55) == 0
+    ellipse = replace(oblong, shape="circle")
+    assert passes(ellipse, 0.55, 0.0) == 1 and passes(ellipse, 0.55, 0.25) == 0
+    turned = make_defect("iris", rotation_deg=45.0, **centred)
+    assert passes(turned, 0.0, 0.8) == 1 and passes(turned, 0.55, 0.55) == 0
+    # from x towards y: the long side of a slit along x points to +x, +y
+    slit = make_defect("iris", rotation_deg=45.0, half_width_y=0.05, **centred)
+    assert passes(slit, 0.3, 0.3) == 1 and passes(slit, 0.3, -0.3) == 0
+
+
+def test_a_soft_edge_passes_half_where_a_hard_one_ends():
+    soft = make_defect("iris", half_width=0.6, soft_edge_share=0.2, centre_x_share=0.1, centre_y_share=0.0)
+    found = [passes(soft, 0.0, fx) for fx in (0.55, 0.65, 0.7, 0.75, 0.85)]
+    assert found[0] == 1 and found[4] == 0
+    assert found[1:4] == pytest.approx([0.5 + np.sqrt(0.125), 0.5, 0.5 - np.sqrt(0.125)], abs=1e-6)
+    band = BenchOptics(small(soft)).path("green", Z).band
+    assert 2 * band.fx[-1] >= 0.8 - 2 / band.padded[1]  # the edge's outer half is in the band
+
+
+def test_what_a_round_iris_cuts_off_is_lost():
+    def share(shape):
+        iris = make_defect("iris", half_width=1.0, centre_x_share=0, centre_y_share=0, shape=shape)
+        light, _, _, per_pixel = samples(small(iris), random_gray(8), 3.0)
+        return light.sum() / per_pixel / (H * W)
+
+    f = np.linspace(-0.5, 0.5, 401)
+    power = np.sinc(f)[:, None] ** 2 * np.sinc(f)[None, :] ** 2 * (f[1] - f[0]) ** 2
+    inside = np.hypot(f[:, None], f[None, :]) <= 0.5
+    assert share("circle") == pytest.approx(power[inside].sum(), rel=0.03)
+    assert share("square") == pytest.approx(power.sum(), rel=0.03)
+
+
+def test_a_rough_wavefront_and_beam_have_the_rms_that_is_asked_for():
+    flat, rough = (
+        panel_path_nm(make_defect("panel_wavefront", rough_rms_rad=rms), 4 * H, 4 * W, W / H)
+        for rms in (0.0, 0.15)
+    )
+    added = (rough - flat) * 2 * np.pi / 520
+    assert added.std() == pytest.approx(0.15, rel=1e-6) and abs(added.mean()) < 1e-9
+    plain, spotted = (
+        beam_amplitude(make_defect("illumination", rough_rms=rms), 4 * H, 4 * W) for rms in (0.0, 0.1)
+    )
+    assert np.mean(spotted**2) == pytest.approx(1)
+    assert np.log(spotted / plain).std() == pytest.approx(0.1, rel=1e-6)
+
+
+def test_a_rough_surface_passes_smoothly_through_its_nodes():
+    weights = spline_weights(701, 8)  # seven intervals; cell k's centre is a node at k = 50, 150, ...
+    values = np.random.default_rng(0).standard_normal(8)
+    curve = weights @ values
+    at = (np.arange(701) + 0.5) / 701 * 7
+    np.testing.assert_allclose(np.interp(np.arange(8), at, curve)[1:-1], values[1:-1], atol=2e-3)
+    np.testing.assert_allclose(
+        spline_weights(50, 5) @ np.arange(5.0), (np.arange(50) + 0.5) / 50 * 4, atol=1e-12
+    )
+    assert np.abs(np.diff(curve, 3)).max() < 1e-4 * np.ptp(curve)  # no kinks
+    first, again, other = (rough_surface((7, 9), seed, 60, 80) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert abs(np.corrcoef(first.ravel(), other.ravel())[0, 1]) < 0.5
+
+
+@pytest.mark.parametrize("interferes", [True, False])
+def test_the_gradient_agrees_with_finite_differences(interferes):
+    optics = BenchOptics(
+        small(
+            make_defect("crosstalk"),
+            make_defect("zero_order"),
+            make_defect("phase_response"),
+            make_defect("amplitude_modulation", fall=0.6),
+            make_defect("polarisation_leak", amplitude=0.4, interferes=interferes),
+            make_defect("phase_ripple", offset_rad=0.3),
+            make_defect("drivers"),
+            make_defect("coherent_ghost"),
+            make_defect("source_lines"),
+            make_defect("convention", phase_sign=-1, mirror_x=False),
+        )
+    )
+    rng = np.random.default_rng(9)
+    gray = rng.uniform(20, 230, (H, W))
+    light, pullback = optics.irradiance_and_pullback(gray, "green", Z)
+    weights = rng.standard_normal(light.shape).astype(np.float32)
+    gradient = pullback(weights)
+    for direction in (np.sign(gradient), np.where(gray > 128, 1.0, -0.5) * np.sign(gradient)):
+
+        def value(t, direction=direction):
+            moved = optics.irradiance(gray + t * direction, "green", Z)
+            return float((moved * weights).sum(dtype=np.float64))
+
+        slope = (value(0.05) - value(-0.05)) / 0.1
+        assert slope == pytest.approx((gradient * direction).sum(), rel=2e-3)
+
+
+def test_the_gradient_of_the_amplitude_alone_is_right():
+    """Of light that no phase changes: the total of a beam that clears the iris."""
+    optics = BenchOptics(small(NARROW, make_defect("amplitude_modulation")))
+    gray = np.full((H, W), 120.0)
+    light, pullback = optics.irradiance_and_pullback(gray, "green", Z)
+    gradient = pullback(np.ones_like(light)).sum()
+    slope = (
+        optics.irradiance(gray + 2, "green", Z).sum() - optics.irradiance(gray - 2, "green", Z).sum()
+    ) / 4
+    assert gradient == pytest.approx(slope, rel=1e-3) and gradient < 0
+
+
+def test_a_slow_panel_cannot_be_differentiated():
+    headset = quiet(make_defect("slow_response"))
+    with pytest.raises(InputError, match=r"slow_response.*take the defect out"):
+        headset.oracle_pattern(np.ones((H, W)), "green", iterations=1)
+
+
+def test_the_oracle_allows_for_what_the_drive_does():
+    y, x = np.mgrid[0:H, 0:W]
+    target = 0.2 + 0.8 * (np.hypot(x - W / 2, y - H / 2) < 12)
+    kinds = ("amplitude_modulation", "polarisation_leak", "drivers")
+    true = VirtualHeadset(small(*map(make_defect, kinds)))
+
+    def error(gray):
+        a, b = np.sqrt(np.clip(true.true_irradiance(gray, "green"), 0, None)), np.sqrt(target)
+        return ((a * (a * b).sum() / (a * a).sum() - b) ** 2).mean()
+
+    found = {
+        name: error(one.oracle_pattern(target, "green", iterations=40))
+        for name, one in (("true", true), ("ideal", VirtualHeadset(small())))
+    }
+    assert found["true"] < 0.7 * found["ideal"]
