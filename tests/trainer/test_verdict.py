@@ -94,7 +94,13 @@ def noisy(rng: np.random.Generator, prediction: np.ndarray) -> Batch:
     kinds = [torch.as_tensor(a, dtype=torch.float32) for a in (signal, np.ones_like(signal), variance)]
     gray = torch.zeros((len(prediction), 1, 1), dtype=torch.int32)
     return Batch(
-        "green", 10.0, tuple(map(str, range(len(prediction)))), gray, *kinds, torch.ones(len(prediction)), lambda: gray[:, None]
+        "green",
+        10.0,
+        tuple(map(str, range(len(prediction)))),
+        gray,
+        *kinds,
+        torch.ones(len(prediction)),
+        lambda: gray[:, None],
     )
 
 
@@ -203,8 +209,17 @@ def test_explanations_are_inseparable_where_their_difference_may_be_none() -> No
 def test_json_has_every_threshold() -> None:
     assert Thresholds().as_json() == {
         "level": 0.05,
-        "share": 0.02,
-        "excess": 1e-4,
-        "complete_share": 0.02,
-        "complete_excess": 3e-4,
+        "share": 0.0,
+        "excess": 2e-4,
+        "complete_share": 0.0,
+        "complete_excess": 5e-4,
+        "floor": 0.0,
     }
+
+
+def test_no_threshold_is_below_the_floor_that_the_captures_show() -> None:
+    t = Thresholds(floor=1e-3)
+    assert not t.worth_adding(RemovedExcess(9e-4, 1e-6), 0.5, 18)
+    assert t.worth_adding(RemovedExcess(1.1e-3, 1e-6), 0.5, 18)
+    assert t.complete(9e-4, 0.5) and not t.complete(1.1e-3, 0.5)
+    assert not t.may_be_worth_adding(9e-4, 0.5)

@@ -16,7 +16,7 @@ def threshold_options(parser: ArgumentParser) -> None:
     group = parser.add_argument_group(
         "what counts",
         "Shares are of the ideal model's excess: the mean squared error above the camera's noise, over "
-        "the variance of the measured signal.",
+        "the variance of the measured signal. No threshold is below the floor that repeated pictures show.",
     )
     share = number(0, 1)
     group.add_argument(
@@ -31,28 +31,28 @@ def threshold_options(parser: ArgumentParser) -> None:
         metavar="S",
         type=share,
         default=None,
-        help="an effect must remove more than this share (default 0.02) ...",
+        help="an effect must remove more than this share as well (default 0; 0.02 was the first version's rule)",
     )
     group.add_argument(
         "--min-excess",
         metavar="E",
         type=share,
         default=None,
-        help="... and more than this excess (default 0.0001) to be worth adding",
+        help="an effect must remove more than this excess to be worth adding (default 0.0002)",
     )
     group.add_argument(
         "--complete-share",
         metavar="S",
         type=share,
         default=None,
-        help="a model is complete below this share (default 0.02) ...",
+        help="a model is complete below this share, too (default 0; 0.02 was the first version's rule)",
     )
     group.add_argument(
         "--complete-excess",
         metavar="E",
         type=share,
         default=None,
-        help="... or below this excess (default 0.0003), whichever is larger",
+        help="a model is complete below this excess (default 0.0005)",
     )
 
 

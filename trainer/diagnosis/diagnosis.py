@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from trainer.diagnosis.probes import ProbeResult, probe
 from trainer.diagnosis.ranking import RankedEffect, rank, try_all, try_together_with_present
 from trainer.diagnosis.screen import ScreenResult, screen
 from trainer.diagnosis.separate import captures_that_separate
-from trainer.diagnosis.verdict import Thresholds, below_the_noise, verdict_of
+from trainer.diagnosis.verdict import Thresholds, below_the_noise, noise_floor, verdict_of
 from trainer.effects.definition import STAGES, Effect
 from trainer.effects.effect_catalogue import Catalogue
 from trainer.fitting.gains import with_gains
@@ -90,8 +90,13 @@ class Diagnosis:
         if below_the_noise(self.held_out):
             return overstated_noise(self.held_out, self.model.bench.camera)
         if self.verdict == "complete":
+            also = ""
+            if self.best is not None:
+                share = 100 * self.best.removed.value / max(self.held_out.excess, 1e-12)
+                also = f" {self.best.effect.name} would explain {min(share, 100):.0f} % of that."
             return (
                 f"Nothing is missing: what remains above the camera's noise is {left} of the signal's variance."
+                + also
                 + f" {self.equal_facts.sentence}".rstrip()
             )
         if self.best is None:
@@ -182,10 +187,12 @@ def diagnose(
     model = with_gains(captures, model, roles.fitted)
     before = evaluate_captures(captures, roles.held_out, model)
     ideal_excess = (ideal or (before if not model.present else ideal_errors(roles, model))).excess
+    thresholds = replace(thresholds, floor=noise_floor(captures, before))
     complete = thresholds.complete(before.excess, ideal_excess)
+    little = complete and not thresholds.may_be_worth_adding(before.excess, ideal_excess)
 
     overstated = below_the_noise(before)
-    if overstated or (complete and not with_probes):
+    if overstated or (little and not with_probes):
         return Diagnosis(
             model,
             before,
@@ -209,7 +216,7 @@ def diagnose(
     # The screen says little of an effect whose derivatives do not reach, or that shows from capture to capture only.
     blind = [s for s in order if known[s.effect].rugged or known[s.effect].measure]
     first = promising + [s for s in blind if s not in promising]
-    fits = try_all(roles, model, before, first[:2] if complete else first, pool, report, 0.3, 0.6)
+    fits = try_all(roles, model, before, first[:2] if little else first, pool, report, 0.3, 0.6)
     ranking = rank(before, fits, known, thresholds, ideal_excess, len(candidates))
     if not complete and not any(r.worth_adding for r in ranking):
         rest = [s for s in order if s.effect not in {f.effect for f in fits}]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -209,6 +209,23 @@ def explain(
         save(model)
     steps = [ExplanationStep(None, errors)]
     diagnoses: list[Diagnosis] = []
+
+    def without_unnecessary(
+        model: Model, errors: PredictionErrors, names: Sequence[str]
+    ) -> tuple[Model, PredictionErrors]:
+        """The model without those of the named effects that it does as well without, each a step."""
+        limits = diagnoses[-1].thresholds
+        while True:
+            smaller = _without_one(roles, model, errors, names, limits, ideal.excess)
+            if smaller is None:
+                return model, errors
+            dropped, model, errors = smaller
+            names = [n for n in names if n != dropped]
+            model = recorded(model, None, errors, dropped)
+            steps.append(ExplanationStep(None, errors, removed=dropped))
+            if save:
+                save(model)
+
     while True:
         done = len(steps) - 1
         report_share = part_of(report, 1 - 0.6**done, 1 - 0.6**done * 0.6)
@@ -221,37 +238,36 @@ def explain(
         report_share(0.9, f"adding {best.effect.name}")
         candidate = add_from(roles, best.base, best.model.instance(best.effect.name))
         after = evaluate_captures(captures, roles.held_out, candidate)
-        if not thresholds.worth_adding(removed_excess(errors, after), ideal.excess, 1):
+        if not found.thresholds.worth_adding(removed_excess(errors, after), ideal.excess, 1):
             break
         errors = after
         model = recorded(candidate, best.effect.name, errors)
         steps.append(ExplanationStep(best.effect.name, errors, best.indistinguishable_from))
         if save:
             save(model)
-        smaller = _without_unnecessary(roles, model, errors, best.effect.name, thresholds, ideal.excess)
-        while smaller is not None:
-            dropped, model, errors = smaller
-            model = recorded(model, None, errors, dropped)
-            steps.append(ExplanationStep(None, errors, removed=dropped))
-            if save:
-                save(model)
-            smaller = _without_unnecessary(roles, model, errors, best.effect.name, thresholds, ideal.excess)
+        newest = best.effect.name
+        model, errors = without_unnecessary(model, errors, [n for n in model.names if n != newest])
+    # A last pass: of every effect but the newest it is known already that the rest cannot do without it.
+    if len(model.names) > 1:
+        kept = model.names
+        model, errors = without_unnecessary(model, errors, [steps[-1].added] if steps[-1].added else [])
+        if model.names != kept:
+            found = diagnose(captures, model, known, pool, thresholds, None, ideal, with_probes=False)
+            diagnoses.append(found)
     report(1.0, "done")
     return Explanation(tuple(steps), model, diagnoses[-1], tuple(diagnoses))
 
 
-def _without_unnecessary(
+def _without_one(
     roles: CaptureRoles,
     model: Model,
     errors: PredictionErrors,
-    newest: str,
+    names: Sequence[str],
     thresholds: Thresholds,
     ideal_excess: float,
 ) -> tuple[str, Model, PredictionErrors] | None:
-    """The model without an earlier effect that the newest has made unnecessary, if there is one."""
-    for name in model.names:
-        if name == newest:
-            continue
+    """The model without one of the named effects, if there is one that it does as well without."""
+    for name in names:
         rest = model.without(name)
         batches = load(roles.captures, roles.fitted)
         unexplained = not thresholds.complete(errors.excess, ideal_excess)

@@ -166,7 +166,6 @@ def rank(
     candidates : int
         How many were screened, which the test of each is corrected for.
     """
-    complete = thresholds.complete(before.excess, ideal_excess)
     ordered = sorted(fits, key=lambda f: f.held_out.excess)
     if len(ordered) > 1 and known[ordered[0].effect].same_as == ordered[1].effect:
         first, second = ordered[:2]
@@ -175,7 +174,7 @@ def rank(
     ranked = []
     for one in ordered:
         removed = removed_excess(before, one.held_out)
-        worth_adding = not complete and thresholds.worth_adding(removed, ideal_excess, candidates)
+        worth_adding = thresholds.worth_adding(removed, ideal_excess, candidates)
         alike = tuple(
             other.effect
             for other in ordered
