@@ -7,7 +7,8 @@
      "arrays": {field of LightPath: name of an array}}
 
 Fields that are None in a LightPath are not listed; `crosstalk` is two arrays, crosstalk_rows and
-crosstalk_columns, and `modulation` three: modulation_ends, modulation_factors and modulation_shares. Arrays that several planes or colours share are stored once.
+crosstalk_columns, and `modulation` three: modulation_ends, modulation_factors and modulation_shares.
+Arrays that several planes or colours share are stored once.
 """
 
 from __future__ import annotations

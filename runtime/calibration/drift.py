@@ -12,11 +12,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.interpolate import BSpline
 
 from runtime.lightpath.grid import band_frequencies
 from runtime.lightpath.legendre import edge_to_edge, legendre_maps, legendre_surface
 from runtime.lightpath.light_path import LightPath
+from runtime.lightpath.spline_maps import spline_surface
 
 LOWEST_WAVEFRONT, LOWEST_AMPLITUDE = 2, 1  # Legendre orders: without piston and tilt; without power
 
@@ -50,12 +50,12 @@ class Drift:
 
     def wavefront(self, shape: tuple[int, int]) -> np.ndarray:
         """The path difference over the panel, nm, float64 [H, W]."""
-        fine = _spline_surface(self.wavefront_nodes_nm, shape)
+        fine = spline_surface(self.wavefront_nodes_nm, shape)
         return _legendre_surface(self.wavefront_nm, shape, LOWEST_WAVEFRONT) + fine
 
     def amplitude(self, channel: str, shape: tuple[int, int]) -> np.ndarray:
         """The factor on a colour's amplitude over the panel, float64 [H, W]."""
-        fine = _spline_surface(self.amplitude_nodes.get(channel, np.zeros((0, 0))), shape)
+        fine = spline_surface(self.amplitude_nodes.get(channel, np.zeros((0, 0))), shape)
         return np.exp(
             _legendre_surface(self.log_amplitude.get(channel, np.zeros(0)), shape, LOWEST_AMPLITUDE) + fine
         )
@@ -93,21 +93,6 @@ def wavefront_maps(shape: tuple[int, int], order: int) -> np.ndarray:
 def amplitude_maps(shape: tuple[int, int], order: int) -> np.ndarray:
     """The maps that `Drift.log_amplitude` has a term for, up to an order: float64 [count, H, W]."""
     return legendre_maps(*edge_to_edge(shape), order, LOWEST_AMPLITUDE)
-
-
-def node_weights(pixels: int, nodes: int) -> np.ndarray:
-    """Weights of evenly spaced nodes of a cubic B-spline at pixels along an axis: float64 [pixels, nodes]."""
-    ends = np.full(3, -0.5), np.full(3, pixels - 0.5)
-    knots = np.concatenate([ends[0], np.linspace(-0.5, pixels - 0.5, nodes - 2), ends[1]])
-    return np.asarray(BSpline.design_matrix(np.arange(pixels), knots, 3).toarray())
-
-
-def _spline_surface(nodes: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """The surface [H, W] of a cubic B-spline's nodes; 0 without nodes."""
-    if not nodes.size:
-        return np.zeros(shape)
-    rows, columns = (node_weights(n, m) for n, m in zip(shape, nodes.shape, strict=True))
-    return np.asarray(rows @ nodes @ columns.T)
 
 
 def _legendre_surface(terms: np.ndarray, shape: tuple[int, int], lowest: int) -> np.ndarray:

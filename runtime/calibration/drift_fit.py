@@ -219,7 +219,9 @@ def _columns(
         """For a relative change [H, W] of the field that leaves the panel."""
         factor = factor.astype(path.source.dtype)
         leak = None if path.leak is None else path.leak * factor
-        moved = [panel_spectrum(replace(one, source=one.source * factor, leak=leak), phase) for one in exposure]
+        moved = [
+            panel_spectrum(replace(one, source=one.source * factor, leak=leak), phase) for one in exposure
+        ]
         return change(lambda k, m: image_field(path, moved[k], m))
 
     shape, place = path.grid.shape, int(layout.edges[1])

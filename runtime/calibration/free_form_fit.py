@@ -16,11 +16,12 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import minimize
 
-from runtime.calibration.drift import drifted, node_weights
+from runtime.calibration.drift import drifted
 from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, gain_of, light_on_camera
 from runtime.camera.view import sampler_and_adjoint
 from runtime.lightpath.light_path import panel_phase
 from runtime.lightpath.light_path_adjoint import irradiance_and_pullback
+from runtime.lightpath.spline_maps import node_weights, nodes_over
 from runtime.program.progress import Progress
 
 NODE = 4  # panel pixels
@@ -105,5 +106,5 @@ def fit_freeform(
 
 def nodes_of(shape: tuple[int, int]) -> tuple[int, int]:
     """Nodes of a map over a panel of that shape, (rows, columns)."""
-    rows, columns = (min(-(-n // NODE) + 3, most) for n, most in zip(shape, MOST, strict=True))
+    rows, columns = (min(n, most) for n, most in zip(nodes_over(shape, NODE), MOST, strict=True))
     return rows, columns

@@ -71,13 +71,38 @@ def irradiance_and_pullback(
             gradient = irfft2(rfft2(gradient) * xp.conj(path.irradiance_filter), path.grid.image_shape)
         total = 0
         for state, fields in kept:
-            back = 0
-            for mode, z in enumerate(fields):
-                back = back + _image_field_adjoint(state, 2 * state.weights[mode] * gradient * z, mode)
+            back = _over_modes(state, fields, gradient)
             total = total + _panel_spectrum_adjoint(state, phase, back, factor)
         return total
 
     return filter_irradiance(path, image), pullback
+
+
+def irradiance_and_field_pullback(path: LightPath, phase: Array) -> tuple[Array, Callable[[Array], Array]]:
+    """`mode_irradiance` of a phase, and the function from a loss's gradient over it to the one over the panel's field.
+
+    Parameters
+    ----------
+    path : LightPath
+        Without crosstalk; of a modulation, the first state counts.
+    phase : float array [..., H, W], rad
+
+    Returns
+    -------
+    irradiance : float array [..., *grid.image_shape]
+        Before the path's irradiance filter.
+    pullback : callable
+        Takes a gradient of that shape and returns G, complex [..., H, W]: a change d of the field that leaves the
+        panel changes the loss by Re(conj(G) d).
+    """
+    spectrum = panel_spectrum(path, phase)
+    fields = [image_field(path, spectrum, mode) for mode in range(path.transfers.shape[0])]
+
+    def pullback(gradient: Array) -> Array:
+        back = _over_modes(path, fields, gradient)
+        return _field_adjoint(path, aperture_spectrum(path, phase, (1, 1)) * back)
+
+    return sum_modes(path, fields), pullback
 
 
 def pixel_irradiance_adjoint(path: LightPath, gradient: Array) -> Array:
@@ -88,6 +113,18 @@ def pixel_irradiance_adjoint(path: LightPath, gradient: Array) -> Array:
     rows, columns = pixel_slices(grid)
     fine[..., rows, columns] = gradient
     return irfft2(rfft2(fine) * pixel_area_spectrum(grid, gradient), grid.image_shape)
+
+
+def _over_modes(path: LightPath, fields: list[Array], gradient: Array) -> Array:
+    """Gradient over the panel's spectrum from the one over irradiance before filters."""
+    back = 0
+    for mode, z in enumerate(fields):
+        back = back + _image_field_adjoint(path, 2 * path.weights[mode] * gradient * z, mode)
+    return back
+
+
+def _field_adjoint(path: LightPath, spectrum: Array) -> Array:
+    return _row_spectrum_adjoint(path.grid, _column_spectrum_adjoint(path.grid, spectrum))
 
 
 def _image_field_adjoint(path: LightPath, z: Array, mode: int) -> Array:
@@ -120,8 +157,7 @@ def _panel_spectrum_adjoint(path: LightPath, phase: Array, spectrum: Array, fact
         return xp.cos(driven) * xp.imag(turned) - xp.sin(driven) * xp.real(turned)
 
     if path.crosstalk is None:
-        back = _column_spectrum_adjoint(path.grid, aperture_spectrum(path, phase, (1, 1)) * spectrum)
-        return here(_row_spectrum_adjoint(path.grid, back), phase)
+        return here(_field_adjoint(path, aperture_spectrum(path, phase, (1, 1)) * spectrum), phase)
     ky, kx = path.crosstalk
     sub = (ky.shape[0], kx.shape[0])
     spectrum = aperture_spectrum(path, phase, sub) * spectrum / (sub[0] * sub[1])

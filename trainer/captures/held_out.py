@@ -6,7 +6,7 @@ side.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -67,6 +67,29 @@ def split(captures: CaptureSet) -> CaptureSplit:
 def scenes(captures: Iterable[Capture]) -> list[tuple[str, float]]:
     """(channel, plane) pairs in order of appearance."""
     return list(dict.fromkeys((c.channel, c.plane_mm) for c in captures))
+
+
+def with_stopping(rows: Sequence[Capture], most: int) -> tuple[list[Capture], list[Capture]]:
+    """Captures for a descent's gradient, and one of each colour and plane that says when to stop.
+
+    Parameters
+    ----------
+    rows : sequence of Capture
+    most : int
+        For the gradient, over all colours and planes; at least one for each.
+
+    Returns
+    -------
+    list of Capture, list of Capture
+        The same capture is in both only where a colour and plane has no other.
+    """
+    last = list({(c.channel, c.plane_mm): c for c in rows}.values())
+    each = max(1, most // max(1, len(last)))
+    first: list[Capture] = []
+    for scene in scenes(rows):
+        own = [c for c in rows if (c.channel, c.plane_mm) == scene]
+        first += ([c for c in own if c not in last] or own)[:each]
+    return first, last
 
 
 def sample(captures: Iterable[Capture], pixels: int, most: int) -> list[Capture]:

@@ -11,12 +11,13 @@ from runtime.excess import PredictionErrors, removed_excess
 from runtime.program.progress import Progress, no_progress, part_of
 from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet
-from trainer.captures.held_out import CaptureRoles, capture_roles
+from trainer.captures.held_out import FIT_CAPTURES, CaptureRoles, capture_roles, with_stopping
 from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors
 from trainer.diagnosis.screen import ScreenResult, screen_batches
-from trainer.diagnosis.verdict import Thresholds
+from trainer.diagnosis.verdict import Thresholds, below_the_noise
 from trainer.effects.definition import Effect
 from trainer.effects.effect_catalogue import Catalogue
+from trainer.fitting.free_form_effects import can_go_on, refined, with_free_form
 from trainer.fitting.gains import with_gains
 from trainer.fitting.gauss_newton import fit
 from trainer.fitting.pool import Pool
@@ -76,17 +77,21 @@ class ExplanationStep:
         Effects that the captures cannot tell the added one from.
     removed : str or None
         The effect that was taken out.
+    refined : str or None
+        The effect of an earlier step whose map went on in free form.
     """
 
     added: str | None
     held_out: PredictionErrors
     indistinguishable_from: tuple[str, ...] = ()
     removed: str | None = None
+    refined: str | None = None
 
     def as_json(self) -> dict[str, Any]:
         """A row of the key `steps` of `explain --json`.
 
-        Keys `added`, `nrmse`, `excess` and `indistinguishable_from`; `removed` only where an effect was taken out.
+        Keys `added`, `nrmse`, `excess` and `indistinguishable_from`; `removed` only where an effect was taken out, and
+        `refined` only where the map of an earlier one went on in free form.
         """
         record: dict[str, Any] = {
             "added": self.added,
@@ -96,6 +101,8 @@ class ExplanationStep:
         }
         if self.removed:
             record["removed"] = self.removed
+        if self.refined:
+            record["refined"] = self.refined
         return record
 
 
@@ -164,6 +171,9 @@ def add(
     report(0.3, f"fitting {effect.name}")
     added = add_from(roles, model, start)
     after = evaluate_captures(captures, roles.held_out, added)
+    report(0.7, f"looking whether the map of {effect.name} goes on")
+    limits = Thresholds()
+    added, after = gone_on(roles, added, effect.name, after, limits) or (added, after)
     added = recorded(added, effect.name, after)
     report(1.0, "done")
     return Addition(effect.name, added, before, after, roles.is_held_out)
@@ -176,6 +186,35 @@ def add_from(roles: CaptureRoles, model: Model, start: EffectInstance) -> Model:
     fitted = fit_from(model, start, batches)
     fitted = raise_order(fitted, name, batches, least_for_order)
     return settled(fitted.model, batches).model if len(fitted.model.names) > 1 else fitted.model
+
+
+def gone_on(
+    roles: CaptureRoles, model: Model, name: str, errors: PredictionErrors, thresholds: Thresholds
+) -> tuple[Model, PredictionErrors] | None:
+    """The model with an effect's map gone on in free form, and its held-out errors, where held-out captures say so.
+
+    Parameters
+    ----------
+    errors : PredictionErrors
+        Of `model` on the held-out captures.
+
+    Returns
+    -------
+    (Model, PredictionErrors) or None
+        None where the effect has no map, or where nothing is left that a map is worth.
+    """
+    present = model.instance(name)
+    if present.effect.free_form is None or present.nodes is not None or not roles.is_held_out:
+        return None
+    if thresholds.complete(errors.excess, errors.excess):
+        return None
+    first, last = with_stopping(roles.probed, FIT_CAPTURES)
+    further = with_free_form(model, name, load(roles.captures, first), load(roles.captures, last))
+    if further is None:
+        return None
+    after = evaluate_captures(roles.captures, roles.held_out, further)
+    worth = thresholds.worth_adding(removed_excess(errors, after), errors.excess, 1)
+    return (further, after) if worth else None
 
 
 def explain(
@@ -234,10 +273,24 @@ def explain(
         diagnoses.append(found)
         best = found.best
         if best is None or len(model.names) >= MOST_EFFECTS:
-            break
+            went_on = None
+            if found.verdict == "outside_catalogue" and not below_the_noise(errors):
+                report_share(0.9, "looking whether maps go on")
+                went_on = _any_gone_on(roles, model, errors, found.thresholds)
+            if went_on is None:
+                break
+            name, model, errors = went_on
+            model = recorded(model, None, errors, refined=name)
+            steps.append(ExplanationStep(None, errors, refined=name))
+            if save:
+                save(model)
+            continue
         report_share(0.9, f"adding {best.effect.name}")
         candidate = add_from(roles, best.base, best.model.instance(best.effect.name))
         after = evaluate_captures(captures, roles.held_out, candidate)
+        candidate, after = _with_maps_again(roles, candidate, after)
+        further = gone_on(roles, candidate, best.effect.name, after, found.thresholds)
+        candidate, after = further or (candidate, after)
         if not found.thresholds.worth_adding(removed_excess(errors, after), ideal.excess, 1):
             break
         errors = after
@@ -256,6 +309,30 @@ def explain(
             diagnoses.append(found)
     report(1.0, "done")
     return Explanation(tuple(steps), model, diagnoses[-1], tuple(diagnoses))
+
+
+def _any_gone_on(
+    roles: CaptureRoles, model: Model, errors: PredictionErrors, thresholds: Thresholds
+) -> tuple[str, Model, PredictionErrors] | None:
+    """The effect whose map, gone on in free form, leaves least, if there is one that is worth it."""
+    found = []
+    for name in can_go_on(model):
+        further = gone_on(roles, model, name, errors, thresholds)
+        if further is not None:
+            found.append((name, *further))
+    return min(found, key=lambda one: one[2].excess, default=None)
+
+
+def _with_maps_again(
+    roles: CaptureRoles, model: Model, errors: PredictionErrors
+) -> tuple[Model, PredictionErrors]:
+    """The model with the maps that it has fitted again, next to a new effect: they give back what was not theirs."""
+    if all(p.nodes is None for p in model.present):
+        return model, errors
+    first, last = with_stopping(roles.probed, FIT_CAPTURES)
+    again = refined(model, load(roles.captures, first), load(roles.captures, last))
+    after = evaluate_captures(roles.captures, roles.held_out, again)
+    return (again, after) if after.excess < errors.excess else (model, errors)
 
 
 def _without_one(

@@ -7,7 +7,7 @@ effect fits. A fitted probe is a picture that shows a fringe, a speck or a strip
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,7 @@ from runtime.lightpath.light_path import mode_irradiance, panel_phase, panel_spe
 from runtime.lightpath.modulation import states
 from trainer.captures.batches import Batch, load, load_batch
 from trainer.captures.capture_set import chosen, opened
-from trainer.captures.capture_table import Capture
-from trainer.captures.held_out import scenes
+from trainer.captures.held_out import with_stopping
 from trainer.fitting.free_form_maps import FreeFormBatch, FreeFormStage, MapPicture, Tensors, descend
 from trainer.model.model import Model
 from trainer.prediction.panel_field import UNITS, resized, with_field
@@ -108,9 +107,8 @@ def probe(
     """
     captures = opened(folder)
     rows = chosen(captures, ids)
-    last = {(c.channel, c.plane_mm): c for c in rows}.values()
-    each = max(1, CAPTURES[stage] // len(last))
-    batches = load(captures, [c for scene in scenes(rows) for c in _of(scene, rows, last)[:each]])
+    first, last = with_stopping(rows, CAPTURES[stage])
+    batches = load(captures, first)
     free = PROBES[stage](model, batches[0])
     scale = sum(float(b.errors(torch.zeros_like(b.signal)).variance.sum()) for b in batches)
     # One capture a colour and plane is kept from the gradient and says when to stop.
@@ -122,12 +120,6 @@ def probe(
             held = FreeFormBatch(model, load_batch(captures, [row]))
             parts.append(held.batch.errors(held.predict(free, found, 0)))
         return ProbeFit(stage, joined(parts), tuple(free.pictures(found)))
-
-
-def _of(scene: tuple[str, float], rows: list[Capture], last: Collection[Capture]) -> list[Capture]:
-    """A scene's captures except the one that says when to stop, unless it is the only one."""
-    own = [c for c in rows if (c.channel, c.plane_mm) == scene]
-    return [c for c in own if c not in last] or own
 
 
 def _drive(model: Model, batch: Batch) -> FreeFormStage:

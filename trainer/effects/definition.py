@@ -16,6 +16,7 @@ import numpy as np
 from firmware_iface.errors import InputError
 from trainer.captures.bench_file import Bench
 from trainer.effects.docstring import effect_text
+from trainer.effects.free_form import FreeForm
 from trainer.formatting import UNIT_SUFFIX
 
 STAGES = ("drive", "panel", "pupil", "sensor")
@@ -122,6 +123,8 @@ class Effect:
         `apply` takes the effect's order as the keyword `order`.
     same_as : str
         The effect that it equals in captures of one colour and plane, where it is no candidate; "" for none.
+    free_form : FreeForm or None
+        How the effect's map goes on where its polynomials end.
     formula : str
         LaTeX, without dollar signs; "" where none is given.
     description : str
@@ -144,6 +147,7 @@ class Effect:
     source: str = "built in"
     takes_order: bool = False
     same_as: str = ""
+    free_form: FreeForm | None = None
     formula: str = ""
     description: str = ""
     references: tuple[str, ...] = ()
@@ -165,6 +169,7 @@ def effect(
     measure: Callable[..., dict[str, Any]] | None = None,
     told_to: str | None = None,
     same_as: str = "",
+    free_form: FreeForm | None = None,
     formula: str = "",
 ) -> Callable[[Callable[..., Any]], Effect]:
     """Make an effect of a function: its name is the function's, its description the docstring's first line.
@@ -175,7 +180,7 @@ def effect(
 
     Parameters
     ----------
-    stage, acts_on, parameters, orders, starts, touches_iris, rugged, measure, same_as, formula
+    stage, acts_on, parameters, orders, starts, touches_iris, rugged, measure, same_as, free_form, formula
         As in `Effect`.
     told_to : str, optional
         The former name of `acts_on`.
@@ -227,6 +232,7 @@ def effect(
             source,
             takes_order,
             same_as,
+            free_form,
             formula.strip(),
             text.description,
             text.references,

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from runtime.lightpath.legendre import legendre_count, legendre_curve, legendre_surface
 from trainer.effects.definition import Parameter, effect
+from trainer.effects.free_form import FreeForm
 from trainer.effects.term_names import curve_terms, driver_terms, surface_terms
 from trainer.prediction.stages import Drive
 
@@ -20,7 +21,7 @@ REACH = 2  # neighbours on either side that act on a pixel
 @effect(
     stage="drive",
     acts_on="display",
-    orders=(2, 4, 6),
+    orders=(2, 4, 6, 10, 16),
     parameters=[
         Parameter(
             "gain",
@@ -69,10 +70,15 @@ def phase_response(drive: Drive, gain: Tensor, curvature: Tensor) -> Drive:
     return replace(drive, response=drive.response * gain + drive.sign * bend)
 
 
+def _scaled(drive: Drive, change: Tensor) -> Drive:
+    return drive.scaled(1 + change)
+
+
 @effect(
     stage="drive",
     acts_on="display",
     orders=(2, 4, 6, 8, 10),
+    free_form=FreeForm(_scaled, "1", 0.02),
     parameters=[
         Parameter(
             "map",
@@ -103,7 +109,7 @@ def phase_nonuniformity(drive: Drive, map: Tensor) -> Drive:
     Schroff et al. 2024, Rapid stochastic spatial light modulator calibration and pixel crosstalk optimisation,
     arXiv:2408.07672.
     """
-    return drive.scaled(1 + legendre_surface(map, drive.y, drive.x))
+    return _scaled(drive, legendre_surface(map, drive.y, drive.x))
 
 
 @effect(

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from runtime.lightpath.legendre import legendre_count, legendre_surface
 from trainer.effects.definition import Parameter, effect
-from trainer.effects.starts import wavefront_starts
+from trainer.effects.free_form import FreeForm
+from trainer.effects.starts import coherent_ghost_starts, wavefront_starts
 from trainer.effects.term_names import surface_terms
 from trainer.prediction.stages import Panel
 
@@ -86,10 +87,15 @@ def zero_order(
     return replace(panel.leaking(leak), aperture=torch.stack((side, side)))
 
 
+def _brightened(panel: Panel, log_amplitude: Tensor) -> Panel:
+    return panel.multiplied(torch.exp(log_amplitude))
+
+
 @effect(
     stage="panel",
     acts_on="display",
     orders=(2, 4, 6, 8),
+    free_form=FreeForm(_brightened, "1", 0.05),
     parameters=[
         Parameter(
             "log_amplitude",
@@ -117,7 +123,12 @@ def illumination(panel: Panel, log_amplitude: Tensor) -> Panel:
     Čižmár et al. 2010, In situ wavefront correction and its application to micromanipulation, Nat. Photonics 4,
     388.
     """
-    return panel.multiplied(torch.exp(legendre_surface(log_amplitude, panel.y, panel.x)))
+    return _brightened(panel, legendre_surface(log_amplitude, panel.y, panel.x))
+
+
+def _delayed(panel: Panel, wavefront: Tensor) -> Panel:
+    phase = wavefront * (panel.reference_wavelength / panel.wavelength)
+    return panel.multiplied(torch.polar(torch.ones_like(phase), phase))
 
 
 @effect(
@@ -125,6 +136,7 @@ def illumination(panel: Panel, log_amplitude: Tensor) -> Panel:
     acts_on="display",
     orders=(2, 4, 6, 8, 10),
     starts=wavefront_starts,
+    free_form=FreeForm(_delayed, "rad", 0.1),
     parameters=[
         Parameter(
             "wavefront",
@@ -152,5 +164,46 @@ def panel_wavefront(panel: Panel, wavefront: Tensor) -> Panel:
     Čižmár et al. 2010, In situ wavefront correction and its application to micromanipulation, Nat. Photonics 4,
     388.
     """
-    phase = legendre_surface(wavefront, panel.y, panel.x) * (panel.reference_wavelength / panel.wavelength)
-    return panel.multiplied(torch.polar(torch.ones_like(phase), phase))
+    return _delayed(panel, legendre_surface(wavefront, panel.y, panel.x))
+
+
+@effect(
+    stage="panel",
+    acts_on="display",
+    starts=coherent_ghost_starts,
+    parameters=[
+        Parameter(
+            "real",
+            "1",
+            scale=0.01,
+            low=-1,
+            high=1,
+            about="amplitude of the copy in phase with the light itself",
+            typical=(-0.3, 0.3),
+            example=0.15,
+        ),
+        Parameter(
+            "imaginary",
+            "1",
+            scale=0.01,
+            low=-1,
+            high=1,
+            about="amplitude a quarter wave ahead",
+            typical=(-0.3, 0.3),
+        ),
+        Parameter("shift_y", "pixels", scale=0.2, low=-200, high=200, typical=(-30, 30), example=3.0),
+        Parameter("shift_x", "pixels", scale=0.2, low=-200, high=200, typical=(-30, 30), example=6.0),
+    ],
+    formula=r"u'(\mathbf{r}) = u(\mathbf{r}) + a\,u(\mathbf{r} - \mathbf{s}), \qquad a = a_\mathrm{r} + j\,a_\mathrm{i}",
+)
+def coherent_ghost(panel: Panel, real: Tensor, imaginary: Tensor, shift_y: Tensor, shift_x: Tensor) -> Panel:
+    """A second path of the light, displaced and delayed, interferes with the first.
+
+    Light that is reflected twice inside a thin window arrives displaced and a little later, within the laser's
+    coherence. It interferes with the light itself: fringes that move with the pattern.
+
+    References
+    ----------
+    Born and Wolf 1999, Principles of Optics, section 7.6.
+    """
+    return panel.copied(torch.complex(real, imaginary), shift_y, shift_x)

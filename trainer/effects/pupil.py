@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from trainer.effects.definition import Parameter, effect
+from trainer.effects.free_form import FreeForm
 from trainer.effects.starts import distance_starts, wavelength_starts
 from trainer.effects.term_names import aberration_terms
 from trainer.effects.zernike import zernike_count, zernike_maps
@@ -86,10 +87,15 @@ def wavelength(pupil: Pupil, offset: Tensor) -> Pupil:
     return pupil.emitting(1e-9 * offset.reshape(1), torch.ones(1, dtype=offset.dtype))
 
 
+def _delayed(pupil: Pupil, waves: Tensor) -> Pupil:
+    return pupil.delayed(waves * pupil.reference_wavelength)
+
+
 @effect(
     stage="pupil",
     acts_on="display",
     orders=(4, 6),
+    free_form=FreeForm(_delayed, "waves", 0.02),
     parameters=[
         Parameter(
             "zernike",
@@ -119,7 +125,7 @@ def pupil_aberration(pupil: Pupil, zernike: Tensor, *, order: int) -> Pupil:
     Goodman, Introduction to Fourier Optics, section 6.4.
     """
     maps = zernike_maps(pupil.v, pupil.u, order, without_defocus=True)
-    return pupil.delayed(torch.tensordot(zernike, maps, dims=1) * pupil.reference_wavelength)
+    return _delayed(pupil, torch.tensordot(zernike, maps, dims=1))
 
 
 @effect(
@@ -246,6 +252,51 @@ def temporal_coherence(pupil: Pupil, line_width: Tensor) -> Pupil:
         torch.as_tensor(a / s, dtype=line_width.dtype) for a, s in zip(rule, (1, rule[1].sum()), strict=True)
     )
     return pupil.emitting(nodes * line_width * 1e-9 / FWHM, weights)
+
+
+@effect(
+    stage="pupil",
+    acts_on="display",
+    orders=(1, 2),
+    parameters=[
+        Parameter(
+            "separation",
+            "nm",
+            scale=0.2,
+            absent=4.0,
+            low=-60,
+            high=60,
+            count=lambda order: order,
+            starts=(-24.0, -12.0, -6.0, -3.0, -1.5, 1.5, 3.0, 6.0, 12.0, 24.0),
+            about="of each further line from the stated wavelength",
+            typical=(-20, 20),
+        ),
+        Parameter(
+            "share",
+            "1",
+            scale=0.03,
+            low=-0.2,
+            high=0.95,
+            count=lambda order: order,
+            about="of the light in each further line",
+            typical=(0, 0.5),
+            example=0.4,
+        ),
+    ],
+    formula=r"I = \Bigl(1 - \sum_k\,p_k\Bigr)\,I_\lambda + \sum_k\,p_k\,I_{\lambda+\delta_k}",
+)
+def source_lines(pupil: Pupil, separation: Tensor, share: Tensor) -> Pupil:
+    """The source has two or more spectral lines or modes.
+
+    A laser diode may emit in several modes at once, and a lamp in several lines. Each forms its own picture with its
+    own diffraction, and they add as light: beside every bright point stands a second, displaced outwards or inwards.
+
+    References
+    ----------
+    Saleh and Teich 2007, Fundamentals of Photonics, chapter 17.
+    """
+    offsets = torch.cat((torch.zeros_like(separation[:1]), 1e-9 * separation))
+    return pupil.emitting(offsets, torch.cat((1 - share.sum().reshape(1), share)))
 
 
 @effect(

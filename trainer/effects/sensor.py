@@ -10,6 +10,7 @@ from torch import Tensor
 
 from runtime.lightpath.legendre import legendre_count, legendre_curve, legendre_surface
 from trainer.effects.definition import Parameter, effect
+from trainer.effects.free_form import FreeForm
 from trainer.effects.pupil import kernel_transfer
 from trainer.effects.starts import gain_spread, ghost_starts, registration_starts
 from trainer.effects.term_names import curve_terms, distortion_terms, surface_terms, surface_terms_with_mean
@@ -161,10 +162,15 @@ def misregistration(
     return sensor.displaced(dy + rows, dx + columns)
 
 
+def _brightened(sensor: Sensor, log_gain: Tensor) -> Sensor:
+    return sensor.multiplied(torch.exp(log_gain))
+
+
 @effect(
     stage="sensor",
     acts_on="camera",
     orders=(2, 4, 6),
+    free_form=FreeForm(_brightened, "1", 0.05),
     parameters=[
         Parameter(
             "log_gain",
@@ -192,13 +198,14 @@ def vignetting(sensor: Sensor, log_gain: Tensor) -> Sensor:
     Goldman 2010, Vignette and exposure calibration and compensation, IEEE Trans. Pattern Anal. Mach. Intell. 32,
     2276.
     """
-    return sensor.multiplied(torch.exp(legendre_surface(log_gain, sensor.y, sensor.x)))
+    return _brightened(sensor, legendre_surface(log_gain, sensor.y, sensor.x))
 
 
 @effect(
     stage="sensor",
     acts_on="camera",
     orders=(1, 2, 4, 6, 8),
+    free_form=FreeForm(Sensor.brightened, "counts", 5.0),
     parameters=[
         Parameter(
             "counts",
@@ -231,7 +238,7 @@ def stray_light(sensor: Sensor, counts: Tensor) -> Sensor:
 @effect(
     stage="sensor",
     acts_on="camera",
-    orders=(2, 4, 6),
+    orders=(2, 4, 6, 10),
     parameters=[
         Parameter(
             "bend",

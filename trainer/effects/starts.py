@@ -15,12 +15,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from runtime.lightpath.grid import at_pixels
+from runtime.lightpath.light_path import image_field, panel_phase, panel_spectrum
 from trainer.captures.bench_file import Bench
 from trainer.captures.conventions import Sample
 from trainer.captures.distance_search import best_distance
 from trainer.effects.evidence import Evidence
-from trainer.prediction.predict import bare_irradiance
-from trainer.prediction.scene import scene_at
+from trainer.prediction.predict import bare_irradiance, light_path
+from trainer.prediction.scene import bare_stages, scene_at
 
 Starts = list[dict[str, Any]]
 SEARCHED = 2  # captures of a colour and plane on which its distance is searched
@@ -168,6 +170,69 @@ def ghost_starts(evidence: Sequence[Evidence], most: int = 3) -> Starts:
             for b in range(-2, 3):
                 correlation[(i + a) % height, (j + b) % width] = 0
     return starts
+
+
+def coherent_ghost_starts(evidence: Sequence[Evidence], most: int = 2) -> Starts:
+    """Displacements (panel pixels) and amplitudes of a second field that interferes with the first.
+
+    A copy a u(r - s) changes irradiance by 2 Re[a* u(r) u*(r - s)]. So the correlation of the residual times the
+    field with the field has its peak at the displacement, and the peak's phase is the copy's.
+    """
+    one = evidence[0]
+    scene, batch = one.scene, one.batch
+    with torch.no_grad():
+        stages = bare_stages(scene)
+        path = light_path(scene, stages)
+        total = None
+        for k in range(min(SEARCHED, len(batch.ids))):
+            spectrum = panel_spectrum(path, panel_phase(path, batch.gray[k : k + 1]))
+            field = at_pixels(scene.grid, image_field(path, spectrum, 0))[0].numpy()
+            power = float((np.abs(field) ** 2).sum())
+            residual = _on_panel_pixels(scene.bench, ((batch.signal - one.prediction) * batch.mask)[k])
+            scale = float(one.prediction[k].sum()) / max(power, 1e-30)
+            shape = [2 * n for n in field.shape]
+            cross = np.fft.fft2(residual * field, shape) * np.conj(np.fft.fft2(field, shape))
+            found = np.fft.ifft2(cross) / max(scale * power**2 / field.size, 1e-30)
+            total = found if total is None else total + found
+    assert total is not None
+    total = total / min(SEARCHED, len(batch.ids))
+    size = np.abs(total)
+    starts = []
+    for _ in range(most):
+        for a, b in _near(0, 0, size.shape):
+            size[a, b] = 0
+        i, j = (int(n) for n in np.unravel_index(int(size.argmax()), size.shape))
+        amplitude = complex(total[i, j])
+        shift = [n - full if n > full / 2 else n for n, full in zip((i, j), size.shape, strict=True)]
+        starts.append(
+            {
+                "real": float(np.clip(amplitude.real, -0.5, 0.5)),
+                "imaginary": float(np.clip(amplitude.imag, -0.5, 0.5)),
+                "shift_y": float(shift[0]),
+                "shift_x": float(shift[1]),
+            }
+        )
+        for a, b in _near(i, j, size.shape):
+            size[a, b] = 0
+    return starts
+
+
+def _near(i: int, j: int, shape: tuple[int, ...]) -> list[tuple[int, int]]:
+    """Places at most two samples from one, on a period."""
+    return [((i + a) % shape[0], (j + b) % shape[1]) for a in range(-2, 3) for b in range(-2, 3)]
+
+
+def _on_panel_pixels(bench: Bench, picture: torch.Tensor) -> NDArray:
+    """A camera's picture summed into the panel pixels that its pixels look at: [H, W]."""
+    if bench.camera.registered:
+        return picture.double().numpy()
+    y, x = bench.camera.looks_at()
+    rows, columns = np.rint(y).astype(int), np.rint(x).astype(int)
+    height, width = bench.panel.shape
+    inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+    total = np.zeros((height, width))
+    np.add.at(total, (rows[inside], columns[inside]), picture.double().numpy()[inside])
+    return total
 
 
 def gain_spread(evidence: Sequence[Evidence]) -> dict[str, Any]:

@@ -12,6 +12,8 @@ from trainer.fitting.predictor import Predictor
 from trainer.fitting.start_points import pattern_search
 from trainer.model.model import EffectInstance, Model, raised
 
+POLYNOMIALS = 6  # order from which a map goes on in free form, where its effect has one
+
 
 def settled(model: Model, batches: Sequence[Batch]) -> FitResult:
     """The model with all of its effects fitted together, and their orders raised as far as that helps."""
@@ -47,6 +49,8 @@ def raise_order(
 ) -> FitResult:
     """Raise the order of an effect's map or curve while the error keeps falling.
 
+    A map that can go on in free form is raised to order POLYNOMIALS only: beyond it splines cost less.
+
     Parameters
     ----------
     fitted : FitResult
@@ -59,7 +63,8 @@ def raise_order(
     while True:
         present = fitted.model.instance(name)
         higher = [o for o in present.effect.orders if o > present.order]
-        if not higher:
+        ended = present.effect.free_form is not None and present.order >= POLYNOMIALS
+        if not higher or ended or present.nodes is not None:
             return fitted
         trial = fitted.model.having(raised(present, fitted.model.bench, higher[0]))
         better = fit(trial, free or [name], batches, iterations=8)

@@ -10,7 +10,13 @@ from runtime.excess import PredictionErrors
 from trainer.model.model import Model
 
 
-def recorded(model: Model, name: str | None, errors: PredictionErrors, dropped: str | None = None) -> Model:
+def recorded(
+    model: Model,
+    name: str | None,
+    errors: PredictionErrors,
+    dropped: str | None = None,
+    refined: str | None = None,
+) -> Model:
     """The model with one more record in its history.
 
     Parameters
@@ -21,6 +27,8 @@ def recorded(model: Model, name: str | None, errors: PredictionErrors, dropped: 
         Held-out errors of the model.
     dropped : str, optional
         The effect that was taken out.
+    refined : str, optional
+        The effect whose map went on in free form.
     """
     record: dict[str, Any] = {
         "added": name or "",
@@ -29,4 +37,6 @@ def recorded(model: Model, name: str | None, errors: PredictionErrors, dropped: 
     }
     if dropped:
         record["removed"] = dropped
+    if refined:
+        record["refined"] = refined
     return replace(model, history=(*model.history, record))

@@ -31,12 +31,15 @@ class EffectInstance:
         By parameter, in the parameter's unit.
     errors : dict of float64 arrays or None
         Standard errors, shaped as `values`; None where nothing was fitted.
+    nodes : float64 array [m, n] or None
+        Of the free-form map that is added to the polynomials, in the unit of the effect's `free_form`.
     """
 
     effect: Effect
     order: int
     values: Values
     errors: Values | None = None
+    nodes: np.ndarray | None = None
 
     def with_values(self, values: Mapping[str, np.ndarray]) -> EffectInstance:
         """The same with other values, without errors."""
@@ -150,4 +153,4 @@ def raised(present: EffectInstance, bench: Bench, order: int) -> EffectInstance:
             for k in range(rows):
                 target[k * longer : k * longer + length] = source[k * length : (k + 1) * length]
         values[p.name] = new
-    return replace(higher, values=values)
+    return replace(higher, values=values, nodes=present.nodes)

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from trainer.captures.bench_file import Bench
+from trainer.effects.free_form import surface_over
 from trainer.effects.own_effect import applied
 from trainer.model.model import EffectInstance, Model
 from trainer.prediction.panel_field import with_field
@@ -68,8 +69,12 @@ def stages_for(scene: Scene, present: tuple[EffectInstance, ...], tensors: Any =
             arguments[p.name] = value[row] if p.per_channel else value
         if one.effect.takes_order:
             arguments["order"] = one.order
-        stage = one.effect.stage
-        stages = replace(stages, **{stage: applied(one.effect, getattr(stages, stage), arguments)})
+        name = one.effect.stage
+        stage = applied(one.effect, getattr(stages, name), arguments)
+        if one.nodes is not None and one.effect.free_form is not None:
+            surface = surface_over(stage, torch.as_tensor(one.nodes, dtype=scene.dtype))
+            stage = one.effect.free_form.apply(stage, surface)
+        stages = replace(stages, **{name: stage})
     return stages
 
 

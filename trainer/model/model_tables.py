@@ -12,10 +12,10 @@ import numpy as np
 from firmware_iface.errors import InputError, nearest
 from runtime.lightpath.propagation import METHODS
 from trainer.captures.bench_file import Bench, read_bench
-from trainer.effects.definition import Parameter
+from trainer.effects.definition import Effect, Parameter
 from trainer.effects.effect_catalogue import Catalogue, find_effect
 from trainer.model.model import EffectInstance, Model
-from trainer.model.model_text import allowed
+from trainer.model.model_text import MAP, allowed
 from trainer.prediction.panel_field import NAME, UNITS
 
 SCHEMA = 1
@@ -135,7 +135,7 @@ def _effect(
         effect = find_effect(known, name)
     except InputError as error:
         raise InputError(f"{error}; an effect that is not built in needs its file, with --effects") from None
-    only_keys(row, ("name", "order", "parameters"), f"effect '{name}': ")
+    only_keys(row, ("name", "order", MAP, "parameters"), f"effect '{name}': ")
     order = row.get("order")
     if type(order) is not int or order not in effect.orders:
         orders = ", ".join(map(str, effect.orders))
@@ -155,7 +155,21 @@ def _effect(
         values[p.name] = _numbers(table.get("value"), f"{where}.value", p, order, bench, arrays)
         if "error" in table:
             errors[p.name] = _numbers(table["error"], f"{where}.error", p, order, bench, arrays)
-    return EffectInstance(effect, order, values, errors or None)
+    nodes = _nodes(row[MAP], effect, arrays) if MAP in row else None
+    return EffectInstance(effect, order, values, errors or None, nodes)
+
+
+def _nodes(given: Any, effect: Effect, arrays: Arrays) -> np.ndarray:
+    """The nodes of an effect's free-form map."""
+    where = f"effect '{effect.name}': {MAP}"
+    if effect.free_form is None:
+        raise InputError(f"{where} is given, and this effect has no map: take it out")
+    array = _array(given, where, arrays)
+    if array is None:
+        raise InputError(f"{where} is {shown(given)}: write {{ array = ... }}, or take it out")
+    if array.ndim != 2 or min(array.shape) < 4 or not np.isfinite(array).all():
+        raise InputError(f"{where} is not a table of at least 4 x 4 finite numbers: fit it again")
+    return array.astype(np.float64)
 
 
 def _numbers(

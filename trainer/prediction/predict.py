@@ -31,6 +31,7 @@ from runtime.lightpath.propagation import (
     far_field_matrix,
     transfer_function,
 )
+from trainer.prediction.panel_gradient import has_panel_gradient, image_with_panel_gradient
 from trainer.prediction.scene import Scene, Stages, bare_stages
 from trainer.prediction.stages import Drive, Pupil, Sensor
 
@@ -41,6 +42,10 @@ FINER = 2  # times as many samples for the splines: exact up to half of the band
 def light_path(scene: Scene, stages: Stages) -> LightPath:
     """Drive, panel and pupil as arrays, ready for `runtime.lightpath.light_path`."""
     transfers, weights = pupil_modes(scene, stages.pupil)
+    for amplitude, dy, dx in stages.panel.copies:
+        # A displaced copy of a field is a linear phase over its spectrum.
+        angle = -2 * math.pi * scene.bench.panel.pitch * (stages.pupil.fy * dy + stages.pupil.fx * dx)
+        transfers = transfers * (1 + amplitude * torch.polar(torch.ones_like(angle), angle))
     source, offset = stages.panel.source, stages.drive.offset
     if offset is not None:
         source = source * torch.polar(torch.ones_like(offset), offset)
@@ -233,7 +238,7 @@ class Trace:
     Attributes
     ----------
     spectrum : complex Tensor [B, K, n, m]
-        The panel's, in each of its states.
+        The panel's, in each of its states; empty where only what happens at the panel has a gradient.
     image : Tensor
         Irradiance before filters.
     """
@@ -277,6 +282,8 @@ def trace(
         spectrum = before.spectrum
     else:
         phase = driven_phase(path, stages, gray, earlier)
+        if has_panel_gradient(path, phase):
+            return Trace(torch.empty(0), image_with_panel_gradient(path, phase))
         spectra = [panel_spectrum(state, phase) for state in exposure]
         spectrum = spectra[0][:, None] if len(spectra) == 1 else torch.stack(spectra, 1)
     parts = [mode_irradiance(state, spectrum[:, k]) for k, state in enumerate(exposure)]

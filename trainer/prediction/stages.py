@@ -98,6 +98,9 @@ class Panel:
         The field that no pattern modulates.
     aperture : Tensor [2]
         Sides of a pixel's active area, share of the pitch.
+    copies : tuple of (complex Tensor, Tensor, Tensor)
+        Further fields beside the panel's own: amplitude against it, and displacement along rows and columns in panel
+        pixels.
     """
 
     channel: str
@@ -109,6 +112,11 @@ class Panel:
     source: Tensor
     leak: Tensor | None
     aperture: Tensor
+    copies: tuple[tuple[Tensor, Tensor, Tensor], ...] = ()
+
+    def copied(self, amplitude: Tensor, dy: Tensor, dx: Tensor) -> Panel:
+        """The panel with a copy of its field added: complex amplitude, and displacement in panel pixels."""
+        return replace(self, copies=(*self.copies, (amplitude, dy, dx)))
 
     def multiplied(self, factor: Tensor) -> Panel:
         """The panel with the modulated and the unmodulated light multiplied by a map [H, W], real or complex."""

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from runtime.calibration.drift import Drift, drifted, node_weights
+from runtime.calibration.drift import Drift, drifted
 from runtime.calibration.drift_fit import chi_squared
 from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, predicted
 from runtime.calibration.free_form_fit import fit_freeform, nodes_of
 from runtime.calibration.shown_patterns import grains
 from runtime.camera.view import View, sampler, sampler_and_adjoint
 from runtime.lightpath.light_path import LightPath, irradiance, panel_phase
+from runtime.lightpath.spline_maps import node_weights
 from tests.runtime.benches import ideal_path, random_path
 from tests.runtime.calibration.drifting import WAVELENGTH_NM, without_tilt
 
