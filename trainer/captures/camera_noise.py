@@ -18,6 +18,7 @@ from trainer.captures.bench_file import Camera
 BINS = 32
 SLOPE_DOUBT = 0.008  # relative standard error that a stated full well has at best
 SURE = 4.0  # standard errors from which a slope or a bend counts
+CORRELATED = 0.05  # correlation of neighbouring pixels from which a difference is no noise
 BEND = 0.25  # of the variance at the brightest bin that a bend may add before it is no line
 
 
@@ -35,6 +36,8 @@ class RepeatNoise:
         Measured noise over the camera model's, both averaged over the pixels, and its standard error.
     black_level : float, counts
         The stated one.
+    correlation : float
+        Of the difference of the two pictures from pixel to pixel, along rows and columns. A camera's noise has none.
     """
 
     mean: np.ndarray
@@ -43,6 +46,12 @@ class RepeatNoise:
     ratio: float
     ratio_error: float
     black_level: float
+    correlation: float = 0.0
+
+    @property
+    def is_noise(self) -> bool:
+        """Whether the pictures differ by the camera's noise alone, as far as neighbouring pixels tell."""
+        return abs(self.correlation) < CORRELATED
 
     def ratio_to(self, camera: Camera) -> float:
         """Measured noise over that of a camera with other numbers than the stated."""
@@ -122,7 +131,8 @@ def compare_repeats(first: np.ndarray, second: np.ndarray, camera: Camera) -> Re
     spread = float(a.std()) / max(float(b.std()), 1e-9)
     gain = spread if 0.5 < spread < 2 and np.corrcoef(a, b)[0, 1] > 0.5 else 1.0
     mean = (a + b) / 2
-    halved = (a - a.mean() - gain * (b - b.mean())) ** 2 / (1 + gain**2)
+    difference = a - a.mean() - gain * (b - b.mean())
+    halved = difference**2 / (1 + gain**2)
     edges = np.unique(np.quantile(mean, np.linspace(0, 1, BINS + 1)))
     place = np.clip(np.searchsorted(edges, mean, side="right") - 1, 0, max(len(edges) - 2, 0))
     number = np.bincount(place, minlength=max(len(edges) - 1, 1))
@@ -138,7 +148,20 @@ def compare_repeats(first: np.ndarray, second: np.ndarray, camera: Camera) -> Re
         float(halved.mean()) / expected,
         spread / expected,
         camera.black_level,
+        _neighbours_correlation(use, difference),
     )
+
+
+def _neighbours_correlation(use: np.ndarray, values: np.ndarray) -> float:
+    """The larger correlation, along rows or columns, of a picture's neighbouring values, given where `use` is set."""
+    picture = np.zeros(use.shape)
+    picture[use] = values
+    power = float((picture**2).sum()) / max(int(use.sum()), 1)
+    found = []
+    for one, next_one in ((np.s_[:-1, :], np.s_[1:, :]), (np.s_[:, :-1], np.s_[:, 1:])):
+        both = max(int((use[one] & use[next_one]).sum()), 1)
+        found.append(float((picture[one] * picture[next_one]).sum()) / both / max(power, 1e-30))
+    return max(found, key=abs)
 
 
 def straight_line(repeats: Sequence[RepeatNoise], camera: Camera) -> NoiseLine | None:

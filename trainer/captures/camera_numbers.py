@@ -2,7 +2,8 @@
 
 Photon transfer (Janesick 2007): light makes noise whose variance is the mean count above black times the counts that
 one electron adds, on top of the read noise. Two pictures of one pattern differ by this noise alone. Where the variance
-does not follow a straight line, something else differs, such as vibration, and nothing is measured.
+does not follow a straight line, or where neighbouring pixels differ alike, something else changes, such as vibration,
+and nothing is measured.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ def photon_transfer(repeats: Sequence[RepeatNoise], camera: Camera) -> PhotonTra
         does not depend on brightness is far more than a camera reads with: then something else differs.
     """
     line = straight_line(repeats, camera)
-    if line is None:
+    if line is None or not all(r.is_noise for r in repeats):
         return None
     ratio = float(np.mean([r.ratio for r in repeats]))
     # A mean of squares has twice the relative variance of one square over their number; they differ in brightness, too.

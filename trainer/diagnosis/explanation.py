@@ -11,7 +11,7 @@ from runtime.excess import PredictionErrors, removed_excess
 from runtime.program.progress import Progress, no_progress, part_of
 from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet
-from trainer.captures.held_out import FIT_CAPTURES, CaptureRoles, capture_roles, with_stopping
+from trainer.captures.held_out import FIT_CAPTURES, CaptureRoles, capture_roles, split, with_stopping
 from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors
 from trainer.diagnosis.screen import ScreenResult, screen_batches
 from trainer.diagnosis.verdict import Thresholds, below_the_noise
@@ -19,7 +19,7 @@ from trainer.effects.definition import Effect
 from trainer.effects.effect_catalogue import Catalogue
 from trainer.fitting.free_form_effects import can_go_on, refined, with_free_form
 from trainer.fitting.gains import with_gains
-from trainer.fitting.gauss_newton import fit
+from trainer.fitting.gauss_newton import fit, with_measured_values
 from trainer.fitting.pool import Pool
 from trainer.fitting.predictor import evaluate_captures
 from trainer.fitting.refit import fit_from, least_for_order, raise_order, settled
@@ -185,7 +185,11 @@ def add_from(roles: CaptureRoles, model: Model, start: EffectInstance) -> Model:
     name = start.effect.name
     fitted = fit_from(model, start, batches)
     fitted = raise_order(fitted, name, batches, least_for_order)
-    return settled(fitted.model, batches).model if len(fitted.model.names) > 1 else fitted.model
+    model = settled(fitted.model, batches).model if len(fitted.model.names) > 1 else fitted.model
+    by_pixel = [p.effect.name for p in model.present if any(q.per_pixel for q in p.effect.parameters)]
+    if by_pixel:  # a number for each pixel asks for all pictures that there are
+        model = with_measured_values(model, by_pixel, load(roles.captures, split(roles.captures).fitted))
+    return model
 
 
 def gone_on(

@@ -60,10 +60,10 @@ def noise_floor(captures: CaptureSet, errors: PredictionErrors) -> float:
     pairs = repeated_pairs(captures.captures)[:MEASURED_PAIRS]
     camera = captures.noise_camera()
     repeats = [compare_repeats(captures.counts(a), captures.counts(b), camera) for a, b in pairs]
-    ratios = [r.ratio for r in repeats if r is not None]
+    ratios = [r.ratio for r in repeats if r is not None and r.is_noise]
     if not ratios:
         return 0.0
-    # Noise that repeats share less of than is expected is the camera's; more of it may be real change between them.
+    # The pair that fits best: more noise in another one may be real change between its pictures.
     off = min(abs(ratio - 1) for ratio in ratios)
     return off * errors.noise_nrmse**2
 

@@ -57,6 +57,8 @@ class Parameter:
         A value, or the first terms, with which the effect is easy to see. None: left absent.
     terms : callable or None
         Names of the numbers, a function of the effect's order, as `count` is. None: their numbers from 1.
+    per_pixel : bool
+        One number for each of the camera's pixels, which the effect measures and no fit moves.
     """
 
     name: str
@@ -74,15 +76,18 @@ class Parameter:
     typical: tuple[float, float] | None = None
     example: float | tuple[float, ...] | None = None
     terms: Callable[[int], tuple[str, ...]] | None = None
+    per_pixel: bool = False
 
     def absent_value(self, bench: Bench) -> float:
         """The value at which the effect is not there, on this bench."""
         return float(self.absent(bench) if callable(self.absent) else self.absent)
 
-    def shape(self, order: int, channels: int) -> tuple[int, ...]:
-        """Shape of the parameter's values for an order and a number of colours."""
+    def shape(self, order: int, bench: Bench) -> tuple[int, ...]:
+        """Shape of the parameter's values for an order, on a bench."""
+        if self.per_pixel:
+            return bench.camera.shape
         row = (self.count(order),) if callable(self.count) else (self.count,) if self.count else ()
-        return (*((channels,) if self.per_channel else ()), *row)
+        return (*((len(bench.channels),) if self.per_channel else ()), *row)
 
     @property
     def key(self) -> str:

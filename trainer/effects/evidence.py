@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from torch import Tensor
 
@@ -25,3 +25,10 @@ class Evidence:
     scene: Scene
     batch: Batch
     prediction: Tensor
+
+    def of(self, k: int) -> Evidence:
+        """The evidence of capture k alone."""
+        b = self.batch
+        parts = {n: getattr(b, n)[k : k + 1] for n in ("ids", "gray", "signal", "mask", "noise", "exposure")}
+        batch = replace(b, shown_before=lambda: b.shown_before()[k : k + 1], **parts)
+        return Evidence(self.scene, batch, self.prediction[k : k + 1])

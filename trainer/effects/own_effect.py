@@ -223,12 +223,12 @@ def _check_values(
     role: str,
     order: int | None = None,
 ) -> None:
-    channels = len(evidence[0].scene.bench.channels)
+    bench = evidence[0].scene.bench
     known = {p.name: p for p in effect.parameters}
     for name, value in values.items():
         if name not in known:
             _refuse(effect, function, f"names a parameter {name!r}", nearest(str(name), known), role)
-        shape = known[name].shape(effect.orders[0] if order is None else order, channels)
+        shape = known[name].shape(effect.orders[0] if order is None else order, bench)
         try:
             numbers = np.asarray(value, dtype=float)
         except (TypeError, ValueError, RuntimeError):

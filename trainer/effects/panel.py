@@ -194,7 +194,7 @@ def panel_wavefront(panel: Panel, wavefront: Tensor) -> Panel:
         Parameter("shift_y", "pixels", scale=0.2, low=-200, high=200, typical=(-30, 30), example=3.0),
         Parameter("shift_x", "pixels", scale=0.2, low=-200, high=200, typical=(-30, 30), example=6.0),
     ],
-    formula=r"u'(\mathbf{r}) = u(\mathbf{r}) + a\,u(\mathbf{r} - \mathbf{s}), \qquad a = a_\mathrm{r} + j\,a_\mathrm{i}",
+    formula=r"u'(\mathbf{r}) = u(\mathbf{r}) + (a_\mathrm{r} + j\,a_\mathrm{i})\,u(\mathbf{r} - \mathbf{s})",
 )
 def coherent_ghost(panel: Panel, real: Tensor, imaginary: Tensor, shift_y: Tensor, shift_x: Tensor) -> Panel:
     """A second path of the light, displaced and delayed, interferes with the first.

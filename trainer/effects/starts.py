@@ -202,8 +202,10 @@ def coherent_ghost_starts(evidence: Sequence[Evidence], most: int = 2) -> Starts
         for a, b in _near(0, 0, size.shape):
             size[a, b] = 0
         i, j = (int(n) for n in np.unravel_index(int(size.argmax()), size.shape))
-        amplitude = complex(total[i, j])
         shift = [n - full if n > full / 2 else n for n, full in zip((i, j), size.shape, strict=True)]
+        # `image_field` leaves out a linear phase, by the band's first frequency.
+        turn = sum(b * n / p for b, n, p in zip(scene.grid.band, shift, scene.grid.padded, strict=True))
+        amplitude = complex(total[i, j] * np.exp(-2j * np.pi * turn))
         starts.append(
             {
                 "real": float(np.clip(amplitude.real, -0.5, 0.5)),

@@ -86,8 +86,8 @@ class FreeFormBatch:
             image = trace(scene, stages, gray, free.stage, before, earlier).image
         else:
             image = free.irradiance(scene, stages, gray, tensors)
-        light = light_on_camera(scene, stages, image)
         measured = (self.batch.signal[k : k + 1], self.batch.mask[k : k + 1])
+        light = light_on_camera(scene, stages, image, measured)
         return counts(scene, stages, light, self.gain[k : k + 1], measured)
 
     def squared_error(self, free: FreeFormStage, tensors: Tensors, k: int) -> Tensor:

@@ -119,14 +119,15 @@ def _fit(
         if fresh and iteration + 1 < iterations:
             slopes = slopes_of(model, keys, channels, predictors, points)
     normal, scatter = _normal(slopes), _scatter(slopes, residuals)
-    model = _measured(model, free, batches)
+    model = with_measured_values(model, free, batches)
     inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
     covariance = inverse @ scatter @ inverse
     return FitResult(_with_errors(model, keys, covariance), errors, covariance, keys)
 
 
-def _measured(model: Model, free: Sequence[str], batches: Sequence[Batch]) -> Model:
-    """The model with the values that effects read off the captures instead of fitting them."""
+@torch.no_grad()
+def with_measured_values(model: Model, free: Sequence[str], batches: Sequence[Batch]) -> Model:
+    """The model with the values that its named effects read off the captures instead of fitting them."""
     for name in free:
         present = model.instance(name)
         if present.effect.measure is None:
@@ -175,7 +176,8 @@ def _with_errors(model: Model, keys: tuple[tuple[str, str, int], ...], covarianc
     spread = np.sqrt(np.maximum(np.diag(covariance), 0))
     for name in dict.fromkeys(k[0] for k in keys):
         present = model.instance(name)
-        errors: Values = {n: np.zeros_like(v) for n, v in present.values.items()}
+        moved = [p.name for p in present.effect.parameters if not p.per_pixel]
+        errors: Values = {n: np.zeros_like(present.values[n]) for n in moved}
         for i, (effect_name, parameter, index) in enumerate(keys):
             if effect_name == name:
                 errors[parameter].reshape(-1)[index] = spread[i]

@@ -23,6 +23,8 @@ def keys_of(model: Model, free: Sequence[str]) -> tuple[tuple[str, str, int], ..
     for name in free:
         present = model.instance(name)
         for p in present.effect.parameters:
+            if p.per_pixel:
+                continue
             keys += [(name, p.name, i) for i in range(present.values[p.name].size)]
     return tuple(keys)
 

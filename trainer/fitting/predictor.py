@@ -54,7 +54,8 @@ class Predictor:
 
     def light(self, model: Model, point: Trace) -> Tensor:
         """Irradiance on the camera [B, h, w]."""
-        return light_on_camera(self.scene, self.stages(model), point.image)
+        measured = (self.batch.signal, self.batch.mask)
+        return light_on_camera(self.scene, self.stages(model), point.image, measured)
 
     def counts(self, model: Model, light: Tensor) -> Tensor:
         """Counts above black [B, h, w], from the irradiance on the camera [B, h, w]."""

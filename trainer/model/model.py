@@ -103,10 +103,9 @@ class Model:
 def absent(effect: Effect, bench: Bench, order: int | None = None) -> EffectInstance:
     """The effect at the values at which it changes nothing, at its lowest order unless another is given."""
     order = effect.orders[0] if order is None else order
-    channels = len(bench.channels)
     with parameters_of(effect):
         values = {
-            p.name: np.full(p.shape(order, channels), p.absent_value(bench), dtype=np.float64)
+            p.name: np.full(p.shape(order, bench), p.absent_value(bench), dtype=np.float64)
             for p in effect.parameters
         }
     return EffectInstance(effect, order, values)
@@ -146,7 +145,7 @@ def raised(present: EffectInstance, bench: Bench, order: int) -> EffectInstance:
         old, new = present.values[p.name], higher.values[p.name].copy()
         source, target = old.reshape(-1), new.reshape(-1)
         rows = (len(bench.channels) if p.per_channel else 1) * p.blocks
-        if new.ndim == 0:
+        if new.ndim == 0 or p.per_pixel:
             new = old.copy()
         elif source.size:
             length, longer = source.size // rows, target.size // rows

@@ -176,7 +176,7 @@ def _numbers(
     given: Any, where: str, parameter: Parameter, order: int, bench: Bench, arrays: Arrays
 ) -> np.ndarray:
     """The numbers of a value or an error, of the shape that the order asks for."""
-    shape = parameter.shape(order, len(bench.channels))
+    shape = parameter.shape(order, bench)
     is_value = where.endswith(".value")
     array = _array(given, where, arrays)
     if array is not None:

@@ -229,7 +229,7 @@ def _row(name: str, row: np.ndarray) -> list[str]:
 def _check(effect: Effect, parameter: Parameter, value: np.ndarray, order: int, bench: Bench) -> None:
     """What is written must be what can be read."""
     where = f"{effect.name}.{parameter.name}"
-    shape = parameter.shape(order, len(bench.channels))
+    shape = parameter.shape(order, bench)
     if np.shape(value) != shape:
         raise InputError(
             f"{where} has shape {np.shape(value)}, but order {order} has {shape}: the model is not written"

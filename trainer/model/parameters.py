@@ -13,9 +13,11 @@ from trainer.model.model import EffectInstance
 
 
 def json_values(present: EffectInstance, bench: Bench) -> dict[str, dict[str, Any]]:
-    """{name with unit: {"value", "error", "unit"}}; per-channel values by channel name."""
+    """{name with unit: {"value", "error", "unit"}}; per-channel values by channel name, maps of pixels left out."""
     result = {}
     for p in present.effect.parameters:
+        if p.per_pixel:
+            continue
         errors = None if present.errors is None else present.errors[p.name]
         result[p.key] = {
             "value": _plain(p, present.values[p.name], bench),
@@ -35,6 +37,8 @@ def describe(present: EffectInstance, bench: Bench) -> str:
     """The effect's parameters that differ from "absent", with units and errors, in one line."""
     words = []
     for p in present.effect.parameters:
+        if p.per_pixel:
+            continue
         values = present.values[p.name]
         errors = np.zeros_like(values) if present.errors is None else present.errors[p.name]
         label = p.name.replace("_", " ")

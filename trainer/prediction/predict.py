@@ -31,6 +31,7 @@ from runtime.lightpath.propagation import (
     far_field_matrix,
     transfer_function,
 )
+from trainer.prediction.capture_shift import displaced_spectrum
 from trainer.prediction.panel_gradient import has_panel_gradient, image_with_panel_gradient
 from trainer.prediction.scene import Scene, Stages, bare_stages
 from trainer.prediction.stages import Drive, Pupil, Sensor
@@ -290,7 +291,9 @@ def trace(
     return Trace(spectrum, parts[0] if len(parts) == 1 else torch.stack(parts).sum(0))
 
 
-def light_on_camera(scene: Scene, stages: Stages, image: Tensor) -> Tensor:
+def light_on_camera(
+    scene: Scene, stages: Stages, image: Tensor, measured: tuple[Tensor, Tensor] | None = None
+) -> Tensor:
     """Irradiance that the camera's pixels integrate, before gain, offset and response.
 
     Parameters
@@ -299,6 +302,8 @@ def light_on_camera(scene: Scene, stages: Stages, image: Tensor) -> Tensor:
     stages : Stages
     image : Tensor
         Irradiance on the fine image grid, as in `Trace`.
+    measured : (Tensor, Tensor), optional
+        Signal and weight [B, h, w], from which each capture's own displacement is measured where the camera moves.
 
     Returns
     -------
@@ -310,17 +315,26 @@ def light_on_camera(scene: Scene, stages: Stages, image: Tensor) -> Tensor:
     for extra in (stages.pupil.irradiance_filter, sensor.irradiance_filter, sensor.blur):
         if extra is not None:
             transfer = transfer * extra
-    if sensor.displacement is None and camera.registered:
-        return registered_samples(grid, rfft2(image) * transfer)
-    if sensor.displacement is None:
-        y, x = camera_positions(scene)
-    else:
+    if sensor.displacement is not None:
         dy, dx = sensor.displacement
         rows = torch.arange(dy.shape[-2], dtype=dy.dtype)[:, None]
-        y, x = camera.on_panel(rows + dy, torch.arange(dy.shape[-1], dtype=dy.dtype) + dx)
-    transfer = transfer / spline_filter(sensor.iy, sensor.ix, FINER)
-    fine = finer_picture(rfft2(image) * transfer, grid.image_shape, FINER)
-    return spline_samples(fine, *sample_places(grid, y, x, FINER))
+        places = camera.on_panel(rows + dy, torch.arange(dy.shape[-1], dtype=dy.dtype) + dx)
+    elif not camera.registered:
+        places = camera_positions(scene)
+    else:
+        places = None
+
+    def read(spectrum: Tensor) -> Tensor:
+        if places is None:
+            return registered_samples(grid, spectrum)
+        finer = spectrum / spline_filter(sensor.iy, sensor.ix, FINER)
+        fine = finer_picture(finer, grid.image_shape, FINER)
+        return spline_samples(fine, *sample_places(grid, *places, FINER))
+
+    spectrum = rfft2(image) * transfer
+    if sensor.free_capture_shift and measured is not None:
+        spectrum = displaced_spectrum(sensor, spectrum, read, measured)
+    return read(spectrum)
 
 
 def counts(

@@ -232,6 +232,8 @@ class Sensor:
         A function of the signal as a share of full scale.
     free_capture_gain : bool
         Each capture has its own gain.
+    free_capture_shift : bool
+        Each capture has its own displacement.
     """
 
     channel: str
@@ -247,6 +249,7 @@ class Sensor:
     offset: Tensor | None = None
     response: Callable[[Tensor], Tensor] | None = None
     free_capture_gain: bool = False
+    free_capture_shift: bool = False
 
     def blurred(self, transfer: Tensor) -> Sensor:
         """The sensor with the camera's picture filtered by a transfer function over (iy, ix)."""

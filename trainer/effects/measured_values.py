@@ -1,0 +1,57 @@
+"""Values that effects read off the captures instead of fitting them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy.ndimage import uniform_filter
+
+from trainer.effects.evidence import Evidence
+from trainer.effects.starts import displacements
+
+LIKELY_GAIN, LIKELY_OFFSET = 0.05, 20.0  # where the estimate of their spreads begins: share, counts
+ROUNDS = 6  # of that estimate
+
+
+def shift_spread(evidence: Sequence[Evidence]) -> dict[str, Any]:
+    """Standard deviation (pixels) of the displacement from capture to capture, along an axis."""
+    shifts: dict[tuple[str, float], list[np.ndarray]] = {}
+    for one in evidence:
+        for k in range(len(one.batch.ids)):
+            _, moved, weights = displacements(one.of(k))
+            middle = np.average(moved, axis=0, weights=weights + 1e-12)
+            shifts.setdefault((one.scene.channel, one.scene.plane_mm), []).append(middle)
+    deviations = np.concatenate([np.array(s) - np.mean(s, axis=0) for s in shifts.values()])
+    return {"spread": max(0.01, float(np.sqrt(np.mean(deviations**2))))}
+
+
+def pixel_pattern(evidence: Sequence[Evidence]) -> dict[str, Any]:
+    """Gain and offset of each camera pixel about its neighbours', as all captures together show them.
+
+    The most probable values where both are drawn from normal distributions, whose spreads are estimated from the
+    captures, too. What neighbours share is left to other effects.
+    """
+    sums = np.zeros((5, *evidence[0].batch.signal.shape[-2:]))
+    for one in evidence:
+        weight = (one.batch.mask / one.batch.noise).double().numpy()
+        expected = one.prediction.double().numpy()
+        beyond = one.batch.signal.double().numpy() - expected
+        terms = (expected**2, expected, np.ones_like(expected), expected * beyond, beyond)
+        sums += np.stack([(weight * t).sum(0) for t in terms])
+    gain_spread, offset_spread = LIKELY_GAIN, LIKELY_OFFSET
+    for _ in range(ROUNDS):
+        a, b, c = sums[0] + gain_spread**-2, sums[1], sums[2] + offset_spread**-2
+        determinant = a * c - b**2
+        gain = (c * sums[3] - b * sums[4]) / determinant
+        offset = (a * sums[4] - b * sums[3]) / determinant
+        gain, offset = (m - uniform_filter(m, 3, mode="nearest") for m in (gain, offset))
+        gain_spread = max(float(np.sqrt(np.mean(gain**2 + c / determinant))), 1e-5)
+        offset_spread = max(float(np.sqrt(np.mean(offset**2 + a / determinant))), 1e-3)
+    return {
+        "gain": np.maximum(gain, -0.99),
+        "offset": offset,
+        "gain_rms": max(100 * gain_spread, 0.01),
+        "offset_rms": max(offset_spread, 0.01),
+    }
