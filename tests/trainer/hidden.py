@@ -39,7 +39,7 @@ read_noise_e = 5
 
 
 def bench_file(
-    folder: Path, *defects: str, width: int = 160, height: int = 128, distance_mm: float = 15
+    folder: Path, *defects: str, width: int = 96, height: int = 80, distance_mm: float = 9
 ) -> Path:
     """A virtual bench's TOML file with defects given as TOML lines after [[defect]]."""
     path = folder / "bench-with-secrets.toml"

@@ -82,7 +82,7 @@ def test_pictures_that_fit_no_pattern_are_refused(tmp_path, capsys) -> None:
     captures = captured(capsys, tmp_path)
     rng = np.random.default_rng(0)
     for path in (captures / "image").glob("*.png"):
-        Image.fromarray(rng.permuted(np.asarray(Image.open(path)).ravel()).reshape(128, 160)).save(path)
+        Image.fromarray(rng.permuted(np.asarray(Image.open(path)).ravel()).reshape(80, 96)).save(path)
     assert main(["explain", str(captures), "--out", str(tmp_path / "model.toml")]) == 2
     assert "fits any of their patterns" in capsys.readouterr().err
     assert main(["compare", str(captures), "--json"]) == 0

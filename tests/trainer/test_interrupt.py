@@ -32,7 +32,7 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small set in which two things are hidden, so that there is work left when the first has been found."""
     folder = tmp_path_factory.mktemp("interrupted")
     defects = ('kind = "distance"', 'kind = "zero_order"')
-    bench = bench_file(folder, *defects, width=128, height=96, distance_mm=10)
+    bench = bench_file(folder, *defects, width=80, height=64, distance_mm=8)
     acquire_from(str(bench), folder / "captures", patterns=6)
     return folder / "captures"
 

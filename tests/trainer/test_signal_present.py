@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from firmware_iface.errors import InputError
-from tests.trainer.made_sets import make_set
+from tests.trainer.made_sets import bench_tables, make_set
 from trainer import cli
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.held_out import capture_roles, sample, split
@@ -92,7 +92,7 @@ def test_equal_gray_levels_are_one_pattern_in_their_channel_whatever_the_table_s
 def test_a_single_pattern_is_not_called_held_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], column: str
 ) -> None:
-    captures = make_set(tmp_path / "set", patterns=1)
+    captures = make_set(tmp_path / "set", bench_tables((40, 48)), patterns=1)
     without_column(captures.folder, column)
     for command in ("compare", "explain"):
         assert cli.main([*arguments(command, captures.folder, tmp_path / "m.toml"), "--json"]) == 0
@@ -151,7 +151,7 @@ def test_a_dark_capture_is_used_for_nothing_and_said(
 def test_a_dark_capture_is_not_a_drift_of_the_laser(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    captures = make_set(tmp_path / "set", patterns=6)
+    captures = make_set(tmp_path / "set", bench_tables((40, 48)), patterns=6)
     repaint(captures, blacked, [captures.captures[3].capture])
     args = arguments("explain", captures.folder, tmp_path / "m.toml")
     assert cli.main([*args, "--json"]) == 0
