@@ -84,6 +84,7 @@ def test_a_mirrored_turned_and_finer_camera_is_found_by_its_dots_and_remembered(
     assert view_of(read_bundle(folder)) == found.estimate.view
 
 
+@pytest.mark.slow
 def test_a_cameras_scale_and_distortion_are_not_put_into_the_light_path() -> None:
     """A scale that is off looks like defocus and distance, exactly; a distortion does not, and is found."""
     shape = (80, 96)
