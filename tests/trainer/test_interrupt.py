@@ -115,7 +115,7 @@ def assert_clean(explaining: Explaining, tmp_path: Path) -> None:
     assert not list((tmp_path / "temporary").iterdir())
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_ctrl_c_leaves_the_model_so_far_and_says_so(
     workers: int, explain: Callable[[int], Explaining], tmp_path: Path
 ) -> None:

@@ -12,7 +12,7 @@ from tests.campaigns.headset import hardware, write_configuration
 from tests.runtime.calibration.drifting import DISTANCE_MM, ideal_bundle
 from tests.trainer.hidden import bench_file
 
-SHAPE = (48, 64)
+SHAPE = (64, 80)
 
 
 def test_a_headset_behind_its_drivers_is_calibrated_and_left_dark(
