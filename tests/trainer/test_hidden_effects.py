@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.trainer.hidden import captured, ran
+from tests.trainer.hidden import LARGER, captured, ran
 from trainer.cli import main
 from trainer.effects import catalogue
 
@@ -72,7 +72,8 @@ def test_nothing_hidden_names_nothing(tmp_path, capsys):
     ids=lambda names: "+".join(names),
 )
 def test_several_effects_are_all_found(names, tmp_path, capsys):
-    captures = captured(capsys, tmp_path, *(ALONE[n] for n in names))
+    sizes = LARGER if len(names) > 2 else {}
+    captures = captured(capsys, tmp_path, *(ALONE[n] for n in names), **sizes)
     found = explained(capsys, captures, tmp_path)
     kept = {s["added"] for s in found["steps"]} - {s.get("removed") for s in found["steps"]}
     assert kept == set(names), found["steps"]
@@ -140,7 +141,7 @@ def test_a_misread_set_is_refused_and_not_explained(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_specks_sit_on_the_panel(tmp_path, capsys):
-    captures = captured(capsys, tmp_path, 'kind = "specks"')
+    captures = captured(capsys, tmp_path, 'kind = "specks"', **LARGER)
     found = ran(capsys, "diagnose", captures, "--workers", 1)
     assert (found["verdict"], found["stage"]) == ("outside_catalogue", "panel")
 
@@ -148,14 +149,16 @@ def test_specks_sit_on_the_panel(tmp_path, capsys):
 @pytest.mark.slow
 def test_source_and_blur_look_alike_at_one_plane_and_not_at_three(tmp_path, capsys):
     source = 'kind = "spatial_coherence"\nradius_mrad = 0.5'
-    captures = captured(capsys, tmp_path, source)
+    captures = captured(capsys, tmp_path, source, **LARGER)
     found = ran(capsys, "diagnose", captures, "--workers", 1)
     best = found["ranking"][0]
     assert {best["effect"], *best["indistinguishable_from"]} >= {"spatial_coherence", "sensor_blur"}
     assert any("mm" in s for s in found["suggested_captures"])
 
     (tmp_path / "three").mkdir()
-    captures = captured(capsys, tmp_path / "three", source, options=("--planes", "10,15,20", "--patterns", 6))
+    captures = captured(
+        capsys, tmp_path / "three", source, options=("--planes", "10,15,20", "--patterns", 6), **LARGER
+    )
     best = ran(capsys, "diagnose", captures, "--workers", 1)["ranking"][0]
     assert best["effect"] == "spatial_coherence"
     assert "sensor_blur" not in best["indistinguishable_from"]
