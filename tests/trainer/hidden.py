@@ -38,8 +38,12 @@ read_noise_e = 5
 """
 
 
+# Where 96 x 80 pixels are too few to tell what is asked.
+LARGER = {"width": 160, "height": 128, "distance_mm": 15}
+
+
 def bench_file(
-    folder: Path, *defects: str, width: int = 160, height: int = 128, distance_mm: float = 15
+    folder: Path, *defects: str, width: int = 96, height: int = 80, distance_mm: float = 9
 ) -> Path:
     """A virtual bench's TOML file with defects given as TOML lines after [[defect]]."""
     path = folder / "bench-with-secrets.toml"
@@ -58,9 +62,13 @@ def ran(capsys: pytest.CaptureFixture[str], *argv: object) -> dict[str, Any]:
 
 
 def captured(
-    capsys: pytest.CaptureFixture[str], folder: Path, *defects: str, options: tuple[object, ...] = ()
+    capsys: pytest.CaptureFixture[str],
+    folder: Path,
+    *defects: str,
+    options: tuple[object, ...] = (),
+    **sizes: Any,
 ) -> Path:
-    """A capture set taken from a bench with these defects."""
+    """A capture set taken from a bench with these defects; `sizes` go to `bench_file`."""
     where = folder / "captures"
-    ran(capsys, "capture", "--bench", bench_file(folder, *defects), "--out", where, *options)
+    ran(capsys, "capture", "--bench", bench_file(folder, *defects, **sizes), "--out", where, *options)
     return where

@@ -243,8 +243,12 @@ def test_nothing_in_the_files_raises(made: CaptureSet, copy: Path, data: st.Data
     assert all(isinstance(p, Problem) and p.message for p in check_captures(copy, flat_prediction))
 
 
-def test_practice_sets_are_clean(shared: Path) -> None:
-    for folder in sorted((shared / "practice").iterdir()):
+@pytest.mark.parametrize(
+    "names", [("ideal", "leak"), pytest.param((), marks=pytest.mark.slow)], ids=["two of them", "all"]
+)
+def test_practice_sets_are_clean(names: tuple[str, ...], shared: Path) -> None:
+    practice = shared / "practice"
+    for folder in [practice / name for name in names] or sorted(practice.iterdir()):
         assert check_captures(folder, ideal_irradiance) == []
 
 

@@ -66,6 +66,7 @@ def test_each_round_is_better_than_none(tmp_path: Path) -> None:
     assert (tmp_path / "round-1" / "network.safetensors").is_file()
 
 
+@pytest.mark.slow
 def test_online_each_picture_has_its_own_network(tmp_path: Path) -> None:
     """Where what is wrong differs from picture to picture, a network of its own serves each better."""
     headset = fringed(kind="zero_order")

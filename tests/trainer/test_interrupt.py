@@ -32,7 +32,7 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small set in which two things are hidden, so that there is work left when the first has been found."""
     folder = tmp_path_factory.mktemp("interrupted")
     defects = ('kind = "distance"', 'kind = "zero_order"')
-    bench = bench_file(folder, *defects, width=128, height=96, distance_mm=10)
+    bench = bench_file(folder, *defects, width=80, height=64, distance_mm=8)
     acquire_from(str(bench), folder / "captures", patterns=6)
     return folder / "captures"
 
@@ -115,7 +115,7 @@ def assert_clean(explaining: Explaining, tmp_path: Path) -> None:
     assert not list((tmp_path / "temporary").iterdir())
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_ctrl_c_leaves_the_model_so_far_and_says_so(
     workers: int, explain: Callable[[int], Explaining], tmp_path: Path
 ) -> None:

@@ -70,7 +70,10 @@ def check_parity(name: str, shape: tuple[int, int], filters: int = 4) -> None:
         assert far(found[name], value) < 3 * far(single[name], value) + ROUNDING, name
 
 
-@pytest.mark.parametrize(("network", "shape"), [("published", (67, 121)), ("compact", (67, 121))])
+@pytest.mark.parametrize(
+    ("network", "shape"),
+    [pytest.param("published", (67, 121), marks=pytest.mark.slow), ("compact", (67, 121))],
+)
 def test_onnxruntime_gives_the_networks_result_and_gradients(network: str, shape: tuple[int, int]) -> None:
     check_parity(network, shape)
 

@@ -18,7 +18,7 @@ import pytest
 from firmware_iface.errors import InputError
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.cli import main
-from trainer.diagnosis.diagnosis import diagnose
+from trainer.diagnosis.diagnosis import Diagnosis, diagnose
 from trainer.effects import testing
 from trainer.effects.effect_catalogue import Catalogue, catalogue, load_effects
 from trainer.fitting import pool
@@ -63,25 +63,43 @@ def few(known: Catalogue, own: Path) -> Catalogue:
     return {n: e for n, e in known.items() if e.source == str(own) or n in ("vignetting", "sensor_blur")}
 
 
-def test_one_process_and_two_give_the_same_numbers(captures: CaptureSet, own: Path) -> None:
+def watched(captures: CaptureSet, own: Path, workers: int) -> tuple[Diagnosis, list[float]]:
+    """A diagnosis by that many processes, and the shares done that it reported."""
     known = few(catalogue([own]), own)
     assert len(known) == 4
     shares: list[float] = []
-    found = []
-    for workers in (1, 2):
-        with open_pool(workers) as running:
-            assert running.workers == workers
-            one = diagnose(
-                captures, Model(captures.bench), known, running, progress=lambda s, _: shares.append(s)
-            )
-            found.append(one)
-    assert found[0].best is not None
-    assert found[0].best.effect.name in ("row_tilt", "vignetting")
-    alone, together = (numbers(f.as_json()) for f in found)
-    assert list(alone) == list(together)
-    assert list(alone.values()) == pytest.approx(list(together.values()), rel=1e-3, abs=1e-7)
-    assert shares[-1] == 1
-    assert all(0 <= share <= 1 for share in shares)
+    with open_pool(workers) as running:
+        assert running.workers == workers
+        found = diagnose(
+            captures, Model(captures.bench), known, running, progress=lambda s, _: shares.append(s)
+        )
+    return found, shares
+
+
+@pytest.fixture(scope="module")
+def alone(captures: CaptureSet, own: Path) -> tuple[Diagnosis, list[float]]:
+    """What one process finds."""
+    return watched(captures, own, 1)
+
+
+def test_one_process_and_two_give_the_same_numbers(
+    captures: CaptureSet, own: Path, alone: tuple[Diagnosis, list[float]]
+) -> None:
+    found, shares = alone
+    assert found.best is not None
+    assert found.best.effect.name in ("row_tilt", "vignetting")
+    together, shares_of_two = watched(captures, own, 2)
+    assert_same(found.as_json(), together.as_json())
+    for one in (shares, shares_of_two):
+        assert one[-1] == 1
+        assert all(0 <= share <= 1 for share in one)
+
+
+def assert_same(here: dict[str, Any], there: dict[str, Any]) -> None:
+    """The same words at the same places, and the same numbers up to rounding."""
+    one, other = numbers(here), numbers(there)
+    assert list(one) == list(other)
+    assert list(one.values()) == pytest.approx(list(other.values()), rel=1e-3, abs=1e-7)
 
 
 def numbers(found: Any, where: str = "") -> dict[str, float]:
@@ -208,14 +226,13 @@ def diagnosed(captures: CaptureSet, own: Path, monkeypatch: pytest.MonkeyPatch, 
     return run
 
 
-def test_a_cluster_gives_the_ranking_that_this_process_gives(cluster: str, diagnosed: Run) -> None:
-    here = diagnosed("--workers", "1")
-    there = diagnosed("--cluster", cluster)
+def test_a_cluster_gives_the_ranking_that_this_process_gives(
+    cluster: str, diagnosed: Run, alone: tuple[Diagnosis, list[float]]
+) -> None:
+    here = alone[0].as_json()
     assert "row_tilt" in [r["effect"] for r in here["ranking"]]
     assert "corner_twist" in [s["effect"] for s in here["screen"]]
-    alone, together = numbers(here), numbers(there)
-    assert list(alone) == list(together)
-    assert list(alone.values()) == pytest.approx(list(together.values()), rel=1e-3, abs=1e-7)
+    assert_same(here, diagnosed("--cluster", cluster))
 
 
 def test_a_cluster_sees_captures_and_effects_as_they_are_now(

@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from firmware_iface.virtual import VirtualHeadset, load_bench
-from tests.trainer.hidden import bench_file, ran
+from tests.trainer.hidden import LARGER, bench_file, ran
 from trainer.cli import main
 
 # 6 um camera pixels behind a relay, mirrored, a little rotated, off centre.
@@ -17,7 +17,7 @@ TRUTH = np.array([[-0.75, 0.02, 150.0], [0.02, 0.75, -2.0], [0.0, 0.0, 1.0]])
 
 
 def test_dots_shown_seen_and_found(tmp_path: Path, capsys) -> None:
-    spec = bench_file(tmp_path)
+    spec = bench_file(tmp_path, **LARGER)
     camera = "registered = false\nhomography = " + str([[float(v) for v in row] for row in TRUTH])
     text = spec.read_text().replace("registered = true", camera)
     text = text.replace(

@@ -19,6 +19,7 @@ from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.held_out import capture_roles, sample, split
 from trainer.captures.signal_present import DARK, SATURATED, fault_of
 from trainer.diagnosis.comparison import compare
+from trainer.effects import catalogue
 from trainer.model.model import Model
 
 COMMANDS = ("compare", "diagnose", "explain", "add", "field")
@@ -88,6 +89,14 @@ def test_equal_gray_levels_are_one_pattern_in_their_channel_whatever_the_table_s
     assert read_captures(captures.folder).captures[1].pattern == "other"
 
 
+@pytest.fixture
+def few_effects(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands try these only, to be quick."""
+    few = {name: one for name, one in catalogue().items() if name in ("stray_light", "laser_drift")}
+    monkeypatch.setattr("trainer.effects.effect_catalogue.catalogue", lambda files=(): few)
+
+
+@pytest.mark.usefixtures("few_effects")
 @pytest.mark.parametrize("column", ["pattern", "time_s"])
 def test_a_single_pattern_is_not_called_held_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], column: str
@@ -148,6 +157,7 @@ def test_a_dark_capture_is_used_for_nothing_and_said(
     ]
 
 
+@pytest.mark.usefixtures("few_effects")
 def test_a_dark_capture_is_not_a_drift_of_the_laser(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -261,6 +261,23 @@ train(sets.fitted, replace(RECIPES["pix2pix"], filters=2), 8, Path(sys.argv[2]),
 """
 
 
+def test_a_stopped_training_continues_to_the_same_bits(sets: TrainingSets, tmp_path: Path) -> None:
+    """In one process; the next test kills one."""
+    recipe = replace(RECIPES["pix2pix"], filters=2)
+
+    def stop_at_5(step: int, loss: float) -> None:
+        if step == 5:
+            raise KeyboardInterrupt
+
+    train(sets.fitted, recipe, 8, tmp_path / "whole", every=3)
+    with pytest.raises(KeyboardInterrupt):
+        train(sets.fitted, recipe, 8, tmp_path / "stopped", every=3, progress=stop_at_5)
+    assert not (tmp_path / "stopped" / NETWORK).exists()
+    train(sets.fitted, recipe, 8, tmp_path / "stopped", every=3)
+    assert (tmp_path / "stopped" / NETWORK).read_bytes() == (tmp_path / "whole" / NETWORK).read_bytes()
+
+
+@pytest.mark.slow
 def test_a_killed_training_continues_to_the_same_bits(captures: CaptureSet, tmp_path: Path) -> None:
     def run(folder: str, die: int) -> int:
         command = [sys.executable, "-c", RESUMED, str(captures.folder), str(tmp_path / folder), str(die)]

@@ -111,9 +111,9 @@ def test_a_small_panel_ends_where_a_registered_one_does(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "dx", "dy"),
     [
-        ({}, 0.3, 0.0),
+        pytest.param({}, 0.3, 0.0, marks=pytest.mark.slow),
         ({"mirrored": True}, 0.2, -0.2),
-        ({"mirrored": True}, 3.0, 2.0),
+        pytest.param({"mirrored": True}, 3.0, 2.0, marks=pytest.mark.slow),
         ({"degrees": 92.0}, 6.0, -5.0),
     ],
     ids=["0.3 px", "0.3 px, mirrored", "4 px, mirrored", "8 px, turned a quarter"],

@@ -488,7 +488,7 @@ def no_limiter(patch: pytest.MonkeyPatch) -> None:
         constant("pec", lambda data: 0x00),
         ceiling_again,
         deaf_to(model.Fault.HEARTBEAT),
-        deaf_to(model.Fault.INTERLOCK),
+        pytest.param(deaf_to(model.Fault.INTERLOCK), marks=pytest.mark.slow),
         deaf_to(model.Fault.HOST),
         deaf_to(model.Fault.OVERPOWER_0 | model.Fault.OVERPOWER_1 | model.Fault.OVERPOWER_2),
         deaf_to(model.Fault.BUS),

@@ -137,7 +137,7 @@ def test_the_report_is_one_file_with_pictures_and_the_verdict(ran: CommandRun) -
 def test_nothing_is_replaced_where_nothing_has_drifted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    shape = (80, 96)
+    shape = (64, 80)
     bench = bench_file(tmp_path, height=shape[0], width=shape[1], distance_mm=DISTANCE_MM)
     bundle = ideal_bundle(tmp_path / "bundle", shape)
     files = {p: p.read_bytes() for p in bundle.iterdir()}

@@ -59,6 +59,7 @@ def turned_camera(bench: BenchDescription, degrees: float = 4.0, scale: float = 
     return replace(bench, camera=camera)
 
 
+@pytest.mark.slow
 def test_a_mirrored_turned_and_finer_camera_is_found_by_its_dots_and_remembered(tmp_path: Path) -> None:
     bench = turned_camera(drifted_bench("panel_wavefront", shape=SHAPE))
     folder = ideal_bundle(tmp_path / "bundle", SHAPE)
@@ -84,6 +85,7 @@ def test_a_mirrored_turned_and_finer_camera_is_found_by_its_dots_and_remembered(
     assert view_of(read_bundle(folder)) == found.estimate.view
 
 
+@pytest.mark.slow
 def test_a_cameras_scale_and_distortion_are_not_put_into_the_light_path() -> None:
     """A scale that is off looks like defocus and distance, exactly; a distortion does not, and is found."""
     shape = (80, 96)
