@@ -10,7 +10,7 @@ The simulation is in `bench_optics`, `simulated_drive`, `simulated_panel`, `roug
 from firmware_iface.virtual.bench_description import BenchDescription, read_bench
 from firmware_iface.virtual.bench_loading import load_bench
 from firmware_iface.virtual.defect_kind import Defect
-from firmware_iface.virtual.defects import CATALOGUE_KINDS, DEFECT_KINDS, GROWN_KINDS, make_defect
+from firmware_iface.virtual.defects import CATALOGUE_KINDS, DEFECT_KINDS, make_defect
 from firmware_iface.virtual.named_benches import named_benches
 from firmware_iface.virtual.virtual_devices import VirtualCamera, VirtualLasers, VirtualPanel
 from firmware_iface.virtual.virtual_headset import VirtualHeadset, open_headset
@@ -18,7 +18,6 @@ from firmware_iface.virtual.virtual_headset import VirtualHeadset, open_headset
 __all__ = [
     "CATALOGUE_KINDS",
     "DEFECT_KINDS",
-    "GROWN_KINDS",
     "BenchDescription",
     "Defect",
     "VirtualCamera",

@@ -1,8 +1,8 @@
 """Hidden defects of a simulated bench: one frozen dataclass for each kind, parameters in physical units.
 
-The first eighteen kinds carry the names of the catalogue of effects, and `further_defects` has ten more. `specks`,
-`fringes`, `stripes` are outside both, and `convention` is a bench described the wrong way. Lateral parameters that
-scale with the panel are shares of its half width or half height (suffix `_share`); `_px` is panel pixels.
+All kinds carry the names of the catalogue of effects (ten of them are in `further_defects`), except `specks`, `fringes`
+and `stripes`, which are outside it, and `convention`, a bench described the wrong way. Lateral parameters that scale
+with the panel are shares of its half width or half height (suffix `_share`); `_px` is panel pixels.
 """
 
 from __future__ import annotations
@@ -327,9 +327,6 @@ _CATALOGUE: tuple[type[Defect], ...] = (
     SensorResponse,
     LaserDrift,
     Ghost,
-)
-CATALOGUE_KINDS: tuple[str, ...] = tuple(c.kind for c in _CATALOGUE)
-_GROWN: tuple[type[Defect], ...] = (
     AmplitudeModulation,
     PolarisationLeak,
     SlowResponse,
@@ -341,9 +338,9 @@ _GROWN: tuple[type[Defect], ...] = (
     FrameMotion,
     FixedPattern,
 )
-GROWN_KINDS: tuple[str, ...] = tuple(c.kind for c in _GROWN)
+CATALOGUE_KINDS: tuple[str, ...] = tuple(c.kind for c in _CATALOGUE)
 _OUTSIDE: tuple[type[Defect], ...] = (Specks, Fringes, Stripes, Convention)
-DEFECT_KINDS: dict[str, type[Defect]] = {c.kind: c for c in _CATALOGUE + _GROWN + _OUTSIDE}
+DEFECT_KINDS: dict[str, type[Defect]] = {c.kind: c for c in _CATALOGUE + _OUTSIDE}
 
 
 def make_defect(kind: str, where: str = "a defect", **parameters: Any) -> Defect:

@@ -10,7 +10,7 @@ from firmware_iface.virtual.bench_description import (
     ChannelDescription,
     SimulationDescription,
 )
-from firmware_iface.virtual.defects import CATALOGUE_KINDS, GROWN_KINDS, make_defect
+from firmware_iface.virtual.defects import CATALOGUE_KINDS, make_defect
 
 _RGB = (
     ChannelDescription("red", 638.0),
@@ -30,7 +30,7 @@ def _benches() -> dict[str, BenchDescription]:
         ),
     )
     benches = [BenchDescription("ideal"), demo, replace(demo.resized(144, 192, 18.0), name="small_demo")]
-    benches += [BenchDescription(kind, defects=(make(kind),)) for kind in CATALOGUE_KINDS + GROWN_KINDS]
+    benches += [BenchDescription(kind, defects=(make(kind),)) for kind in CATALOGUE_KINDS]
     benches += [
         BenchDescription("pair", defects=(make("phase_response"), make("pupil_aberration"))),
         BenchDescription("triple", defects=(make("crosstalk"), make("illumination"), make("distance"))),

@@ -14,7 +14,6 @@ from firmware_iface import InputError
 from firmware_iface.virtual import (
     CATALOGUE_KINDS,
     DEFECT_KINDS,
-    GROWN_KINDS,
     load_bench,
     make_defect,
     named_benches,
@@ -96,10 +95,9 @@ def test_unknown_benches_are_refused_with_the_nearest_name():
 
 
 def test_one_bench_for_every_effect_of_the_catalogue():
-    assert len(CATALOGUE_KINDS) == 18
-    assert len(GROWN_KINDS) == 10 and not set(GROWN_KINDS) & set(CATALOGUE_KINDS)
-    assert {*CATALOGUE_KINDS, *GROWN_KINDS} <= set(named_benches())
-    for kind in CATALOGUE_KINDS + GROWN_KINDS:
+    assert len(CATALOGUE_KINDS) == 28
+    assert set(CATALOGUE_KINDS) <= set(named_benches())
+    for kind in CATALOGUE_KINDS:
         assert [d.kind for d in load_bench(f"virtual:{kind}").defects] == [kind]
 
 

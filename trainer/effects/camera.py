@@ -9,13 +9,15 @@ import torch
 from torch import Tensor
 
 from trainer.effects.definition import Parameter, effect
-from trainer.effects.measured_values import pixel_pattern, shift_spread
+from trainer.effects.measured_values import blur_rms, pixel_pattern, shift_spread
 from trainer.prediction.stages import Sensor
 
 
 @effect(
     stage="sensor",
     acts_on="camera",
+    measure=blur_rms,
+    rugged=True,
     parameters=[
         Parameter(
             "rms",
@@ -25,7 +27,7 @@ from trainer.prediction.stages import Sensor
             high=20,
             even=True,
             starts=(0.3, 0.8),
-            about="of the motion during an exposure, panel pixels",
+            about="of the motion during a usual exposure; each capture has its own, up to twice as much",
             typical=(0, 3),
             example=1.2,
         ),
@@ -46,13 +48,13 @@ from trainer.prediction.stages import Sensor
             scale=0.3,
             absent=-1.5,
             low=-1.5,
-            high=1.5,
+            high=0,
             about="shape: -1.5 a sinusoid, 0 a random motion",
-            typical=(-1.5, 1.5),
+            typical=(-1.5, 0),
         ),
     ],
     formula=(
-        r"\hat{I}' = \hat{I}\,e^{-w^2/2 + \kappa w^4/24}, \qquad"
+        r"\hat{I}' = \hat{I}\,\bigl[\,s\,J_0(\sqrt2\,w) + (1-s)\,e^{-w^2/2}\bigr], \qquad s = -\kappa/1.5, \quad"
         r" w = 2\pi\sigma\,(f_x \cos\theta + f_y \sin\theta)"
     ),
 )
@@ -60,15 +62,21 @@ def vibration(sensor: Sensor, rms: Tensor, direction: Tensor, kurtosis: Tensor) 
     """The picture moves along a direction during each exposure.
 
     A fan, a pump or the table's own resonance shakes the camera while it exposes. The picture blurs along one
-    direction, and stays sharp across it.
+    direction, and stays sharp across it. How far it moves is measured from each capture.
 
     References
     ----------
     Holst 2008, Electro-Optical Imaging System Performance, chapter on motion.
     """
     angle = math.pi / 180 * direction
-    w2 = (2 * math.pi * rms * (sensor.ix * torch.cos(angle) + sensor.iy * torch.sin(angle))) ** 2
-    return sensor.blurred(torch.exp(w2 * (torch.clamp(kurtosis * w2 / 24, -0.25, 0.25) - 0.5)))
+    whole = (2 * math.pi * rms * (sensor.ix * torch.cos(angle) + sensor.iy * torch.sin(angle))) ** 2
+
+    def blur(amount: Tensor) -> Tensor:
+        w2 = amount * whole
+        share = -kurtosis / 1.5
+        return share * torch.special.bessel_j0(torch.sqrt(2 * w2)) + (1 - share) * torch.exp(-0.5 * w2)
+
+    return sensor if float(rms) == 0 else replace(sensor, capture_blur=blur)
 
 
 @effect(

@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 from scipy.ndimage import uniform_filter
+from scipy.special import j0
 
 from trainer.effects.evidence import Evidence
 from trainer.effects.starts import displacements
 
 LIKELY_GAIN, LIKELY_OFFSET = 0.05, 20.0  # where the estimate of their spreads begins: share, counts
+LIKELY_VARIANCES = tuple(0.06 * 1.6**n for n in range(-1, 10))  # of a blur, pixels^2, from 0.04 to 4
 ROUNDS = 6  # of that estimate
 
 
@@ -25,6 +27,31 @@ def shift_spread(evidence: Sequence[Evidence]) -> dict[str, Any]:
             shifts.setdefault((one.scene.channel, one.scene.plane_mm), []).append(middle)
     deviations = np.concatenate([np.array(s) - np.mean(s, axis=0) for s in shifts.values()])
     return {"spread": max(0.01, float(np.sqrt(np.mean(deviations**2))))}
+
+
+def blur_rms(evidence: Sequence[Evidence]) -> dict[str, Any]:
+    """Rms (camera pixels) of the blur along the direction in which captures are blurred most, over all of them."""
+    variances = []
+    for one in evidence:
+        for k in range(len(one.batch.ids)):
+            sharp = one.prediction[k].double().numpy()
+            blurred, weight = (t[k].double().numpy() for t in (one.batch.signal, one.batch.mask))
+            variances.append(_blur_variance(sharp, blurred, weight))
+    return {"rms": max(0.05, float(np.sqrt(np.mean(variances))))}
+
+
+def _blur_variance(sharp: np.ndarray, blurred: np.ndarray, weight: np.ndarray) -> float:
+    """Variance (pixels^2) of a swing along its direction: the one of some tried that fits best."""
+    fy, fx = np.fft.fftfreq(sharp.shape[0])[:, None], np.fft.fftfreq(sharp.shape[1])[None, :]
+    spectrum = np.fft.fft2(sharp)
+    best = (-np.inf, 0.0)
+    for angle in np.deg2rad(np.arange(0, 180, 15)):
+        along = (2 * np.pi * (fx * np.cos(angle) + fy * np.sin(angle))) ** 2
+        for variance in LIKELY_VARIANCES:
+            trial = np.fft.ifft2(spectrum * j0(np.sqrt(2 * variance * along))).real
+            power = float((weight * trial**2).sum())
+            best = max(best, (float((weight * trial * blurred).sum()) ** 2 / max(power, 1e-30), variance))
+    return best[1]
 
 
 def pixel_pattern(evidence: Sequence[Evidence]) -> dict[str, Any]:

@@ -11,6 +11,8 @@ from torch import Tensor
 
 from trainer.prediction.stages import Drive, Panel, Pupil, Sensor
 
+_CURVES = {"response": "the signal", "capture_blur": "its amount"}
+
 Shape = tuple[int, ...]
 Fault = tuple[str, str]  # what is wrong, after "whose"; what is wanted
 
@@ -60,9 +62,9 @@ def stage_faults(before: Any, after: Any) -> Iterator[Fault]:
             continue
         if name in wanted:
             yield from _tensor_faults(name, new, wanted[name], optional=field.default is None)
-        elif name == "response":  # the sensor's: a curve
+        elif name in _CURVES:  # the sensor's
             if new is not None and not callable(new):
-                yield f"response is {_kind(new)}", "give a function of the signal"
+                yield f"{name} is {_kind(new)}", f"give a function of {_CURVES[name]}"
         elif isinstance(old, Tensor):
             yield from _tensor_faults(name, new, _Wanted(tuple(old.shape), str(list(old.shape))), False)
         elif not isinstance(new, type(old)) and not isinstance(new, int | float):

@@ -9,7 +9,7 @@ import torch
 
 from trainer.fitting.predictor import Predictor
 from trainer.model.model import Model
-from trainer.prediction.predict import Trace, counts, light_on_camera
+from trainer.prediction.predict import Trace, counts
 
 
 def with_gain(model: Model, predictors: Sequence[Predictor], points: Sequence[Trace] | None = None) -> Model:
@@ -27,7 +27,7 @@ def with_gain(model: Model, predictors: Sequence[Predictor], points: Sequence[Tr
         stages = predictor.stages(unit)
         linear = replace(stages.sensor, offset=None, response=None, free_capture_gain=False)
         point = predictor.trace(unit) if points is None else points[k]
-        light = light_on_camera(predictor.scene, stages, point.image)
+        light = predictor.light(unit, point)
         one = counts(
             predictor.scene, replace(stages, sensor=linear), light, batch.exposure[:, None, None], None
         )

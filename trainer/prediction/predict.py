@@ -31,7 +31,7 @@ from runtime.lightpath.propagation import (
     far_field_matrix,
     transfer_function,
 )
-from trainer.prediction.capture_shift import displaced_spectrum
+from trainer.prediction.capture_motion import blurred_spectrum, displaced_spectrum
 from trainer.prediction.panel_gradient import has_panel_gradient, image_with_panel_gradient
 from trainer.prediction.scene import Scene, Stages, bare_stages
 from trainer.prediction.stages import Drive, Pupil, Sensor
@@ -303,7 +303,7 @@ def light_on_camera(
     image : Tensor
         Irradiance on the fine image grid, as in `Trace`.
     measured : (Tensor, Tensor), optional
-        Signal and weight [B, h, w], from which each capture's own displacement is measured where the camera moves.
+        Signal and weight [B, h, w]: where the camera moves, each capture's own displacement and blur follow from them.
 
     Returns
     -------
@@ -334,6 +334,11 @@ def light_on_camera(
     spectrum = rfft2(image) * transfer
     if sensor.free_capture_shift and measured is not None:
         spectrum = displaced_spectrum(sensor, spectrum, read, measured)
+    if sensor.capture_blur is not None:
+        if measured is None:
+            spectrum = spectrum * sensor.capture_blur(torch.ones((), dtype=scene.dtype))
+        else:
+            spectrum = blurred_spectrum(sensor, spectrum, read, measured)
     return read(spectrum)
 
 

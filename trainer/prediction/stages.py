@@ -234,6 +234,9 @@ class Sensor:
         Each capture has its own gain.
     free_capture_shift : bool
         Each capture has its own displacement.
+    capture_blur : callable or None
+        Each capture has its own amount of a blur: a function of its variance over the usual one's that gives the blur's
+        transfer function over (iy, ix).
     """
 
     channel: str
@@ -250,6 +253,7 @@ class Sensor:
     response: Callable[[Tensor], Tensor] | None = None
     free_capture_gain: bool = False
     free_capture_shift: bool = False
+    capture_blur: Callable[[Tensor], Tensor] | None = None
 
     def blurred(self, transfer: Tensor) -> Sensor:
         """The sensor with the camera's picture filtered by a transfer function over (iy, ix)."""
