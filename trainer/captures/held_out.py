@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 from trainer.captures.capture_set import CaptureSet
@@ -174,7 +175,11 @@ def capture_roles(captures: CaptureSet) -> CaptureRoles:
     pixels = height * width
     count = len(scenes(divided.fitted))
     fitted = sample(divided.fitted, pixels, max(FIT_CAPTURES, count))
-    screened = sample(divided.fitted, pixels, count)
+    # A panel that still shows the pattern before is seen only where that was another one.
+    all_rows = captures.captures
+    after_another = {b.capture for a, b in pairwise(all_rows) if a.pattern != b.pattern}
+    telling = [c for c in divided.fitted if c.capture in after_another]
+    screened = sample(telling if len(scenes(telling)) == count else divided.fitted, pixels, count)
     probed = sample(divided.fitted, pixels // 2, max(PROBE_CAPTURES, count))
     most = max(2 * count, HELD_PIXELS // pixels)
     held_out = list(divided.held_out)
