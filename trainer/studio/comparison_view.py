@@ -203,15 +203,17 @@ def pictures_view(pictures: Sequence[CapturePicture]) -> Any:
 
 def comparison_view(project: Project, visit: Visit) -> Any:
     """The pictures, and what is shown in them."""
-    if project.captures is None:
+    if project.set.captures is None:
         return pn.pane.HTML("<p class='quiet'>There are no captures to compare.</p>", css_classes=["card"])
-    shape = project.captures.bench.camera.shape
+    shape = project.set.captures.bench.camera.shape
     pictures = LinkedPictures(shape)
     place = pn.FlexBox(gap="12px", sizing_mode="stretch_width")
     note = pn.pane.HTML("", margin=0, sizing_mode="stretch_width")
     scales = pn.pane.HTML("", margin=0, sizing_mode="stretch_width")
-    colour = pn.widgets.Select(name="Colour", options=list(project.captures.channels), width=110, margin=0)
-    planes = {f"{z:g} mm": z for z in project.captures.planes}
+    colour = pn.widgets.Select(
+        name="Colour", options=list(project.set.captures.channels), width=110, margin=0
+    )
+    planes = {f"{z:g} mm": z for z in project.set.captures.planes}
     plane = pn.widgets.Select(name="Plane", options=planes, width=110, margin=0)
     capture = pn.widgets.Select(name="Capture", options=[], width=230, margin=0)
     way = pn.widgets.Select(name="Pictures", options=["side by side", "wipe"], width=130, margin=0)
@@ -226,7 +228,7 @@ def comparison_view(project: Project, visit: Visit) -> Any:
 
     def layout() -> None:
         kinds = ("wipe", "difference") if way.value == "wipe" else KINDS
-        if project.other is not None:
+        if project.set.other is not None:
             kinds = (*kinds, "predicted_2", "difference_2")
         if built == [kinds]:
             return
@@ -237,7 +239,7 @@ def comparison_view(project: Project, visit: Visit) -> Any:
                 if not made:
                     plot.on_event(RangesUpdate, pictures.redraw)
                 made[kind] = pn.pane.Bokeh(plot, sizing_mode="scale_width", margin=0)
-        share = "50%" if way.value == "wipe" and project.other is None else "33.3%"
+        share = "50%" if way.value == "wipe" and project.set.other is None else "33.3%"
         place[:] = [
             pn.Column(
                 pn.pane.HTML(f"<h3>{TITLES[k]}</h3>", margin=0),
@@ -249,13 +251,13 @@ def comparison_view(project: Project, visit: Visit) -> Any:
         ]
 
     def list_captures() -> None:
-        if project.captures is None:
+        if project.set.captures is None:
             return
-        held = {c.capture for c in project.held_out}
-        errors = project.errors
+        held = {c.capture for c in project.set.held_out}
+        errors = project.set.errors
         excess = {} if errors is None else {one.capture: one.errors.excess for one in errors.captures}
         options = {}
-        for c in project.captures.captures:
+        for c in project.set.captures.captures:
             if c.channel == colour.value and c.plane_mm == plane.value:
                 tail = "held out" if c.capture in held else "fitted"
                 if c.capture in excess:
@@ -271,13 +273,15 @@ def comparison_view(project: Project, visit: Visit) -> Any:
 
     def show() -> None:
         name = visit.capture
-        found = project.pictures.prediction(name) if name else None
+        found = project.set.pictures.prediction(name) if name else None
         other = (
-            project.pictures.prediction(name, of_other=True) if name and project.other is not None else None
+            project.set.pictures.prediction(name, of_other=True)
+            if name and project.set.other is not None
+            else None
         )
         layout()
         if found is None:
-            fault = project.pictures.fault(name)
+            fault = project.set.pictures.fault(name)
             note.object = (
                 f"<p class='{'bad-text' if fault else 'quiet'}'>{escape(fault) or 'Predicting …'}</p>"
             )
@@ -293,7 +297,7 @@ def comparison_view(project: Project, visit: Visit) -> Any:
 
     def jump(event: Any) -> None:
         """Another view has chosen a capture."""
-        rows = project.captures.captures if project.captures is not None else ()
+        rows = project.set.captures.captures if project.set.captures is not None else ()
         row = next((c for c in rows if c.capture == event.new), None)
         if row is not None and (row.channel, row.plane_mm) != (colour.value, plane.value):
             colour.value, plane.value = row.channel, row.plane_mm
@@ -306,16 +310,16 @@ def comparison_view(project: Project, visit: Visit) -> Any:
         layout()
 
     def toggle(_: Any) -> None:
-        if project.other is not None:
+        if project.set.other is not None:
             project.compare_with("", None)
         else:
             second.visible = True
             _compare(project, second.value)
 
     def others() -> None:
-        second.options = [IDEAL, *project.earlier_models()]
-        second.visible = project.other is not None
-        compare.name = "Compare" if project.other is None else "Compare no more"
+        second.options = [IDEAL, *project.set.earlier_models()]
+        second.visible = project.set.other is not None
+        compare.name = "Compare" if project.set.other is None else "Compare no more"
         layout()
         show()
 
@@ -326,7 +330,7 @@ def comparison_view(project: Project, visit: Visit) -> Any:
     way.param.watch(ways, "value")
     wipe.param.watch(lambda event: pictures.wipe(event.new / 100), "value")
     second.param.watch(
-        lambda event: _compare(project, event.new) if project.other is not None else None, "value"
+        lambda event: _compare(project, event.new) if project.set.other is not None else None, "value"
     )
     compare.on_click(toggle)
     visit.on("errors set", list_captures)
@@ -346,15 +350,15 @@ def comparison_view(project: Project, visit: Visit) -> Any:
 
 def _compare(project: Project, name: str) -> None:
     """Show a second model: the ideal one, or an earlier step."""
-    captures = project.captures
+    captures = project.set.captures
     if captures is None:
         return
     try:
         if name == IDEAL:
             model = Model(captures.bench)
         else:
-            path: Path = project.earlier_models()[name]
-            model = read_model(path, project.known, captures.bench)
+            path: Path = project.set.earlier_models()[name]
+            model = read_model(path, project.effects.known, captures.bench)
     except (InputError, KeyError) as error:
         project.say(str(error), "error")
         return
@@ -368,7 +372,7 @@ def _words(project: Project, found: CapturePrediction) -> str:
     excess = f", excess <b>{number(errors.errors.excess)}</b>" if errors.has_contrast else ""
     lost = 1 - float(found.valid.mean())
     saturated = f"; {100 * lost:.2g} % saturated, gray" if lost > 0 else ""
-    other = "" if project.other is None else f"; next to {escape(project.other[0])}"
+    other = "" if project.set.other is None else f"; next to {escape(project.set.other[0])}"
     return (
         f"<p>Capture <b>{escape(found.capture)}</b>, {escape(errors.channel)}, {errors.plane_mm:g} mm{excess}"
         f"{saturated}{other}. Drag to pan, wheel to zoom; the pictures move together.</p>"

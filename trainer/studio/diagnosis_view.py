@@ -39,16 +39,16 @@ def diagnosis_view(project: Project, visit: Visit) -> Any:
 
     def work() -> None:
         idle = project.work is None
-        usable = idle and project.captures is not None and not project.misread
+        usable = idle and project.set.captures is not None and not project.set.misread
         diagnose.disabled = explain.disabled = not usable
         cancel.disabled = idle
         progress.object = "" if project.work is None else progress_html(project.work)
 
     def show() -> None:
-        found = project.diagnosis
+        found = project.results.diagnosis
         tone = TONES[found.verdict] if found is not None else "plain"
         label.object = "" if found is None else f"<p class='tone {tone}'>{LABELS[found.verdict]}</p>"
-        verdict.tone, verdict.text = tone, project.verdict or _first_words(project)
+        verdict.tone, verdict.text = tone, project.results.verdict or _first_words(project)
 
     visit.on("job set", work)
     visit.on("diagnosis errors set model", show)
@@ -78,11 +78,11 @@ def _time(seconds: float) -> str:
 
 def _first_words(project: Project) -> str:
     """What the numbers say before anything was diagnosed."""
-    if project.set_fault:
-        return project.set_fault
-    if project.misread:
+    if project.set.fault:
+        return project.set.fault
+    if project.set.misread:
         return "Correct the captures first: every number would be wrong."
-    errors = project.errors
+    errors = project.set.errors
     if errors is None:
         return "Comparing the model with captures that no fit saw …"
     one = errors.errors
@@ -105,11 +105,11 @@ def candidates_view(project: Project, visit: Visit) -> Any:
     shown: list[Any] = []
 
     def show() -> None:
-        now = [project.ranking, *project.previews.values()]
+        now = [project.results.ranking, *project.results.previews.values()]
         if len(shown) == len(now) and all(a is b for a, b in zip(shown, now, strict=True)):
             return  # a button that is replaced while somebody clicks it does nothing
         shown[:] = now
-        ranking = project.ranking[:MOST]
+        ranking = project.results.ranking[:MOST]
         buttons.clear()
         if not ranking:
             place[:] = []
@@ -117,7 +117,7 @@ def candidates_view(project: Project, visit: Visit) -> Any:
         top = max([r.removed.interval()[1] for r in ranking] + [1e-12])
         rows: list[Any] = [pn.pane.HTML("<h2>Candidates</h2>", margin=0)]
         rows += [_candidate(project, r, top, buttons) for r in ranking]
-        found = project.diagnosis
+        found = project.results.diagnosis
         if found is not None and found.suggested_captures:
             items = "".join(f"<li>{escape(s)}</li>" for s in found.suggested_captures)
             rows.append(pn.pane.HTML(f"<h3>Captures that would decide more</h3><ul>{items}</ul>", margin=0))
@@ -162,7 +162,7 @@ def _candidate(project: Project, one: RankedEffect, top: float, buttons: list[An
 
 def _pictures(project: Project, one: RankedEffect) -> Any:
     """What is missing in a picture, and what the candidate would put there, on one scale."""
-    preview = project.previews.get(one.effect.name)
+    preview = project.results.previews.get(one.effect.name)
     if preview is None:
         return pn.pane.HTML("", margin=0)
     pictures = "".join(

@@ -26,9 +26,9 @@ Chosen = Callable[[str, list[tuple[str, float]]], None]
 
 def failures_view(project: Project, visit: Visit) -> Any:
     """Four plots on the held-out captures, and the captures that are worst where one has clicked."""
-    if project.captures is None:
+    if project.set.captures is None:
         return pn.Column()
-    shape = project.captures.bench.camera.shape
+    shape = project.set.captures.bench.camera.shape
     plots: dict[str, Any] = {
         "field": _Field(shape),
         "frequency": _Frequency(visit),
@@ -52,7 +52,7 @@ def failures_view(project: Project, visit: Visit) -> Any:
         worst[:] = buttons
 
     def pick(event: Any) -> None:
-        errors = project.errors
+        errors = project.set.errors
         if errors is None:
             return
         if event.new not in places:
@@ -64,7 +64,7 @@ def failures_view(project: Project, visit: Visit) -> Any:
 
     def tapped(kind: str) -> Callable[[Any], None]:
         def act(event: Any) -> None:
-            errors = project.errors
+            errors = project.set.errors
             if errors is None:
                 return
             place = plots[kind].place(errors, event.x, event.y)
@@ -87,7 +87,7 @@ def failures_view(project: Project, visit: Visit) -> Any:
         )
 
     def show() -> None:
-        errors = project.errors
+        errors = project.set.errors
         if errors is None:
             words.object = "<p class='quiet'>Comparing with the held-out captures …</p>"
             worst[:] = []

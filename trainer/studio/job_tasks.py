@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from trainer.captures.problems import Problem
 from trainer.diagnosis.candidate_fits import try_effect
 from trainer.diagnosis.capture_errors import CaptureErrors, capture_errors
 from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors
+from trainer.diagnosis.error_budget import error_budget
 from trainer.diagnosis.explanation import add, explain
 from trainer.diagnosis.ranking import RankedEffect, rank
 from trainer.diagnosis.screen import screen_batches
@@ -33,6 +35,7 @@ from trainer.fitting.predictor import evaluate_captures
 from trainer.model.history import recorded
 from trainer.model.model import Model
 from trainer.model.model_stages import ideal_irradiance
+from trainer.networks.approximator import Approximator, read_approximator, write_approximator
 from trainer.report.heat_maps import blocks, from_zero, symmetric
 from trainer.studio.jobs import Say
 
@@ -112,13 +115,21 @@ def fit_gains(say: Say, folder: Path, model: Model) -> Model:
     return with_gains(captures, model, capture_roles(captures).fitted)
 
 
-def predict(say: Say, folder: Path, model: Model, capture: str, effects_version: int) -> CapturePrediction:
+def predict(
+    say: Say, folder: Path, model: Model, capture: str, network: Path | None, effects_version: int
+) -> CapturePrediction:
     """One capture, measured and predicted, and where they differ."""
     captures = opened(folder)
     row = chosen(captures, (capture,))[0]
-    residual, errors = capture_errors(captures, row, model)
+    learned = None if network is None else _network_in(network, network.stat().st_mtime_ns)
+    residual, errors = capture_errors(captures, row, model, learned)
     measured, predicted = residual.measured.astype(np.float32), residual.predicted.astype(np.float32)
     return shown_as(capture, measured, predicted, residual.mask > 0, errors)
+
+
+@lru_cache(maxsize=1)
+def _network_in(path: Path, time_ns: int) -> Approximator:
+    return read_approximator(path)[0]
 
 
 def shown_as(
@@ -214,8 +225,7 @@ def learn_panel_field(say: Say, folder: Path, model: Model) -> tuple[Model, floa
 
 
 def train_network(say: Say, folder: Path, model: Model, steps: int, out: Path) -> tuple[Path, float, float]:
-    """A network trained beyond the model: its file, and the PSNR of held-out predictions without and with it, dB."""
-    from trainer.training.image_metrics import prediction_metrics
+    """A network trained beyond the model: its file, and the held-out excess without and with it."""
     from trainer.training.recipe import recipe_named
     from trainer.training.training_run import NETWORK, train
     from trainer.training.training_sets import training_sets
@@ -230,10 +240,13 @@ def train_network(say: Say, folder: Path, model: Model, steps: int, out: Path) -
     out.mkdir(parents=True, exist_ok=True)
     network = train(
         sets.fitted, recipe_named("compact"), steps, out, sets.held_out, about=sets.about,
-        progress=lambda step, loss: progress(0.1 + 0.9 * step / steps, f"step {step} of {steps}, loss {loss:.3g}"),
+        progress=lambda step, loss: progress(0.1 + 0.8 * step / steps, f"step {step} of {steps}, loss {loss:.3g}"),
     )  # fmt: skip
-    before, after = (prediction_metrics(sets.held_out, one).as_json() for one in (None, network))
-    return out / NETWORK, float(before["psnr_db"]), float(after["psnr_db"])
+    progress(0.9, "comparing with captures that the network has not seen")
+    before, after = (error_budget(captures, sets.model, one).unexplained for one in (None, network))
+    about = {**sets.about, "steps": steps, "excess_before": before, "excess_after": after}
+    write_approximator(out / NETWORK, network, about)
+    return out / NETWORK, before, after
 
 
 def _begin(folder: Path, effects: Sequence[Path]) -> tuple[CaptureSet, Any]:

@@ -41,9 +41,9 @@ def ladder_view(project: Project, visit: Visit) -> Any:
     pane = pn.pane.HTML("", sizing_mode="stretch_width", margin=0, css_classes=["card", "ladder"])
 
     def show() -> None:
-        rows = ladder_rows(project.model.history) if project.model is not None else []
-        if not rows and project.errors is not None:
-            rows = [{"label": "ideal model", **project.errors.errors.as_json()}]
+        rows = ladder_rows(project.set.model.history) if project.set.model is not None else []
+        if not rows and project.set.errors is not None:
+            rows = [{"label": "ideal model", **project.set.errors.errors.as_json()}]
         if not rows:
             pane.object = (
                 "<h2>Ladder of errors</h2><p class='quiet'>Comparing with the held-out captures …</p>"

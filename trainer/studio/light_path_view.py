@@ -39,22 +39,22 @@ def light_path_view(project: Project, visit: Visit) -> Any:
 
 
 def _path(project: Project) -> str:
-    model = project.model
+    model = project.set.model
     if model is None:
         return ""
-    probes = {p.stage: p for p in (project.diagnosis.probes if project.diagnosis else ())}
-    excess = project.diagnosis.held_out.excess if project.diagnosis else 0.0
+    probes = {p.stage: p for p in (project.results.diagnosis.probes if project.results.diagnosis else ())}
+    excess = project.results.diagnosis.held_out.excess if project.results.diagnosis else 0.0
     names = ["gray", *STAGES, "camera"]
     if model.panel_field is not None:
         names.insert(names.index("panel") + 1, "field")
-    if project.network is not None:
+    if project.set.network is not None:
         names.insert(names.index("sensor"), "network")
     boxes = "".join(_stage(n, model, probes.get(n), excess) for n in names)
     if probes:
         legend = (
             "The deeper the colour, the more of what is left a free-form probe of the stage would remove."
         )
-    elif project.diagnosis and project.diagnosis.verdict == "complete":
+    elif project.results.diagnosis and project.results.diagnosis.verdict == "complete":
         legend = "What is left is too little to come from a stage."
     else:
         legend = "Diagnose shows at which stage the error that is left comes in."

@@ -32,13 +32,13 @@ def outside_view(project: Project, visit: Visit) -> Any:
     train.on_click(lambda _: project.train_network(int(steps.value or 400)))
 
     def written(_: Any) -> None:
-        if project.captures is None:
+        if project.set.captures is None:
             return
-        bench = project.captures.bench
+        bench = project.set.captures.bench
         found = (
             None
-            if project.diagnosis is None
-            else next((p for p in project.diagnosis.probes if p.stage == stage.value), None)
+            if project.results.diagnosis is None
+            else next((p for p in project.results.diagnosis.probes if p.stage == stage.value), None)
         )
         shape = bench.camera.shape if stage.value == "sensor" else bench.panel.shape
         try:
@@ -48,7 +48,7 @@ def outside_view(project: Project, visit: Visit) -> Any:
                 found,
                 shape,
                 project.home,
-                project.known,
+                project.effects.known,
             )
         except (InputError, OSError) as error:
             project.say(str(error), "error")
@@ -61,7 +61,7 @@ def outside_view(project: Project, visit: Visit) -> Any:
     write.on_click(written)
 
     def show() -> None:
-        found = project.diagnosis
+        found = project.results.diagnosis
         if found is None or not found.probes:
             pictures.object = (
                 "<p class='quiet'>Diagnose fits each stage's free-form probe; its pictures come here.</p>"
@@ -72,12 +72,12 @@ def outside_view(project: Project, visit: Visit) -> Any:
                 stage.value = found.stage
 
     def work() -> None:
-        idle = project.work is None and project.captures is not None
+        idle = project.work is None and project.set.captures is not None
         learn.disabled = train.disabled = write.disabled = not idle
 
     def listed() -> None:
-        rows = "".join(f"<li><code>{escape(str(p))}</code></li>" for p in project.effect_files)
-        fault = f"<p class='bad-text'>{escape(project.effects_fault)}</p>" if project.effects_fault else ""
+        rows = "".join(f"<li><code>{escape(str(p))}</code></li>" for p in project.effects.paths)
+        fault = f"<p class='bad-text'>{escape(project.effects.fault)}</p>" if project.effects.fault else ""
         files.object = (f"<h3>Watched files</h3><ul>{rows}</ul>" if rows else "") + fault
 
     visit.on("diagnosis model", show)

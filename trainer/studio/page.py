@@ -56,11 +56,11 @@ def _fill(place: Any, project: Project, visit: Visit) -> None:
     shown: list[Path | None] = []
 
     def show() -> None:
-        if shown == [project.folder]:
+        if shown == [project.set.folder]:
             return
-        shown[:] = [project.folder]
+        shown[:] = [project.set.folder]
         visit.capture = ""
-        if project.folder is None:
+        if project.set.folder is None:
             place[:] = [notice_view(project, visit), start_view(project, visit)]
         else:
             place[:] = [
@@ -126,4 +126,4 @@ def _bench(project: Project, visit: Visit) -> Any:
 
 def _catalogue(project: Project, visit: Visit) -> Any:
     """The catalogue of effects, with pictures that move."""
-    return catalogue_view(project.known)
+    return catalogue_view(project.effects.known)

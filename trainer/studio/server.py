@@ -96,9 +96,9 @@ def serve(
             server.stop()
     finally:
         project.close()
-    path = project.model_path
+    path = project.set.model_path
     written = str(path) if path is not None and path.is_file() else None
-    return Served(address, None if project.folder is None else str(project.folder), written)
+    return Served(address, None if project.set.folder is None else str(project.set.folder), written)
 
 
 def make_server(project: Project, port: int, token: str) -> Any:

@@ -324,28 +324,30 @@ def test_a_project_predicts_adds_undoes_and_sees_the_command_line(
     project: Project, captures: CaptureSet
 ) -> None:
     project.open_set(captures.folder)
-    until(lambda: project.errors is not None and project.problems is not None)
-    assert project.errors is not None and project.errors.errors.excess > 0.05
-    assert project.problems == [] or all(p.severity == "warning" for p in project.problems or ())
-    path = project.model_path
+    until(lambda: project.set.errors is not None and project.set.problems is not None)
+    assert project.set.errors is not None and project.set.errors.errors.excess > 0.05
+    assert project.set.problems == [] or all(p.severity == "warning" for p in project.set.problems or ())
+    path = project.set.model_path
     assert path is not None and not path.exists()
     project.add("zero_order")
     assert project.work is not None and project.work.name == "Add zero_order"
-    until(lambda: project.model is not None and project.model.names == ("zero_order",))
-    until(lambda: project.diagnosis is not None)
-    assert project.model is not None
+    until(lambda: project.set.model is not None and project.set.model.names == ("zero_order",))
+    until(lambda: project.results.diagnosis is not None)
+    assert project.set.model is not None
     assert path.is_file()
-    assert project.diagnosis is not None and project.diagnosis.verdict == "complete"
-    until(lambda: project.errors)
-    assert project.errors.errors.excess < 1e-3
-    assert [r["label"] for r in ladder_rows(project.model.history)] == ["ideal model", "+ zero order"]
+    assert project.results.diagnosis is not None and project.results.diagnosis.verdict == "complete"
+    until(lambda: project.set.errors)
+    assert project.set.errors.errors.excess < 1e-3
+    assert [r["label"] for r in ladder_rows(project.set.model.history)] == ["ideal model", "+ zero order"]
     project.undo()
-    assert project.model.names == () and project.can_redo() and read_model(path, catalogue()).names == ()
+    assert (
+        project.set.model.names == () and project.set.can_redo() and read_model(path, catalogue()).names == ()
+    )
     project.redo()
-    assert project.model.names == ("zero_order",)
+    assert project.set.model.names == ("zero_order",)
     write_model(path, read_model(path, catalogue()).without("zero_order"))
     until(lambda: "another program" in project.notice[1])
-    assert project.model.names == ()
+    assert project.set.model.names == ()
 
 
 def test_a_broken_set_is_a_sentence(project: Project, captures: CaptureSet, tmp_path: Path) -> None:
@@ -353,10 +355,10 @@ def test_a_broken_set_is_a_sentence(project: Project, captures: CaptureSet, tmp_
     shutil.copytree(captures.folder, folder)
     (folder / "bench.toml").write_text("[panel\n")
     project.open_set(folder)
-    assert project.captures is None and "bench.toml" in project.set_fault
-    until(lambda: project.problems)
+    assert project.set.captures is None and "bench.toml" in project.set.fault
+    until(lambda: project.set.problems)
     (folder / "bench.toml").write_text((captures.folder / "bench.toml").read_text())
-    until(lambda: project.captures is not None)
+    until(lambda: project.set.captures is not None)
     with pytest.raises(InputError, match="is not a folder"):
         project.open_set(tmp_path / "nowhere")
 
@@ -365,20 +367,20 @@ def test_a_saved_effect_file_takes_part_at_once(
     project: Project, captures: CaptureSet, tmp_path: Path
 ) -> None:
     project.open_set(captures.folder)
-    until(lambda: project.errors)
+    until(lambda: project.set.errors)
     path = write_effect_of_probe("my_stripe", "panel", None, (72, 96), tmp_path, ())
     project.add_effect_file(path)
-    until(lambda: any(r.effect.name == "my_stripe" for r in project.ranking))
-    assert "my_stripe" in project.previews
+    until(lambda: any(r.effect.name == "my_stripe" for r in project.results.ranking))
+    assert "my_stripe" in project.results.previews
     path.write_text(path.read_text() + "\nthis is not Python\n")
-    until(lambda: project.effects_fault)
-    assert str(path) in project.effects_fault and "line" in project.effects_fault
+    until(lambda: project.effects.fault)
+    assert str(path) in project.effects.fault and "line" in project.effects.fault
 
 
 def test_a_full_disk_is_a_sentence_and_the_model_stays(project: Project, captures: CaptureSet) -> None:
     """A limit on the size of files stands for the full disk."""
     project.open_set(captures.folder)
-    until(lambda: project.errors)
+    until(lambda: project.set.errors)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
     try:
@@ -388,10 +390,10 @@ def test_a_full_disk_is_a_sentence_and_the_model_stays(project: Project, capture
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     severity, sentence = project.notice
     assert severity == "error" and "cannot be written" in sentence and "\n" not in sentence
-    assert project.model is not None and project.model.names == ()
-    assert project.model_path is not None and not project.model_path.exists()
+    assert project.set.model is not None and project.set.model.names == ()
+    assert project.set.model_path is not None and not project.set.model_path.exists()
     project.add("zero_order")
-    until(lambda: project.model is not None and project.model.names == ("zero_order",))
+    until(lambda: project.set.model is not None and project.set.model.names == ("zero_order",))
 
 
 # What is gained
