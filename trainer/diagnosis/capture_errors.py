@@ -202,6 +202,27 @@ class SetErrors:
         ]
         return sorted(rows, key=lambda row: row["time_s"])
 
+    def where(self) -> dict[str, Any]:
+        """The rows under `where` of `compare --json`."""
+        keys = ("cycles_per_pixel", "error", "noise", "signal")
+        counts, error, bias, noise, pixels = self.brightness
+        return {
+            "field": [[float(v) if np.isfinite(v) else None for v in row] for row in self.field],
+            "tile_px": self.captures[0].tile_px,
+            "frequency": [dict(zip(keys, map(float, ring), strict=True)) for ring in self.frequency.T],
+            "brightness": [
+                {
+                    "counts": float(counts[k]),
+                    "error": float(error[k] ** 2),
+                    "bias": float(bias[k]),
+                    "noise": float(noise[k] ** 2),
+                    "pixels": float(pixels[k]),
+                }
+                for k in np.flatnonzero(np.isfinite(error))
+            ],
+            "time": self.time(),
+        }
+
     def worst_at(self, row: int, column: int) -> list[tuple[str, float]]:
         """Captures by their excess in a tile, worst first."""
         return self._ordered([one.field[row, column] / self.variance for one in self.captures])

@@ -6,7 +6,6 @@ import math
 from html import escape
 from typing import Any
 
-import matplotlib
 import numpy as np
 import panel as pn
 from bokeh.models import (
@@ -20,25 +19,14 @@ from bokeh.models import (
     WheelZoomTool,
 )
 from bokeh.models.annotations.geometry import Span
-from bokeh.palettes import Viridis256
 from bokeh.plotting import figure
 
+from trainer.report.palettes import DIFFERENCE, IRRADIANCE, gradient, palette
 from trainer.studio.effect_demonstration import EffectPicture
 
 LINE = "#8a8f98"  # of frames and cross-hairs: seen on light and on dark
-STOPS = 17  # of a colour bar
 NARROWEST, GAP = 220, 16  # of a picture and between two, CSS pixels
 SHARE = 99.0  # per cent of the pixels that the difference's colours hold
-
-
-def _palette(name: str, instead: str) -> list[str]:
-    """A matplotlib colour map as 256 colours."""
-    known = matplotlib.colormaps[name if name in matplotlib.colormaps else instead]
-    return [matplotlib.colors.to_hex(known(k / 255)) for k in range(256)]
-
-
-# Both are perceptually uniform and safe for colour-blind readers; in both, dark is nothing.
-IRRADIANCE, DIFFERENCE = list(Viridis256), _palette("berlin", "RdBu_r")
 
 
 class EffectPictures:
@@ -54,8 +42,8 @@ class EffectPictures:
         self._source = ColumnDataSource(data=_columns(first))
         self._top = _round_up(float(np.percentile(first.ideal, 99.8)))
         self._spread = 1.0
-        self._difference = LinearColorMapper(palette=DIFFERENCE, low=-1, high=1)
-        irradiance = LinearColorMapper(palette=IRRADIANCE, low=0, high=self._top)
+        self._difference = LinearColorMapper(palette=list(palette(DIFFERENCE)), low=-1, high=1)
+        irradiance = LinearColorMapper(palette=list(palette(IRRADIANCE)), low=0, high=self._top)
         self._x, self._y = Range1d(start=0, end=width), Range1d(start=height, end=0)
         self._whole = (width, height)
         across, down = Span(dimension="width", line_color=LINE), Span(dimension="height", line_color=LINE)
@@ -158,13 +146,12 @@ def _title(text: str, note: str = "") -> str:
     return f"<h3>{escape(text)} <small>{escape(note)}</small></h3>"
 
 
-def _bar(colours: list[str], ends: tuple[str, str, str], unit: str) -> str:
+def _bar(colours: str, ends: tuple[str, str, str], unit: str) -> str:
     """A colour bar with three labels."""
-    stops = ", ".join(colours[round(k * 255 / (STOPS - 1))] for k in range(STOPS))
     low, middle, high = (escape(e) for e in ends)
     return (
         f'<div class="bar" role="img" aria-label="Colours from {low} to {high} {unit}">'
-        f'<div class="colours" style="background: linear-gradient(to right, {stops})"></div>'
+        f'<div class="colours" style="background: linear-gradient(to right, {gradient(colours)})"></div>'
         f'<div class="ends"><span>{low}</span><span>{middle} {escape(unit)}</span><span>{high}</span></div></div>'
     )
 

@@ -13,7 +13,7 @@ from bokeh.palettes import Greys256
 from bokeh.plotting import figure
 
 from firmware_iface.errors import InputError
-from trainer.report.heat_maps import blocks
+from trainer.captures.block_means import blocks
 from trainer.studio.gain_tasks import (
     OWN,
     PICTURES,

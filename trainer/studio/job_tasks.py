@@ -15,15 +15,17 @@ import torch
 from runtime.program.outputs import emptied
 from runtime.program.progress import Progress
 from trainer.captures.batches import load
+from trainer.captures.block_means import blocks
 from trainer.captures.capture_set import CaptureSet, chosen, opened
 from trainer.captures.check_set import check_captures
 from trainer.captures.held_out import capture_roles
 from trainer.captures.problems import Problem
 from trainer.diagnosis.candidate_fits import try_effect
 from trainer.diagnosis.capture_errors import CaptureErrors, capture_errors
-from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors
+from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors, with_previews
 from trainer.diagnosis.error_budget import error_budget
 from trainer.diagnosis.explanation import add, explain
+from trainer.diagnosis.previews import CandidatePreview, previews
 from trainer.diagnosis.ranking import RankedEffect, rank
 from trainer.diagnosis.screen import screen_batches
 from trainer.diagnosis.verdict import Thresholds
@@ -36,12 +38,10 @@ from trainer.model.history import recorded
 from trainer.model.model import Model
 from trainer.model.model_stages import ideal_irradiance
 from trainer.networks.approximator import Approximator, read_approximator, write_approximator
-from trainer.report.heat_maps import blocks, from_zero, symmetric
+from trainer.report.heat_maps import from_zero, symmetric
 from trainer.studio.jobs import Say
 
 SHOWN_PX = 480  # along a picture's longer side, where the whole of it is shown
-PREVIEW_PX = 160
-MOST_PREVIEWS = 8
 SMALL_PX = 60_000  # of a picture: below, processes of a pool cost more time than they save
 PROGRESS_S = 0.15  # between two words on progress
 
@@ -73,30 +73,6 @@ class CapturePrediction:
     light: float
     apart: float
     errors: CaptureErrors | None
-
-
-@dataclass(frozen=True)
-class CandidatePreview:
-    """What a candidate would change in a picture.
-
-    Attributes
-    ----------
-    effect : str
-    capture : str
-        The picture.
-    missing : float32 array [h, w], counts
-        Measured less predicted without the candidate; means of blocks.
-    change : float32 array [h, w], counts
-        Predicted with the candidate less predicted without it.
-    scale : float, counts
-        End of the colour scale of both.
-    """
-
-    effect: str
-    capture: str
-    missing: np.ndarray
-    change: np.ndarray
-    scale: float
 
 
 def block_side(pixels: int) -> int:
@@ -155,15 +131,13 @@ def shown_as(
     )
 
 
-def find_missing(
-    say: Say, folder: Path, model: Model, effects: Sequence[Path]
-) -> tuple[Diagnosis, list[CandidatePreview]]:
+def find_missing(say: Say, folder: Path, model: Model, effects: Sequence[Path]) -> Diagnosis:
     """What `diagnose` does, and what each candidate would change."""
     captures, known = _begin(folder, effects)
     with open_pool(_workers(captures)) as pool:
         found = diagnose(captures, model, known, pool, Thresholds(), _progress(say))
     say("progress", (0.97, "drawing what each candidate would change"))
-    return found, _previews(captures, found.model, found.ranking[:MOST_PREVIEWS])
+    return with_previews(captures, found)
 
 
 def add_effect(
@@ -187,7 +161,7 @@ def explain_all(say: Say, folder: Path, model: Model, effects: Sequence[Path]) -
 
     with open_pool(_workers(captures)) as pool:
         found = explain(captures, model, known, pool, Thresholds(), save, _progress(say))
-    return found.diagnosis
+    return with_previews(captures, found.diagnosis)
 
 
 def try_own(
@@ -209,7 +183,7 @@ def try_own(
         held = tuple(c.capture for c in roles.held_out)
         fits.append(try_effect(folder, ids, held, model, start, True))
     ranking = rank(before, fits, known, Thresholds(), ideal.excess, len(known))
-    return ranking, _previews(captures, model, ranking)
+    return ranking, previews(captures, model, ranking)
 
 
 def learn_panel_field(say: Say, folder: Path, model: Model) -> tuple[Model, float, float]:
@@ -297,28 +271,3 @@ def _complete(captures: CaptureSet, model: Model, effects: Sequence[Path]) -> Di
         if not Thresholds().complete(errors.excess, ideal.excess):
             return None
         return diagnose(captures, model, catalogue(effects), pool, ideal=ideal, with_probes=False)
-
-
-def _previews(captures: CaptureSet, model: Model, ranking: Sequence[RankedEffect]) -> list[CandidatePreview]:
-    """What each candidate would change in the held-out capture that the model predicts worst."""
-    if not ranking:
-        return []
-    roles = capture_roles(captures)
-    row = (
-        max(roles.held_out, key=lambda c: _excess(captures, c, model))
-        if len(roles.held_out) < 5
-        else roles.held_out[0]
-    )
-    residual, _ = capture_errors(captures, row, model)
-    factor = max(1, -(-max(residual.measured.shape) // PREVIEW_PX))
-    missing = blocks(np.where(residual.mask > 0, residual.residual, np.nan), factor).astype(np.float32)
-    found = []
-    for one in ranking:
-        there, _ = capture_errors(captures, row, one.model)
-        change = blocks(there.predicted - residual.predicted, factor).astype(np.float32)
-        found.append(CandidatePreview(one.effect.name, row.capture, missing, change, symmetric([missing])[1]))
-    return found
-
-
-def _excess(captures: CaptureSet, row: Any, model: Model) -> float:
-    return evaluate_captures(captures, [row], model).excess

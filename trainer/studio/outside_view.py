@@ -8,9 +8,9 @@ from typing import Any
 import panel as pn
 
 from firmware_iface.errors import InputError
+from trainer.diagnosis.diagnosis import Diagnosis
 from trainer.effects.definition import STAGES
-from trainer.report.diagnosis_sections import stages
-from trainer.report.heat_maps import HeatMap
+from trainer.report.diagnosis_sections import stages, stages_html
 from trainer.studio.probe_template import write_effect_of_probe
 from trainer.studio.project import Project
 from trainer.studio.visit import Visit
@@ -115,30 +115,8 @@ def outside_view(project: Project, visit: Visit) -> Any:
     return pn.FlexBox(left, right, gap="16px", align_items="flex-start", sizing_mode="stretch_width")
 
 
-def _pictures(found: Any) -> str:
+def _pictures(found: Diagnosis) -> str:
     section = stages(found.as_json(), found.probe_pictures)
     if section is None or not section["groups"]:
         return "<p>No stage's probe finds anything.</p>"
-    parts = [str(section["chart"] or "")]
-    for group in section["groups"]:
-        shown = "".join(
-            _map(p["picture"]) if p["picture"] is not None else _curve(p) for p in group["probes"]
-        )
-        parts.append(
-            f"<h3>{escape(group['stage'])}: {escape(group['note'])}</h3><div class='probes'>{shown}</div>"
-        )
-    return "".join(parts)
-
-
-def _map(one: HeatMap) -> str:
-    low, _, high = one.scale
-    return (
-        f"<figure><img src='{one.uri}' alt='{escape(one.alt, quote=True)}' "
-        f"style='aspect-ratio:{one.width}/{one.height}'>"
-        f"<div class='scale'><span>{low.text}</span><i style='background:linear-gradient(90deg,{one.bar})'></i>"
-        f"<span>{high.text} {escape(one.unit)}</span></div><figcaption>{escape(one.title)}</figcaption></figure>"
-    )
-
-
-def _curve(one: dict[str, Any]) -> str:
-    return f"<figure>{one['chart']}<figcaption>{escape(one['title'])}</figcaption></figure>"
+    return str(stages_html(section))

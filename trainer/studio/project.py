@@ -4,30 +4,28 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from firmware_iface.errors import InputError
 from trainer.captures.problems import Problem
 from trainer.diagnosis.diagnosis import Diagnosis
+from trainer.diagnosis.previews import CandidatePreview
 from trainer.diagnosis.ranking import RankedEffect
 from trainer.model.model import Model
 from trainer.studio import gain_tasks, job_tasks
 from trainer.studio.effect_files import EffectFiles
-from trainer.studio.job_tasks import CandidatePreview
 from trainer.studio.jobs import sentence_of
 from trainer.studio.learned_network import network_folder
 from trainer.studio.open_set import TABLES, OpenSet
 from trainer.studio.picture_queue import PictureQueue
-from trainer.studio.work_results import Results
 from trainer.studio.running_work import RunningWork, Work
 from trainer.studio.watched_files import WatchedFiles
+from trainer.studio.watchers import Watchers
+from trainer.studio.work_results import Results
 
 TOPICS = ("set", "model", "picture", "errors", "job", "diagnosis", "notice", "effects", "other", "gain")
 BUSY = "Other work is under way: wait for it, or cancel it."
-
-Watcher = Callable[[str], None]
 
 
 class Project:
@@ -56,7 +54,8 @@ class Project:
         self.home = home
         self.lock = threading.RLock()
         self.notice: tuple[str, str] = ("", "")
-        self._watchers: dict[int, Watcher] = {}
+        self._watchers = Watchers()
+        self.watch, self.unwatch, self.tell = self._watchers.add, self._watchers.remove, self._watchers.tell
         self.effects = EffectFiles(effects)
         self.results = Results()
         pictures = PictureQueue(self.lock, self.tell, self._checked, self._unpredictable)
@@ -67,28 +66,7 @@ class Project:
             self.lock, lambda: [*self.effects.paths, *self.set.files()], self._changed_outside
         )
 
-    # Watching
-
-    def watch(self, watcher: Watcher) -> int:
-        """Have a function called, in any thread, with the topic of each change; returns a number for `unwatch`."""
-        with self.lock:
-            number = max(self._watchers, default=0) + 1
-            self._watchers[number] = watcher
-            return number
-
-    def unwatch(self, number: int) -> None:
-        """Call a watcher no longer."""
-        with self.lock:
-            self._watchers.pop(number, None)
-
-    def tell(self, *topics: str) -> None:
-        """Say that something has changed."""
-        with self.lock:
-            watchers = list(self._watchers.values())
-        for topic in topics:
-            for watcher in watchers:
-                with suppress(Exception):  # a browser that has just left
-                    watcher(topic)
+    # What everybody hears
 
     def say(self, sentence: str, severity: str = "note") -> None:
         """Show a sentence in every browser; severity is "note" or "error"."""
@@ -216,7 +194,7 @@ class Project:
         """Diagnose and add, again and again."""
         if self._ready():
             arguments = (self.set.folder, self.set.model_now, self.effects.paths)
-            self._begin("Explain", job_tasks.explain_all, arguments, self._explained)
+            self._begin("Explain", job_tasks.explain_all, arguments, self._diagnosed)
 
     def learn_field(self) -> None:
         """Learn the wave at the panel, without a name."""
@@ -300,9 +278,9 @@ class Project:
         elif kind == "picture":
             self.show_gain(value)
 
-    def _diagnosed(self, value: tuple[Diagnosis, list[CandidatePreview]]) -> None:
+    def _diagnosed(self, found: Diagnosis) -> None:
         with self.lock:
-            self.results.diagnosed(*value)
+            self.results.diagnosed(found)
         self.tell("diagnosis")
 
     def _added(self, value: tuple[Model, Diagnosis | None]) -> None:
@@ -312,11 +290,6 @@ class Project:
             self._write(model)
             self.results.added(model, history[-1].get("excess") if history else None, found)
         self._show("model", "diagnosis")
-
-    def _explained(self, found: Diagnosis) -> None:
-        with self.lock:
-            self.results.diagnosed(found)
-        self.tell("diagnosis")
 
     def _learned(self, value: tuple[Model, float, float]) -> None:
         model, before, after = value

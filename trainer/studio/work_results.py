@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from trainer.diagnosis.diagnosis import Diagnosis
+from trainer.diagnosis.previews import CandidatePreview
 from trainer.diagnosis.ranking import RankedEffect
 from trainer.model.model import Model
-from trainer.studio.job_tasks import CandidatePreview
 
 
 class Results:
@@ -37,10 +37,10 @@ class Results:
         self.previews: dict[str, CandidatePreview] = {}
         self.verdict = ""
 
-    def diagnosed(self, found: Diagnosis, previews: Sequence[CandidatePreview] = ()) -> None:
+    def diagnosed(self, found: Diagnosis) -> None:
         """Keep what is missing from the model."""
         self.diagnosis, self.ranking, self.verdict = found, found.ranking, found.sentence
-        self.previews = {p.effect: p for p in previews}
+        self.previews = {p.effect: p for p in found.previews}
 
     def added(self, model: Model, before: float | None, found: Diagnosis | None) -> None:
         """Keep what one more effect has brought.

@@ -32,10 +32,11 @@ from trainer.effects.testing import captures_with
 from trainer.model.model import Model, instance_with
 from trainer.model.model_file import read_model, write_model
 from trainer.model.model_stages import ideal_irradiance
-from trainer.studio import colours, gain_tasks, guess_benches, jobs
+from trainer.report.ladder import ladder_rows
+from trainer.report.palettes import DIFFERENCE, palette
+from trainer.studio import gain_tasks, guess_benches, jobs
 from trainer.studio.findings_fixes import fix_of
 from trainer.studio.jobs import CANCELLED, ENDED, WorkerProcess, sentence_of
-from trainer.studio.ladder_view import ladder_rows
 from trainer.studio.model_steps import ModelSteps
 from trainer.studio.probe_template import write_effect_of_probe
 from trainer.studio.project import Project
@@ -455,16 +456,20 @@ def test_tokens_and_ports() -> None:
 
 
 def test_differences_are_white_at_zero_and_equally_deep_on_both_sides() -> None:
-    palette = [tuple(int(c[k : k + 2], 16) for k in (1, 3, 5)) for c in colours.difference_palette()]
-    assert len(palette) == 255 and min(palette[127]) > 235
-    light = [0.2126 * r + 0.7152 * g + 0.0722 * b for r, g, b in palette]
+    colours = [tuple(int(c[k : k + 2], 16) for k in (1, 3, 5)) for c in palette(DIFFERENCE)]
+    assert len(colours) == 255 and min(colours[127]) > 235
+    light = [0.2126 * r + 0.7152 * g + 0.0722 * b for r, g, b in colours]
     assert all(a < b + 2 for a, b in pairwise(light[:128]))
     assert light[0] == pytest.approx(light[-1], abs=25)
 
 
-def test_a_notebook_shows_the_same_pictures(captures: CaptureSet, tmp_path: Path) -> None:
+def test_a_notebook_shows_the_same_views(captures: CaptureSet, tmp_path: Path) -> None:
     import hololoop
 
     hololoop.compare(captures).view().save(tmp_path / "view.html", resources="inline", title="captures")
     text = (tmp_path / "view.html").read_text(encoding="utf-8")
     assert "\\u2212 predicted" in text or "Measured − predicted" in text
+    assert "Over spatial frequency" in text and "gray level" in text
+    assert len(hololoop.compare(captures).view("failures")) == 1
+    with pytest.raises(InputError, match="there is no view 'ladders'"):
+        hololoop.explain(captures, workers=1).view("ladders")
