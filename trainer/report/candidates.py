@@ -31,9 +31,9 @@ def ranking_html(rows: Sequence[Mapping[str, Any]], least: float | None) -> Mark
     least : float or None
         Excess that an effect must remove to be worth adding.
     """
-    return Markup('{}<p class="small quiet">Filled marks are worth adding.</p>').format(
-        forest_plot(rows, least)
-    )
+    return Markup(
+        '<div class="forest">{}</div><p class="small quiet">Filled marks are worth adding.</p>'
+    ).format(forest_plot(rows, least))
 
 
 def least_worth_adding(found: Mapping[str, Any]) -> float | None:

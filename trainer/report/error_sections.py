@@ -101,7 +101,7 @@ def _triple(p: Any, what: str, corner: tuple[int, int] | None) -> list[HeatMap]:
         f"symmetric about zero, to ± {number(apart[1])} counts{lost}."
     )
     note = f"rms {number(rms)} counts, own scale, symmetric about 0{lost}"
-    title = "difference (measured − predicted)"
+    title = "measured − predicted"
     maps.append(heat_map(title, arrays[2], alt, "counts", apart, DIFFERENCE, extent, note=note))
     return maps
 

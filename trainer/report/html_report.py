@@ -26,6 +26,7 @@ from trainer.report.diagnosis_sections import (
 from trainer.report.error_sections import facts, pictures, where
 from trainer.report.light_path import light_path_html
 
+LOOK = Path(__file__).with_name("look")
 METHOD = (
     "Every number comes from captures that no fit has used: excess is the mean squared error beyond the "
     "camera's expected noise, divided by the variance of the measured signal, so that 0 is a perfect model "
@@ -103,7 +104,7 @@ def write_report(
 @lru_cache(maxsize=1)
 def page_style() -> Markup:
     """The style sheet that reports and the studio share."""
-    return Markup(Path(__file__).with_name("page.css").read_text(encoding="utf-8"))
+    return Markup((LOOK / "page.css").read_text(encoding="utf-8"))
 
 
 def _steps(ladder: Any) -> tuple[Sequence[Mapping[str, Any]], float | None]:

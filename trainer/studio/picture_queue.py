@@ -39,6 +39,8 @@ class PictureQueue:
         Called with what the check of the set has found.
     failed : callable
         Called with a sentence where nothing can be predicted.
+    worker : WorkerProcess
+        Predicts.
     """
 
     def __init__(
@@ -47,9 +49,10 @@ class PictureQueue:
         tell: Callable[..., None],
         checked: Callable[[list[Problem]], None],
         failed: Callable[[str], None],
+        worker: WorkerProcess,
     ) -> None:
         self._lock, self._tell, self._checked, self._failed = lock, tell, checked, failed
-        self._worker = WorkerProcess("hololoop studio: pictures", job_tasks.__name__)
+        self._worker = worker
         self._closed = threading.Event()
         self._shown, self._other = 0, -1
         self.effects_version = 0

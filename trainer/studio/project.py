@@ -15,7 +15,7 @@ from trainer.diagnosis.ranking import RankedEffect
 from trainer.model.model import Model
 from trainer.studio import gain_tasks, job_tasks
 from trainer.studio.effect_files import EffectFiles
-from trainer.studio.jobs import sentence_of
+from trainer.studio.jobs import WorkerProcess, picture_worker, sentence_of
 from trainer.studio.learned_network import network_folder
 from trainer.studio.open_set import TABLES, OpenSet
 from trainer.studio.picture_queue import PictureQueue
@@ -37,6 +37,8 @@ class Project:
         Folder in which new files are made.
     effects : iterable of Path
         Files of the user's own effects; they are watched.
+    worker : WorkerProcess, optional
+        Predicts pictures; one that has been started early is ready sooner.
 
     Attributes
     ----------
@@ -50,7 +52,7 @@ class Project:
         Severity and sentence of what just happened.
     """
 
-    def __init__(self, home: Path, effects: Iterable[Path] = ()) -> None:
+    def __init__(self, home: Path, effects: Iterable[Path] = (), worker: WorkerProcess | None = None) -> None:
         self.home = home
         self.lock = threading.RLock()
         self.notice: tuple[str, str] = ("", "")
@@ -58,7 +60,8 @@ class Project:
         self.watch, self.unwatch, self.tell = self._watchers.add, self._watchers.remove, self._watchers.tell
         self.effects = EffectFiles(effects)
         self.results = Results()
-        pictures = PictureQueue(self.lock, self.tell, self._checked, self._unpredictable)
+        worker = worker or picture_worker()
+        pictures = PictureQueue(self.lock, self.tell, self._checked, self._unpredictable, worker)
         pictures.effects_version = self.effects.version
         self.set = OpenSet(self.lock, pictures)
         self._jobs = RunningWork(job_tasks.__name__, self.tell, self.say, self._news)
@@ -170,6 +173,7 @@ class Project:
         self.set.pictures.work()
 
     def _checked(self, problems: list[Problem]) -> None:
+        self._jobs.prepare()  # not before the first picture is there
         self.set.problems = problems
         self.tell("set")
 

@@ -264,6 +264,7 @@ class Heard:
 @pytest.fixture(scope="module")
 def worker() -> Iterator[WorkerProcess]:
     one = WorkerProcess("test")
+    one.start()
     yield one
     one.close()
 
