@@ -96,7 +96,7 @@ def frequency_plot(rows: Sequence[Mapping[str, Any]]) -> FailurePlot:
         (
             curve("signal", "signal", "quiet"),
             curve("error", "error", "main"),
-            curve("camera noise, expected", "noise", "other", "dashed"),
+            curve("camera noise", "noise", "other", "dashed"),
         ),
         None,
     )
@@ -132,9 +132,9 @@ def brightness_plot(rows: Sequence[Mapping[str, Any]]) -> FailurePlot:
     noise = tuple(float(r["noise"]) ** 0.5 for r in rows)
     bias = tuple(float(r["bias"]) for r in rows)
     curves = (
-        Curve("error, rms above noise", x, above, "main", marked=True),
-        Curve("camera noise, expected", x, noise, "other", "dashed"),
-        Curve("bias: measured − predicted", x, bias, "third", "dotted"),
+        Curve("error above noise", x, above, "main", marked=True),
+        Curve("camera noise", x, noise, "other", "dashed"),
+        Curve("bias", x, bias, "third", "dotted"),
     )
     worst = max(rows, key=lambda r: abs(r["bias"]))
     words = f"largest bias {number(worst['bias'])} counts at {number(worst['counts'])} counts."
@@ -142,7 +142,7 @@ def brightness_plot(rows: Sequence[Mapping[str, Any]]) -> FailurePlot:
         f"Error over brightness: model error of up to {number(max(above))} counts rms, camera noise from "
         f"{number(noise[0])} to {number(noise[-1])}, {words}"
     )
-    panel = PlotPanel("counts", curves, _ends(curves, 0.0, 0.0), 0.0)
+    panel = PlotPanel("counts, rms; bias: mean", curves, _ends(curves, 0.0, 0.0), 0.0)
     return FailurePlot("Over brightness", "predicted counts above black", (panel,), words, alt)
 
 

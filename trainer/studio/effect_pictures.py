@@ -39,6 +39,8 @@ class EffectPictures:
 
     def __init__(self, first: EffectPicture) -> None:
         height, width = first.ideal.shape
+        # The ideal picture never changes, and is sent once.
+        self._ideal = ColumnDataSource(data={"ideal": [first.ideal]})
         self._source = ColumnDataSource(data=_columns(first))
         self._top = _round_up(float(np.percentile(first.ideal, 99.8)))
         self._spread = 1.0
@@ -119,7 +121,14 @@ class EffectPictures:
         plot.axis.visible = False
         plot.grid.visible = False
         plot.image(  # type: ignore[call-arg]
-            image=name, source=self._source, x=0, y=0, dw=width, dh=height, color_mapper=mapper, name=name
+            image=name,
+            source=self._ideal if name == "ideal" else self._source,
+            x=0,
+            y=0,
+            dw=width,
+            dh=height,
+            color_mapper=mapper,
+            name=name,
         )
         rows = [("row, column", "$y{0}, $x{0}"), (name.replace("_", " "), "@" + name + "{0,0}")]
         plot.add_tools(HoverTool(tooltips=rows))
@@ -128,7 +137,6 @@ class EffectPictures:
 
 def _columns(picture: EffectPicture) -> dict[str, list[Any]]:
     return {
-        "ideal": [picture.ideal],
         "with_effect": [picture.with_effect],
         "difference": [picture.difference],
     }

@@ -122,7 +122,7 @@ class CurveFigures:
                 plot.scatter("x", "y", size=6, **style)
         if plot.legend:
             plot.add_layout(plot.legend[0], "above")
-            plot.legend.orientation = "horizontal"
+            plot.legend.update(orientation="horizontal", spacing=14)
         return plot
 
     def show(self, plot: FailurePlot) -> None:

@@ -17,6 +17,7 @@ from trainer.report.palettes import DIFFERENCE, IRRADIANCE, MISSING, gradient, p
 from trainer.studio.job_tasks import CapturePrediction, block_side
 
 NOTHING = np.zeros((2, 2), np.float32)
+CLOSEST = 6  # pixels across, at the closest zoom
 KINDS = ("measured", "predicted", "difference")
 TITLES = {
     "measured": "Measured",
@@ -37,8 +38,8 @@ class LinkedPictures:
         self.x: Any
         self.y: Any
         self.x, self.y = (
-            Range1d(start=0, end=width, bounds=(0, width)),
-            Range1d(start=height, end=0, bounds=(0, height)),
+            Range1d(start=0, end=width, bounds=(0, width), min_interval=CLOSEST),
+            Range1d(start=height, end=0, bounds=(0, height), min_interval=CLOSEST),
         )
         self.light: Any = LinearColorMapper(
             palette=list(palette(IRRADIANCE)), low=0, high=1, nan_color=MISSING
@@ -66,7 +67,7 @@ class LinkedPictures:
             active_scroll="wheel_zoom",
             toolbar_location=None,
             min_border=0,
-            lod_timeout=120,  # ms after a zoom until finer pixels are asked for
+            lod_timeout=60,  # ms after a zoom until finer pixels are asked for
             width=400,
             height=max(1, round(400 * height / width)),
             sizing_mode="scale_width",
