@@ -192,7 +192,8 @@ def test_the_whole_way_and_a_second_browser_and_a_reload(browser: Any, studio: S
 def under(page: Any, heading: str, right: float, down: float) -> None:
     """Click into the plot below a heading, at a place in pixels from the heading's corner."""
     one = page.get_by_role("heading", name=heading).first
-    one.scroll_into_view_if_needed()
+    one.evaluate("element => element.scrollIntoView({block: 'start'})")
+    page.wait_for_timeout(300)
     box = one.bounding_box()
     assert box is not None
     page.mouse.click(box["x"] + right, box["y"] + box["height"] + down)

@@ -32,11 +32,12 @@ from trainer.effects.testing import captures_with
 from trainer.model.model import Model, instance_with
 from trainer.model.model_file import read_model, write_model
 from trainer.model.model_stages import ideal_irradiance
-from trainer.report.ladder import ladder_rows
+from trainer.report.ladder import ladder_rows, with_network
 from trainer.report.palettes import DIFFERENCE, palette
 from trainer.studio import gain_tasks, guess_benches, jobs
 from trainer.studio.findings_fixes import fix_of
 from trainer.studio.jobs import CANCELLED, ENDED, WorkerProcess, sentence_of
+from trainer.studio.learned_network import network_of
 from trainer.studio.model_steps import ModelSteps
 from trainer.studio.probe_template import write_effect_of_probe
 from trainer.studio.project import Project
@@ -396,6 +397,36 @@ def test_a_full_disk_is_a_sentence_and_the_model_stays(project: Project, capture
     assert project.set.model_path is not None and not project.set.model_path.exists()
     project.add("zero_order")
     until(lambda: project.set.model is not None and project.set.model.names == ("zero_order",))
+
+
+def test_a_network_that_is_a_gain_takes_part_and_goes_into_the_bundle(
+    project: Project, tmp_path: Path
+) -> None:
+    uneven = {"log_amplitude": [0.3, 0.2, -0.4, 0.0, -0.4]}
+    captures = captures_with(tmp_path / "uneven", catalogue()["illumination"], uneven, patterns=6)
+    project.open_set(captures.folder)
+    before = until(lambda: project.set.errors).errors.excess
+    project.train_network(60)
+    until(lambda: project.work is None and project.notice[1], 200)
+    network = project.set.network
+    assert network is not None, project.notice
+    assert network.after < network.before == pytest.approx(before, rel=0.02)
+    assert "takes part" in project.notice[1]
+    after = until(lambda: project.set.errors).errors.excess
+    assert after == pytest.approx(network.after, rel=0.02)
+    project.export(tmp_path / "bundle")
+    until(lambda: "The bundle is" in project.notice[1], 120)
+    assert "the network" in project.notice[1]
+    assert list((tmp_path / "bundle").rglob("*.onnx"))
+    assert project.set.model_path is not None
+    again = network_of(project.set.model_path, project.set.model_now, captures.folder.name)
+    assert again == network  # found again when the studio is started anew
+    other = project.set.model_now.having(
+        instance_with(catalogue()["zero_order"], captures.bench, {"leak_real": 0.1})
+    )
+    assert network_of(project.set.model_path, other, captures.folder.name) is None
+    rows = with_network(ladder_rows([{"nrmse": 0.5, "noise_nrmse": 0.1, "excess": before}]), network.after)
+    assert rows[-1]["label"] == "+ network" and rows[-1]["excess"] == network.after
 
 
 # What is gained
