@@ -108,11 +108,11 @@ def candidates_view(project: Project, visit: Visit) -> Any:
             return
         least = None if found is None else least_worth_adding(found.as_json())
         forest = ranking_html([r.as_json() for r in ranking], least)
-        rows: list[Any] = [pn.pane.HTML(f"<h2>Candidates</h2>{forest}", margin=0, css_classes=["card"])]
+        rows: list[Any] = [_wide(f"<h2>Candidates</h2>{forest}", "card")]
         rows += [_candidate(project, r, least, buttons) for r in ranking[:MOST]]
         if found is not None and found.suggested_captures:
             items = "".join(f"<li>{escape(s)}</li>" for s in found.suggested_captures)
-            rows.append(pn.pane.HTML(f"<h3>Captures that would decide more</h3><ul>{items}</ul>", margin=0))
+            rows.append(_wide(f"<h3>Captures that would decide more</h3><ul>{items}</ul>"))
         place[:] = rows
         busy()
 
@@ -123,6 +123,10 @@ def candidates_view(project: Project, visit: Visit) -> Any:
     visit.on("diagnosis model", show)
     visit.on("job", busy)
     return place
+
+
+def _wide(html: str, *classes: str) -> Any:
+    return pn.pane.HTML(html, margin=0, sizing_mode="stretch_width", css_classes=list(classes))
 
 
 def _candidate(project: Project, one: RankedEffect, least: float | None, buttons: list[Any]) -> Any:
