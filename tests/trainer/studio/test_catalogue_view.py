@@ -19,7 +19,8 @@ from trainer.studio.catalogue_view import _CatalogueView, catalogue_view, effect
 from trainer.studio.formula_svg import formula_svg  # noqa: E402
 
 KNOWN = {name: one for name, one in catalogue().items() if one.source == "built in"}
-SOURCE = "[...Bokeh.documents[0]._all_models.values()].find(m => m.type == 'ColumnDataSource' && 'difference' in m.data)"
+MODELS = "[...Bokeh.documents[0]._all_models.values()]"
+SOURCE = f"{MODELS}.find(m => m.type == 'ColumnDataSource' && 'difference' in m.data)"
 LARGEST = f"() => Math.max(...Array.from({SOURCE}.data.difference[0], Math.abs))"
 
 
