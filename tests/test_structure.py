@@ -31,7 +31,17 @@ BELOW = {
     "model": {"captures", "prediction", "effects", "networks"},
     "fitting": {"captures", "prediction", "effects", "model"},
     "diagnosis": {"captures", "prediction", "effects", "model", "fitting", "networks", "training"},
-    "studio": {"captures", "prediction", "effects", "model", "fitting", "diagnosis", "training", "report"},
+    "studio": {
+        "captures",
+        "prediction",
+        "effects",
+        "model",
+        "fitting",
+        "diagnosis",
+        "networks",
+        "training",
+        "report",
+    },
 }
 FOR_TESTS_OF_EFFECTS = ("trainer.effects.testing", "trainer.effects.new_effect.effect_test_template")
 

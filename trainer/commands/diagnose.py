@@ -48,13 +48,14 @@ def run(args: Namespace, screen: Screen) -> Result:
             found = diagnose(captures, model, known, pool, thresholds, progress)
     if args.report:
         from trainer.diagnosis.comparison import compare
+        from trainer.diagnosis.diagnosis import with_previews
         from trainer.report import write_report
 
         write_report(
             args.report,
             f"Diagnosis: {captures.folder.name}",
             comparison=compare(captures, found.model),
-            diagnosis=found,
+            diagnosis=with_previews(captures, found),
         )
     return found.as_json()
 

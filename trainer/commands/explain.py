@@ -82,13 +82,14 @@ def run(args: Namespace, screen: Screen) -> Result:
         save(found.model, is_last=True)
         if args.report:
             from trainer.diagnosis.comparison import compare
+            from trainer.diagnosis.diagnosis import with_previews
             from trainer.report import write_report
 
             write_report(
                 args.report,
                 f"Explanation: {captures.folder.name}",
                 comparison=compare(captures, found.model),
-                diagnosis=found.diagnosis,
+                diagnosis=with_previews(captures, found.diagnosis),
                 ladder=found.as_json(args.out),
                 model=found.model,
             )

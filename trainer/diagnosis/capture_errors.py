@@ -8,14 +8,19 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from runtime.excess import PredictionErrors, joined
-from trainer.captures.batches import load_batch
+from trainer.captures.batches import Batch, load_batch
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.capture_table import Capture
+from trainer.captures.held_out import split
+from trainer.diagnosis.error_budget import network_changes, with_change
 from trainer.diagnosis.localise import CaptureResidual, FieldSums, FrequencySums, residual_of
 from trainer.fitting.predictor import Predictor
 from trainer.model.model import Model
+from trainer.networks.approximator import Approximator
+from trainer.training.training_pairs import stacked
 
 STEPS = 16  # of brightness, equal in the root of the counts
 
@@ -64,7 +69,7 @@ class CaptureErrors:
 
 
 def capture_errors(
-    captures: CaptureSet, capture: Capture, model: Model
+    captures: CaptureSet, capture: Capture, model: Model, network: Approximator | None = None
 ) -> tuple[CaptureResidual, CaptureErrors | None]:
     """A capture and its prediction, and where they differ; None for the latter where every pixel is saturated.
 
@@ -72,10 +77,15 @@ def capture_errors(
     ----------
     model : Model
         With fitted gains.
+    network : Approximator, optional
+        Trained on what the model leaves; its part is in the prediction.
     """
     batch = load_batch(captures, [capture])
     with torch.no_grad():
-        prediction = Predictor(model, batch).predict(model)
+        if network is None:
+            prediction = Predictor(model, batch).predict(model)
+        else:
+            prediction = _with_network(captures, capture, batch, model, network)
     residual = residual_of(batch, prediction)
     if not bool(batch.mask.any()):
         return residual, None
@@ -99,6 +109,18 @@ def capture_errors(
         edges,
     )
     return residual, found
+
+
+def _with_network(
+    captures: CaptureSet, capture: Capture, batch: Batch, model: Model, network: Approximator
+) -> Tensor:
+    """Counts that model and network expect; the network sees the other colours of the same picture, too."""
+    divided = split(captures)
+    rows = divided.held_out if capture in divided.held_out else divided.fitted
+    stack = next(s for s in stacked(captures, rows) if capture in s)
+    batches = [None if c is None else batch if c == capture else load_batch(captures, [c]) for c in stack]
+    change = network_changes(model, network, batches)[stack.index(capture)]
+    return with_change(model, batch, change)[1]
 
 
 def _by_brightness(residual: CaptureResidual, edges: np.ndarray) -> np.ndarray:
@@ -179,6 +201,27 @@ class SetErrors:
             for one in self.captures
         ]
         return sorted(rows, key=lambda row: row["time_s"])
+
+    def where(self) -> dict[str, Any]:
+        """The rows under `where` of `compare --json`."""
+        keys = ("cycles_per_pixel", "error", "noise", "signal")
+        counts, error, bias, noise, pixels = self.brightness
+        return {
+            "field": [[float(v) if np.isfinite(v) else None for v in row] for row in self.field],
+            "tile_px": self.captures[0].tile_px,
+            "frequency": [dict(zip(keys, map(float, ring), strict=True)) for ring in self.frequency.T],
+            "brightness": [
+                {
+                    "counts": float(counts[k]),
+                    "error": float(error[k] ** 2),
+                    "bias": float(bias[k]),
+                    "noise": float(noise[k] ** 2),
+                    "pixels": float(pixels[k]),
+                }
+                for k in np.flatnonzero(np.isfinite(error))
+            ],
+            "time": self.time(),
+        }
 
     def worst_at(self, row: int, column: int) -> list[tuple[str, float]]:
         """Captures by their excess in a tile, worst first."""

@@ -15,6 +15,7 @@ from trainer.captures.camera_numbers import camera_of_residual
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import CaptureRoles, capture_roles, scenes
 from trainer.diagnosis.bench_facts import EqualFacts, equal_facts
+from trainer.diagnosis.previews import CandidatePreview, previews
 from trainer.diagnosis.probes import ProbeResult, probe
 from trainer.diagnosis.ranking import RankedEffect, rank, try_all, try_together_with_present
 from trainer.diagnosis.screen import ScreenResult, screen
@@ -71,6 +72,7 @@ class Diagnosis:
     screened: tuple[ScreenResult, ...] = field(default=())
     is_held_out: bool = True
     equal_facts: EqualFacts = field(default_factory=EqualFacts)
+    previews: tuple[CandidatePreview, ...] = ()
 
     @property
     def best(self) -> RankedEffect | None:
@@ -134,6 +136,11 @@ class Diagnosis:
             "equal_facts": [f.as_json() for f in self.equal_facts.facts],
             "sentence": self.sentence,
         }
+
+
+def with_previews(captures: CaptureSet, found: Diagnosis) -> Diagnosis:
+    """A diagnosis of captures with what its best candidates would change in a picture."""
+    return replace(found, previews=tuple(previews(captures, found.model, found.ranking)))
 
 
 def overstated_noise(errors: PredictionErrors, camera: Camera) -> str:

@@ -79,14 +79,11 @@ def error_budget(
     with torch.no_grad():
         for k, stack in enumerate(stacks):
             batches = [None if c is None else load_batch(captures, [c]) for c in stack]
-            changes = _changes(model, network, batches)
+            changes = network_changes(model, network, batches)
             for batch, change in zip(batches, changes, strict=True):
                 if batch is None or not bool(batch.mask.any()):
                     continue
-                scene, stages, expected, sensitivity = expected_counts(model, batch)
-                with_network = expected
-                if change is not None:
-                    with_network = expected + sensitivity * onto_camera(scene, stages, change)
+                expected, with_network = with_change(model, batch, change)
                 physical = expected if named is model else Predictor(named, batch).predict(named)
                 bare = Predictor(ideal, batch).predict(ideal)
                 rows.append((batch.errors(bare), batch.errors(physical), batch.errors(with_network)))
@@ -103,7 +100,17 @@ def error_budget(
     )
 
 
-def _changes(model: Model, network: Approximator | None, batches: list[Batch | None]) -> list[Tensor | None]:
+def with_change(model: Model, batch: Batch, change: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Counts that a model expects of a capture (a batch of one), without and with a change of irradiance [H, W]."""
+    scene, stages, expected, sensitivity = expected_counts(model, batch)
+    if change is None:
+        return expected, expected
+    return expected, expected + sensitivity * onto_camera(scene, stages, change)
+
+
+def network_changes(
+    model: Model, network: Approximator | None, batches: list[Batch | None]
+) -> list[Tensor | None]:
     """What the network adds to the irradiance of each colour of a picture, [H, W]; None without a network."""
     if network is None:
         return [None] * len(batches)

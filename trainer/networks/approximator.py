@@ -25,6 +25,7 @@ from trainer.networks.published_generator import Generator
 from trainer.networks.unet import UNet
 
 FORMAT = "hololoop-approximator"
+NETWORK = "network.safetensors"  # its file in the folder of a run
 DYNAMIC_RANGE = 1e-3  # of irradiance: added before square roots, whose slope is unbounded in the dark
 
 _NETWORKS: dict[str, Callable[[tuple[int, int], int, int], nn.Module]] = {
@@ -121,6 +122,22 @@ def write_approximator(path: Path | str, network: Approximator, about: dict[str,
     header = {"format": FORMAT, "architecture": asdict(network.architecture), "about": about}
     with whole_file(path) as file:
         file.write(save(tensors, {"hololoop": json.dumps(header)}))
+
+
+def read_about(path: Path | str) -> dict[str, Any]:
+    """Where an approximator comes from, as `write_approximator` got it, without its weights; {} where it says nothing.
+
+    Raises
+    ------
+    InputError
+        Where the file cannot be read.
+    """
+    try:
+        with safe_open(path, "pt") as file:
+            header = json.loads((file.metadata() or {}).get("hololoop", "{}"))
+    except (OSError, SafetensorError, ValueError) as error:
+        raise InputError(f"{path} cannot be read as an approximator ({error}): train one") from None
+    return dict(header.get("about", {})) if isinstance(header, dict) else {}
 
 
 def read_approximator(path: Path | str) -> tuple[Approximator, dict[str, Any]]:

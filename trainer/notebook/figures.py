@@ -10,10 +10,12 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
 from trainer.diagnosis.comparison import CapturePicture
 from trainer.formatting import percent
+from trainer.report.palettes import DIFFERENCE, IRRADIANCE, palette
 
 
 class NotebookFigure(Figure):
@@ -95,12 +97,12 @@ def _draw_picture(axes: Sequence[Axes], pictures: Sequence[CapturePicture]) -> N
     top = float(np.percentile(picture.measured, 99.8))
     spread = float(np.nanpercentile(np.abs(picture.difference), 99.7)) or 1.0
     shown = (
-        (f"measured ({picture.channel}, {picture.plane_mm:g} mm)", picture.measured, 0.0, top, "viridis"),
-        ("predicted", picture.predicted, 0.0, top, "viridis"),
-        ("difference", picture.difference, -spread, spread, "RdBu_r"),
+        (f"measured ({picture.channel}, {picture.plane_mm:g} mm)", picture.measured, 0.0, top, IRRADIANCE),
+        ("predicted", picture.predicted, 0.0, top, IRRADIANCE),
+        ("difference", picture.difference, -spread, spread, DIFFERENCE),
     )
     for one, (title, values, low, high, colours) in zip(axes, shown, strict=True):
-        image = one.imshow(values, vmin=low, vmax=high, cmap=colours)
+        image = one.imshow(values, vmin=low, vmax=high, cmap=ListedColormap(palette(colours)))
         one.set_title(title, fontsize=9)
         one.set_xticks([])
         one.set_yticks([])

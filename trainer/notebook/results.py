@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
 from pathlib import Path
 from typing import Any
 
+from firmware_iface.errors import InputError, nearest
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.problems import Problem
 from trainer.diagnosis.comparison import Comparison
@@ -91,11 +93,17 @@ class ComparisonResult:
         """A held-out capture as measured, as predicted, and the difference."""
         return comparison_figure(self.comparison.pictures)
 
-    def view(self) -> Any:
-        """The same pictures with linked pan and zoom, as in the studio; needs the extra `studio`."""
-        from trainer.studio.comparison_view import pictures_view
+    def view(self, *names: str) -> Any:
+        """The studio's views of it, as a panel object; needs the extra `studio`.
 
-        return pictures_view(self.comparison.pictures)
+        Parameters
+        ----------
+        names : str
+            "light path", "pictures" (linked pan and zoom) and "failures"; all without any.
+        """
+        from trainer.studio import result_views as views
+
+        return _viewed(_comparison_views(views, self.comparison), names)
 
     def report(self, path: str | os.PathLike[str]) -> None:
         """Write the report, one HTML file."""
@@ -157,6 +165,18 @@ class DiagnosisResult:
     def as_json(self) -> dict[str, Any]:
         """What `hololoop-trainer diagnose --json` prints."""
         return self.diagnosis.as_json()
+
+    def view(self, *names: str) -> Any:
+        """The studio's views of it, as a panel object; needs the extra `studio`.
+
+        Parameters
+        ----------
+        names : str
+            "verdict", "light path", "candidates" and "probes"; all without any.
+        """
+        from trainer.studio import result_views as views
+
+        return _viewed(_diagnosis_views(views, self.diagnosis), names)
 
     def _repr_html_(self) -> str:
         """What a notebook shows."""
@@ -222,6 +242,31 @@ class ExplanationResult:
             self.ladder, float(self._json["noise_nrmse"]), self.comparison.comparison.pictures
         )
 
+    def view(self, *names: str) -> Any:
+        """The studio's views of it, as a panel object; needs the extra `studio`.
+
+        Parameters
+        ----------
+        names : str
+            "verdict", "light path", "ladder", "pictures", "failures", "candidates" and "probes"; all without any.
+        """
+        from trainer.studio import result_views as views
+
+        found = self.explanation.diagnosis
+        diagnosed = _diagnosis_views(views, found)
+        compared = _comparison_views(views, self.comparison.comparison)
+        noise = float(self._json["noise_nrmse"])
+        every = {
+            "verdict": diagnosed["verdict"],
+            "light path": diagnosed["light path"],
+            "ladder": lambda: views.ladder_view(self.ladder, noise),
+            "pictures": compared["pictures"],
+            "failures": compared["failures"],
+            "candidates": diagnosed["candidates"],
+            "probes": diagnosed["probes"],
+        }
+        return _viewed(every, names)
+
     def report(self, path: str | os.PathLike[str]) -> None:
         """Write the report, one HTML file."""
         write_report(
@@ -245,6 +290,33 @@ class ExplanationResult:
             + _table(("step", "nrmse", "excess"), rows)
             + image_tag(self.figure(), "The error after each step, and a held-out capture.")
         )
+
+
+def _comparison_views(views: Any, found: Comparison) -> dict[str, Callable[[], Any]]:
+    return {
+        "light path": lambda: views.light_path_view(found.model, None),
+        "pictures": lambda: views.pictures_view(found.pictures),
+        "failures": lambda: views.failures_view(found),
+    }
+
+
+def _diagnosis_views(views: Any, found: Diagnosis) -> dict[str, Callable[[], Any]]:
+    return {
+        "verdict": lambda: views.verdict_view(found),
+        "light path": lambda: views.light_path_view(found.model, found),
+        "candidates": lambda: views.candidates_view(found),
+        "probes": lambda: views.probes_view(found),
+    }
+
+
+def _viewed(every: Mapping[str, Callable[[], Any]], names: Sequence[str]) -> Any:
+    """Views by their names, above each other."""
+    from trainer.studio.result_views import together
+
+    for name in names:
+        if name not in every:
+            raise InputError(f"there is no view '{name}': {nearest(name, list(every))}")
+    return together(every, names)
 
 
 def _step(step: dict[str, Any]) -> str:

@@ -18,6 +18,7 @@ from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.check_set import check_captures, errors_unless_misread
 from trainer.diagnosis.comparison import compare as compare_model
 from trainer.diagnosis.diagnosis import diagnose as diagnose_model
+from trainer.diagnosis.diagnosis import with_previews
 from trainer.diagnosis.explanation import explain as explain_captures
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import Catalogue, catalogue
@@ -113,7 +114,8 @@ def diagnose(
     taken, known, start = _inputs(captures, model, effects)
     errors_unless_misread(taken.folder, ideal_irradiance)
     with open_pool(workers) as pool:
-        return DiagnosisResult(diagnose_model(taken, start, known, pool, thresholds, progress))
+        found = diagnose_model(taken, start, known, pool, thresholds, progress)
+    return DiagnosisResult(with_previews(taken, found))
 
 
 def explain(

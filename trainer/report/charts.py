@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import matplotlib
@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from trainer.formatting import number, percent, superscript
+from trainer.formatting import number, percent, plain, superscript
 from trainer.report.chart_style import (
     CHART,
     INK,
@@ -25,121 +25,49 @@ from trainer.report.chart_style import (
     new_chart,
     svg,
 )
+from trainer.report.failure_plots import FailurePlot
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+COLOURS = {"main": MAIN, "other": OTHER, "third": THIRD, "quiet": QUIET}
+NARROW, WIDE = 5.2, 7.2  # inches, of a chart in a column and over the whole page
 
 
-def frequency_chart(rows: Sequence[dict[str, Any]]) -> Markup:
-    """Power spectra of the error, of the expected noise and of the signal, logarithmic."""
-    f = [r["cycles_per_pixel"] for r in rows]
+def failure_chart(plot: FailurePlot) -> Markup:
+    """A plot of where the model fails."""
     with matplotlib.rc_context(STYLE):
-        figure, axes = new_chart()
-        axes.fill_between(
-            f, [r["noise"] for r in rows], [r["error"] for r in rows], color=MAIN, alpha=0.15, linewidth=0
-        )
-        axes.plot(f, [r["signal"] for r in rows], color=QUIET, linewidth=1.4, label="signal")
-        axes.plot(f, [r["error"] for r in rows], color=MAIN, label="error")
-        axes.plot(f, [r["noise"] for r in rows], color=OTHER, linestyle="--", label="camera noise, expected")
-        axes.set_yscale("log")
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _power_of_ten(value)))
-        axes.yaxis.set_minor_formatter(NullFormatter())
-        axes.set(xlabel="spatial frequency, cycles/pixel", ylabel="power, counts²")
-        axes.set_xlim(0, max(f, default=0.7))
-        axes.legend(loc="upper right")
-        top = max(float(r["signal"]) for r in rows)
-        low = min([float(r[k]) for r in rows for k in ("error", "noise") if r[k] > 0] or [0.0])
-        text = (
-            f"Power of signal, error and expected noise over spatial frequency, from {number(low)} to "
-            f"{number(top)} counts squared on a logarithmic scale; {frequency_words(rows)}"
-        )
-        return svg(figure, text)
-
-
-def frequency_words(rows: Sequence[dict[str, Any]]) -> str:
-    """Where over frequency the error above the noise lies, in a sentence."""
-    f = np.array([r["cycles_per_pixel"] for r in rows])
-    above = np.array([max(r["error"] - r["noise"], 0.0) for r in rows]) * f
-    if above.sum() <= 0.02 * float(np.sum(f * [r["noise"] for r in rows])):
-        return "the error follows the camera's noise at every frequency."
-    half = f[int(np.searchsorted(np.cumsum(above), above.sum() / 2))]
-    signal = np.array([r["signal"] for r in rows]) * f
-    usual = f[int(np.searchsorted(np.cumsum(signal), signal.sum() / 2))]
-    return (
-        f"half of the error above the noise lies below {number(half, 2)} cycles/pixel "
-        f"(half of the signal below {number(usual, 2)})."
-    )
-
-
-def brightness_chart(rows: Sequence[dict[str, Any]]) -> Markup:
-    """Root mean squared error above the noise, the noise and the bias over the predicted counts."""
-    x = [r["counts"] for r in rows]
-    above = [max(r["error"], 0.0) ** 0.5 for r in rows]
-    with matplotlib.rc_context(STYLE):
-        figure, axes = new_chart()
-        axes.axhline(0, color=QUIET, linewidth=0.8)
-        axes.plot(x, above, color=MAIN, marker="o", markersize=3.5, label="model error, rms above noise")
-        axes.plot(
-            x, [r["noise"] ** 0.5 for r in rows], color=OTHER, linestyle="--", label="camera noise, expected"
-        )
-        axes.plot(
-            x, [r["bias"] for r in rows], color=THIRD, linestyle=":", marker="s", markersize=3,
-            label="bias: measured − predicted",
-        )  # fmt: skip
-        axes.set(xlabel="predicted counts above black", ylabel="counts")
-        _legend_above(figure, axes)
-        worst = max(rows, key=lambda r: abs(r["bias"]))
-        text = (
-            f"Error over brightness: model error of up to {number(max(above))} counts rms, camera noise from "
-            f"{number(rows[0]['noise'] ** 0.5)} to {number(rows[-1]['noise'] ** 0.5)}, largest bias "
-            f"{number(worst['bias'])} counts at {number(worst['counts'])} counts."
-        )
-        return svg(figure, text)
-
-
-def time_chart(rows: Sequence[dict[str, Any]]) -> Markup:
-    """Each capture's own gain and excess over the time it was taken."""
-    channels = list(dict.fromkeys(r["channel"] for r in rows))
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(CHART[0], 3.3), layout="constrained")
-        upper, lower = figure.subplots(2, 1, sharex=True)
-        for k, channel in enumerate(channels):
-            own = [r for r in rows if r["channel"] == channel]
-            t = [r["time_s"] for r in own]
-            colour, marker = (MAIN, OTHER, THIRD)[k % 3], MARKERS[k % len(MARKERS)]
-            gains = [np.nan if r["gain"] is None else r["gain"] for r in own]
-            excess = [np.nan if r["excess"] is None else r["excess"] for r in own]
-            for axes, values in ((upper, gains), (lower, excess)):
-                axes.plot(t, values, color=colour, marker=marker, markersize=4.5, lw=1.2, label=channel)
-        upper.axhline(1, color=QUIET, linewidth=1, linestyle="--")
-        upper.set_ylabel("gain")
-        lower.set(ylabel="excess", xlabel="time, s")
-        lower.set_ylim(bottom=min(0.0, lower.get_ylim()[0]))
-        for axes in (upper, lower):
-            axes.yaxis.set_major_locator(MaxNLocator(4))
-            axes.ticklabel_format(useOffset=False)
-        low, high = upper.get_ylim()
-        if high - low < 0.02:  # a drift too small to matter must not fill the chart
-            upper.set_ylim(min(low, 0.99), max(high, 1.01))
-        if len(channels) > 1:
-            _legend_above(figure, upper)
-        return svg(figure, f"Gain and excess of each held-out capture over time: {time_words(rows)}")
-
-
-def time_words(rows: Sequence[dict[str, Any]]) -> str:
-    """How far the captures' own gains spread, in a sentence."""
-    gains = [r["gain"] for r in rows if r["gain"] is not None]
-    if not gains:
-        return "no capture has a gain."
-    if len(gains) == 1:
-        return f"the only held-out capture has a gain of {number(gains[0], 4)}."
-    return f"the captures' own gains run from {number(min(gains), 4)} to {number(max(gains), 4)}."
+        count = len(plot.panels)
+        figure = Figure(figsize=(CHART[0], 3.0 + 0.3 * (count - 1)), layout="constrained")
+        every = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
+        for axes, panel in zip(every, plot.panels, strict=True):
+            if panel.level is not None:
+                axes.axhline(panel.level, color=QUIET, linewidth=0.8)
+            for k, c in enumerate(panel.curves):
+                marker = MARKERS[k % len(MARKERS)] if c.marked else None
+                width = 1.2 if count > 1 else 2.0
+                axes.plot(
+                    c.x, c.y, color=COLOURS[c.colour], linestyle=c.dash, linewidth=width, marker=marker, markersize=4.5,
+                    label=c.name,
+                )  # fmt: skip
+            axes.set_ylabel(panel.label)
+            if panel.ends is None:
+                axes.set_yscale("log")
+                axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _power_of_ten(value)))
+                axes.yaxis.set_minor_formatter(NullFormatter())
+            else:
+                axes.set_ylim(panel.ends)
+                axes.yaxis.set_major_locator(MaxNLocator(4 if count > 1 else 6))
+                axes.ticklabel_format(useOffset=False)
+        every[-1].set_xlabel(plot.label)
+        if len(plot.panels[0].curves) > 1:
+            _legend_above(figure, every[0])
+        return svg(figure, plot.alt)
 
 
 def ladder_chart(labels: Sequence[str], nrmse: Sequence[float], noise: float | None) -> Markup:
     """Held-out error after each step, from top to bottom, with the noise floor drawn in."""
     y = np.arange(len(labels))
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(7.2, 1.15 + 0.36 * len(labels)), layout="constrained")
+        figure = Figure(figsize=(NARROW, 1.15 + 0.34 * len(labels)), layout="constrained")
         axes = figure.subplots()
         low = min([*nrmse, *([noise] if noise else [])]) / 1.35
         if noise:
@@ -160,7 +88,7 @@ def ladder_chart(labels: Sequence[str], nrmse: Sequence[float], noise: float | N
         axes.grid(axis="y", visible=False)
         axes.tick_params(axis="y", length=0)
         _log_ticks(axes)
-        axes.set_xlabel("held-out error, rms, share of the signal's spread (logarithmic)")
+        axes.set_xlabel("held-out error, rms, of the signal's spread")
         steps = ", ".join(f"{a} {percent(v)}" for a, v in zip(labels, nrmse, strict=True))
         floor = f"; the camera's noise alone is {percent(noise)}" if noise else ""
         return svg(figure, f"Held-out error after each step: {steps}{floor}.")
@@ -171,7 +99,7 @@ def stage_bars(rows: Sequence[dict[str, Any]], total: float | None, chosen: str 
     names = [str(r["stage"]) for r in rows]
     values = [float(r["excess_removed"]) for r in rows]
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(7.2, 1.05 + 0.36 * len(rows)), layout="constrained")
+        figure = Figure(figsize=(WIDE, 1.05 + 0.36 * len(rows)), layout="constrained")
         axes = figure.subplots()
         bars = axes.barh(names, values, height=0.6, color=[MAIN if n == chosen else QUIET for n in names])
         for bar, name in zip(bars, names, strict=True):
@@ -195,10 +123,10 @@ def stage_bars(rows: Sequence[dict[str, Any]], total: float | None, chosen: str 
         return svg(figure, f"Excess removed by each stage's probe: {said}.")
 
 
-def forest_plot(rows: Sequence[dict[str, Any]], least: float | None) -> Markup:
+def forest_plot(rows: Sequence[Mapping[str, Any]], least: float | None) -> Markup:
     """Excess that each effect removes, with its interval; filled where it is worth adding."""
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(7.2, 1.1 + 0.3 * len(rows)), layout="constrained")
+        figure = Figure(figsize=(NARROW, 1.1 + 0.27 * len(rows)), layout="constrained")
         axes = figure.subplots()
         for k, r in enumerate(rows):
             low, high = r.get("ci95") or (r["excess_removed"], r["excess_removed"])
@@ -217,15 +145,15 @@ def forest_plot(rows: Sequence[dict[str, Any]], least: float | None) -> Markup:
                 f"least worth adding {number(least, 2)}", (least, 1.0), xycoords=("data", "axes fraction"),
                 xytext=(shift, 3), textcoords="offset points", ha=side, color=OTHER,
             )  # fmt: skip
-        axes.set_yticks(range(len(rows)), [str(r["effect"]) for r in rows])
+        axes.set_yticks(range(len(rows)), [plain(r["effect"]) for r in rows])
         axes.set_ylim(len(rows) - 0.5, -0.5)
         axes.tick_params(axis="y", length=0)
-        axes.set_xlabel("excess removed on held-out captures, with 95 % interval")
+        axes.set_xlabel("held-out excess removed, 95 % interval")
         said = ", ".join(f"{r['effect']} {number(r['excess_removed'])}" for r in rows)
         return svg(figure, f"Excess removed by each effect with its interval, best first: {said}.")
 
 
-def is_worth(row: dict[str, Any], least: float | None) -> bool:
+def is_worth(row: Mapping[str, Any], least: float | None) -> bool:
     """Whether an effect of the ranking is worth adding: by the diagnosis, or else by its interval."""
     if "worth_adding" in row:
         return bool(row["worth_adding"])

@@ -6,15 +6,22 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
+from trainer.diagnosis.previews import CandidatePreview
 from trainer.diagnosis.verdict import Thresholds
 from trainer.formatting import listed, number, parameters, percent, plain
 from trainer.model.model import Model
 from trainer.model.parameters import json_values
-from trainer.report.charts import curve_chart, forest_plot, is_worth, ladder_chart, stage_bars
-from trainer.report.heat_maps import DIFFERENCE, IRRADIANCE, HeatMap, from_zero, heat_map, place, symmetric
+from trainer.report.candidates import MOST, candidate_html, least_worth_adding, preview_html, ranking_html
+from trainer.report.charts import curve_chart, is_worth, stage_bars
+from trainer.report.heat_maps import HeatMap, from_zero, heat_map, place, symmetric
+from trainer.report.ladder import ladder_html, ladder_rows
+from trainer.report.palettes import DIFFERENCE, IRRADIANCE
 
 PROBE = 320  # largest side of a probe's picture, pixels
+PROBES = Markup('<h3>Fitted probe of the {} stage{}</h3><div class="probes">{}</div>')
+CURVE = Markup("<figure><b>{}</b>{}</figure>")
 
 VERDICTS = {
     "complete": ("good", "Complete"),
@@ -69,25 +76,12 @@ def _diagnosed(found: Mapping[str, Any]) -> str:
 
 
 def ladder_section(steps: Sequence[Mapping[str, Any]], noise: float | None) -> dict[str, Any] | None:
-    """The chart and the table of errors after each step; None where nothing was added."""
-    if len(steps) < 2:
+    """The ladder and the table of errors after each step; None where nothing was added."""
+    rows = ladder_rows(steps)
+    if len(rows) < 2:
         return None
-    rows: list[dict[str, Any]] = []
-    for k, step in enumerate(steps):
-        label = ""
-        if step.get("added"):
-            label = f"+ {step['added']}"
-        if step.get("removed"):
-            label = f"{label} − {step['removed']}".strip()
-        if not label:
-            label = "start" if k == 0 else "no change"
-        others = step.get("indistinguishable_from") or []
-        rows.append({"label": label, "nrmse": step["nrmse"], "excess": step["excess"], "others": others})
-    first = rows[0]["excess"]
-    for row in rows:
-        row["left"] = row["excess"] / first if first and first > 0 else None
     return {
-        "chart": ladder_chart([r["label"] for r in rows], [r["nrmse"] for r in rows], noise),
+        "html": ladder_html(rows, noise),
         "rows": rows,
         "undecided": any(r["others"] for r in rows),
         "noise": noise,
@@ -116,6 +110,19 @@ def stages(found: Any, probes: Sequence[tuple[str, str, np.ndarray, str]]) -> di
         "chart": stage_bars(rows, total, found.get("stage")) if rows else None,
         "groups": groups,
     }
+
+
+def stages_html(section: Mapping[str, Any]) -> Markup:
+    """The section of `stages`: its bars, and each stage's probes."""
+    parts = [section["chart"] or Markup("")]
+    for group in section["groups"]:
+        note = Markup(' <span class="quiet">– {}</span>').format(group["note"]) if group["note"] else ""
+        shown = Markup("").join(
+            one["picture"].html() if one["picture"] is not None else CURVE.format(one["title"], one["chart"])
+            for one in group["probes"]
+        )
+        parts.append(PROBES.format(group["stage"], note, shown))
+    return Markup("").join(parts)
 
 
 def _probe(stage: str, title: str, values: Any, unit: str) -> dict[str, Any]:
@@ -150,12 +157,13 @@ def _probe_map(stage: str, title: str, array: np.ndarray, unit: str) -> HeatMap:
     return heat_map(title, array, alt, "" if unit == "1" else unit, scale, colours, largest=PROBE)
 
 
-def ranking(found: Any) -> dict[str, Any] | None:
-    """The forest plot and the table of effects."""
+def ranking(found: Any, previews: Sequence[CandidatePreview] = ()) -> dict[str, Any] | None:
+    """The ranking, the best candidates with their pictures, and the table of all."""
     rows = (found or {}).get("ranking") or []
     if not rows:
         return None
-    least = _least(found)
+    least = least_worth_adding(found)
+    drawn = {p.effect: p for p in previews}
     table = []
     for r in rows:
         interval = r.get("ci95")
@@ -172,12 +180,12 @@ def ranking(found: Any) -> dict[str, Any] | None:
             }
         )
     undecided = any(r["others"] for r in table)
-    return {"chart": forest_plot(rows, least), "rows": table, "undecided": undecided}
-
-
-def _least(found: Mapping[str, Any]) -> float | None:
-    limits, ideal = found.get("thresholds"), found.get("ideal_excess")
-    return max(limits["share"] * (ideal or 0.0), limits["excess"]) if limits else None
+    return {
+        "html": ranking_html(rows, least),
+        "best": [(candidate_html(r, least), preview_html(drawn.get(r["effect"]))) for r in rows[:MOST]],
+        "rows": table,
+        "undecided": undecided,
+    }
 
 
 def apart(found: Any, steps: Sequence[Mapping[str, Any]], more: Sequence[Any]) -> dict[str, Any] | None:

@@ -8,11 +8,9 @@ from typing import Any
 import numpy as np
 
 from trainer.formatting import number, percent
-from trainer.report.charts import brightness_chart, frequency_chart, frequency_words, time_chart, time_words
+from trainer.report.charts import failure_chart
+from trainer.report.failure_plots import brightness_plot, frequency_plot, time_plot
 from trainer.report.heat_maps import (
-    DIFFERENCE,
-    ERROR,
-    IRRADIANCE,
     LARGEST,
     HeatMap,
     from_zero,
@@ -20,6 +18,7 @@ from trainer.report.heat_maps import (
     place,
     symmetric,
 )
+from trainer.report.palettes import DIFFERENCE, ERROR, IRRADIANCE
 
 DETAIL = 160  # side, pixels, of the piece of a large picture that is shown pixel by pixel
 
@@ -102,7 +101,7 @@ def _triple(p: Any, what: str, corner: tuple[int, int] | None) -> list[HeatMap]:
         f"symmetric about zero, to ± {number(apart[1])} counts{lost}."
     )
     note = f"rms {number(rms)} counts, own scale, symmetric about 0{lost}"
-    title = "difference (measured − predicted)"
+    title = "measured − predicted"
     maps.append(heat_map(title, arrays[2], alt, "counts", apart, DIFFERENCE, extent, note=note))
     return maps
 
@@ -141,14 +140,11 @@ def where(compared: dict[str, Any], shape: tuple[int, int] | None) -> dict[str, 
         for key in ("by_channel", "by_plane")
     }
     everything = [r["excess"] for rows in columns.values() for r in rows if r["excess"] is not None]
-    times, spectrum, levels = (parts.get(key) or [] for key in ("time", "frequency", "brightness"))
+    made = (("frequency", frequency_plot), ("brightness", brightness_plot), ("time", time_plot))
+    plots = [make(parts[key]) for key, make in made if parts.get(key)]
     return {
         "field": _field(parts, shape),
-        "frequency": frequency_chart(spectrum) if spectrum else None,
-        "frequency_words": frequency_words(spectrum) if spectrum else "",
-        "brightness": brightness_chart(levels) if levels else None,
-        "time": time_chart(times) if times else None,
-        "time_words": time_words(times) if times else "",
+        "plots": [(plot, failure_chart(plot)) for plot in plots],
         "by_channel": columns["by_channel"],
         "by_plane": columns["by_plane"] if len(columns["by_plane"]) > 1 else [],
         "longest": max([*everything, 1e-9]),

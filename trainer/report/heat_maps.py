@@ -4,21 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import matplotlib
 import numpy as np
+from markupsafe import Markup
 from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
+from trainer.captures.block_means import blocks
 from trainer.formatting import number
+from trainer.report.palettes import LEVELS, MISSING, gradient, palette
 from trainer.report.png_uri import png_uri
 
-IRRADIANCE = "viridis"
-ERROR = "cividis"
-DIFFERENCE = "RdBu_r"
-MISSING = (128, 128, 128)
-LEVELS = 255  # the last of 256 palette entries stands for "nothing measured"
 LARGEST = 480  # pixels along a side; larger pictures are shown as means of blocks
-BAR = 9  # stops of a colour bar
+FIGURE = Markup(
+    '<figure class="map"><b>{title}</b><div class="frame"><div class="y" aria-hidden="true">{y}</div>'
+    '<img src="{uri}" alt="{alt}" style="aspect-ratio:{width}/{height}"><div></div>'
+    '<div class="x" aria-hidden="true">{x}</div><div class="bar" aria-hidden="true">'
+    '<i style="background:linear-gradient(90deg,{bar})"></i><div class="scale-ends">{scale}</div></div>{unit}</div>'
+    "{note}</figure>"
+)
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,22 @@ class HeatMap:
     unit: str
     note: str = ""
 
+    def html(self) -> Markup:
+        """A <figure> with title, axes, colour bar and caption."""
+        return FIGURE.format(
+            title=self.title,
+            uri=self.uri,
+            alt=self.alt,
+            width=self.width,
+            height=self.height,
+            x=_labels(self.x, "left"),
+            y=_labels(self.y, "top"),
+            bar=self.bar,
+            scale=_labels(self.scale, "left"),
+            unit=_about(self.unit, "div", "unit"),
+            note=_about(self.note, "figcaption", ""),
+        )
+
 
 def heat_map(
     title: str,
@@ -92,7 +111,7 @@ def heat_map(
     scale : (float, float)
         Values at the two ends of the colour bar; values beyond are drawn as the ends.
     colours : str
-        Name of a matplotlib colour map.
+        Name of a palette.
     extent : (float, float, float, float) or None, pixels
         Top, left, height and width that the axes show; None: the array's own.
     largest : int, pixels
@@ -102,37 +121,33 @@ def heat_map(
     factor = -(-max(array.shape) // largest)
     small = blocks(array, factor)
     low, high = scale if scale[1] > scale[0] else (scale[0], scale[0] + 1)
-    index = np.full(small.shape, LEVELS, dtype=np.uint8)
-    finite = np.isfinite(small)
-    index[finite] = np.clip(np.rint((small[finite] - low) / (high - low) * (LEVELS - 1)), 0, LEVELS - 1)
     words = [note] if note else []
     if factor > 1:
         words.append(f"each point is the mean of {factor} × {factor} pixels")
     return HeatMap(
         title,
-        _png(index, colours),
+        picture_uri(small, (low, high), colours),
         alt,
         width,
         height,
         _ticks(left, width),
         _ticks(top, height),
-        _gradient(colours),
+        gradient(colours),
         (Tick(0, number(low)), Tick(50, number((low + high) / 2)), Tick(100, number(high))),
         unit,
         "; ".join(words),
     )
 
 
-def blocks(array: np.ndarray, factor: int) -> np.ndarray:
-    """Means over blocks of factor x factor pixels, without NaN; what is left at the border is cut off."""
-    if factor <= 1:
-        return array
-    height, width = (n // factor * factor for n in array.shape)
-    parts = array[:height, :width].reshape(height // factor, factor, width // factor, factor)
-    finite = np.isfinite(parts)
-    count = finite.sum((1, 3))
-    total = np.where(finite, parts, 0).sum((1, 3), dtype=np.float64)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+def picture_uri(values: np.ndarray, scale: tuple[float, float], colours: str) -> str:
+    """A small palette PNG of an array as a data URI; NaN is gray, values beyond the scale are drawn as its ends."""
+    low, high = scale if scale[1] > scale[0] else (scale[0], scale[0] + 1)
+    index = np.full(values.shape, LEVELS, dtype=np.uint8)  # the last of 256 entries: nothing measured
+    finite = np.isfinite(values)
+    index[finite] = np.clip(np.rint((values[finite] - low) / (high - low) * (LEVELS - 1)), 0, LEVELS - 1)
+    picture = Image.fromarray(index)
+    picture.putpalette([int(c[k : k + 2], 16) for c in (*palette(colours), MISSING) for k in (1, 3, 5)])
+    return png_uri(picture)
 
 
 def place(y: float, x: float) -> str:
@@ -160,13 +175,6 @@ def from_zero(arrays: list[np.ndarray], share: float = 99.8) -> tuple[float, flo
     return 0.0, (float(np.percentile(values, share)) if values.size else 1.0) or 1.0
 
 
-def _png(index: np.ndarray, colours: str) -> str:
-    palette = np.rint(matplotlib.colormaps[colours](np.linspace(0, 1, LEVELS))[:, :3] * 255).astype(np.uint8)
-    picture = Image.fromarray(index)
-    picture.putpalette(bytes(palette.tobytes()) + bytes(MISSING))
-    return png_uri(picture)
-
-
 def _ticks(start: float, length: float) -> tuple[Tick, ...]:
     values = MaxNLocator(4, integer=True, steps=[1, 2, 2.5, 5, 10]).tick_values(start, start + length)
     return tuple(
@@ -174,6 +182,13 @@ def _ticks(start: float, length: float) -> tuple[Tick, ...]:
     )
 
 
-def _gradient(colours: str) -> str:
-    stops = matplotlib.colormaps[colours](np.linspace(0, 1, BAR))[:, :3]
-    return ", ".join("#" + "".join(f"{round(255 * c):02x}" for c in stop) for stop in stops)
+def _labels(ticks: tuple[Tick, ...], side: str) -> Markup:
+    one = Markup('<span style="{side}:{at:.2f}%">{text}</span>')
+    return Markup("").join(one.format(side=side, at=t.at, text=t.text) for t in ticks)
+
+
+def _about(text: str, tag: str, kind: str) -> Markup:
+    """An element with a text; nothing without one."""
+    if not text:
+        return Markup("")
+    return Markup('<{tag} class="{kind}">{text}</{tag}>').format(tag=tag, kind=kind, text=text)

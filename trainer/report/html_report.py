@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from markupsafe import Markup
 
 from runtime.bundle.whole_files import whole_file
 from trainer.formatting import listed, number, percent, sentence
@@ -19,10 +20,13 @@ from trainer.report.diagnosis_sections import (
     model_table,
     ranking,
     stages,
+    stages_html,
     thresholds,
 )
 from trainer.report.error_sections import facts, pictures, where
+from trainer.report.light_path import light_path_html
 
+LOOK = Path(__file__).with_name("look")
 METHOD = (
     "Every number comes from captures that no fit has used: excess is the mean squared error beyond the "
     "camera's expected noise, divided by the variance of the measured signal, so that 0 is a perfect model "
@@ -53,7 +57,7 @@ def write_report(
         Or another object with its `as_json()` and, if known, `pictures`.
     diagnosis : object or None
         With `as_json()` (the object of `diagnose --json`, with `thresholds`, `ideal_excess` and `sentence` if known)
-        and `probe_pictures`: (stage, title, array of one or two dimensions, unit).
+        `probe_pictures`: (stage, title, array of one or two dimensions, unit), and, if known, `previews`.
     ladder : sequence of mapping, mapping or None
         Steps with the keys `added`, `removed`, `nrmse`, `excess` and `indistinguishable_from`, or the object of
         `explain --json`; None: the model's history.
@@ -75,15 +79,18 @@ def write_report(
     if floor is None:
         floor = next((d["heldout"]["noise_nrmse"] for d in (compared, found) if d and d.get("heldout")), None)
     heldout = next((d["heldout"] for d in (compared, found) if d and d.get("heldout")), None)
+    probed = stages(found, getattr(diagnosis, "probe_pictures", None) or ())
     context = {
         "title": title,
+        "style": page_style(),
+        "light_path": light_path_html(model, found) if model is not None else None,
         "headline": headline(compared, found, steps),
         "facts": facts(compared, heldout, found),
         "pictures": pictures(getattr(comparison, "pictures", None) or ()),
         "where": where(compared, model.bench.camera.shape if model else None) if compared else None,
         "ladder": ladder_section(steps, floor),
-        "stages": stages(found, getattr(diagnosis, "probe_pictures", None) or ()),
-        "ranking": ranking(found),
+        "stages": stages_html(probed) if probed else None,
+        "ranking": ranking(found, getattr(diagnosis, "previews", ())),
         "apart": apart(found, steps, _more(ladder)),
         "thresholds": thresholds(found),
         "model": model_table(model) if model is not None else None,
@@ -92,6 +99,12 @@ def write_report(
     html = _template().render(context)
     with whole_file(path, "w") as stream:
         stream.write(html)
+
+
+@lru_cache(maxsize=1)
+def page_style() -> Markup:
+    """The style sheet that reports and the studio share."""
+    return Markup((LOOK / "page.css").read_text(encoding="utf-8"))
 
 
 def _steps(ladder: Any) -> tuple[Sequence[Mapping[str, Any]], float | None]:

@@ -6,7 +6,6 @@ The first visit with the token gets a cookie, so that a reload needs no token in
 from __future__ import annotations
 
 import hmac
-import secrets
 from collections.abc import Callable
 from html import escape
 from typing import Any
@@ -14,7 +13,6 @@ from typing import Any
 from bokeh.server.auth_provider import AuthProvider
 from tornado.web import Finish, RequestHandler
 
-TOKEN_BYTES = 24
 REFUSED = (
     "This page needs the token of the address that the studio printed when it started: "
     "open that whole address, or start the studio again."
@@ -26,11 +24,6 @@ ADMITTED = (  # to the address without the token, telling whether the system is 
     "'light') + ';path=/'; location.replace('/');</script></html>"
 )
 FOREIGN = "The studio answers to 127.0.0.1 and localhost alone: open the address that it printed."
-
-
-def new_token() -> str:
-    """A token that nobody guesses."""
-    return secrets.token_urlsafe(TOKEN_BYTES)
 
 
 class TokenAccess(AuthProvider):

@@ -138,11 +138,11 @@ class _CatalogueView:
         effect = self._chosen
         before = {(effect.name, n.label): s.value for n, s in zip(self._numbers, self._sliders, strict=True)}
         self._say("")
+        self._numbers, by_capture = (), False
         try:
             self._numbers = numbers_of(effect, self._order.value)
             by_capture = differs_by_capture(effect)
-        except InputError as error:
-            self._numbers, by_capture = (), False
+        except InputError as error:  # at its example; its sliders may lead to where it works
             self._say(str(error))
         same = self._shown == effect.name
         self._shown = effect.name

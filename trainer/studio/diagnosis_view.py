@@ -9,20 +9,12 @@ import panel as pn
 
 from trainer.diagnosis.ranking import RankedEffect
 from trainer.diagnosis.verdict import Thresholds
-from trainer.formatting import number, plain
-from trainer.model.parameters import describe
-from trainer.studio.difference_pictures import difference_uri
+from trainer.formatting import number
+from trainer.report.candidates import MOST, candidate_html, least_worth_adding, preview_html, ranking_html
+from trainer.report.diagnosis_sections import VERDICTS
 from trainer.studio.project import Project
 from trainer.studio.running_work import Work
 from trainer.studio.visit import LiveText, Visit
-
-MOST = 6
-TONES = {"complete": "good", "missing": "warn", "outside_catalogue": "bad"}
-LABELS = {
-    "complete": "Complete",
-    "missing": "Something is missing",
-    "outside_catalogue": "Something outside the catalogue is missing",
-}
 
 
 def diagnosis_view(project: Project, visit: Visit) -> Any:
@@ -39,16 +31,16 @@ def diagnosis_view(project: Project, visit: Visit) -> Any:
 
     def work() -> None:
         idle = project.work is None
-        usable = idle and project.captures is not None and not project.misread
+        usable = idle and project.set.captures is not None and not project.set.misread
         diagnose.disabled = explain.disabled = not usable
         cancel.disabled = idle
         progress.object = "" if project.work is None else progress_html(project.work)
 
     def show() -> None:
-        found = project.diagnosis
-        tone = TONES[found.verdict] if found is not None else "plain"
-        label.object = "" if found is None else f"<p class='tone {tone}'>{LABELS[found.verdict]}</p>"
-        verdict.tone, verdict.text = tone, project.verdict or _first_words(project)
+        found = project.results.diagnosis
+        tone, words = VERDICTS[found.verdict] if found is not None else ("plain", "")
+        label.object = f"<p class='tone {tone}'>{words}</p>" if words else ""
+        verdict.tone, verdict.text = tone, project.results.verdict or _first_words(project)
 
     visit.on("job set", work)
     visit.on("diagnosis errors set model", show)
@@ -78,11 +70,11 @@ def _time(seconds: float) -> str:
 
 def _first_words(project: Project) -> str:
     """What the numbers say before anything was diagnosed."""
-    if project.set_fault:
-        return project.set_fault
-    if project.misread:
+    if project.set.fault:
+        return project.set.fault
+    if project.set.misread:
         return "Correct the captures first: every number would be wrong."
-    errors = project.errors
+    errors = project.set.errors
     if errors is None:
         return "Comparing the model with captures that no fit saw …"
     one = errors.errors
@@ -105,22 +97,22 @@ def candidates_view(project: Project, visit: Visit) -> Any:
     shown: list[Any] = []
 
     def show() -> None:
-        now = [project.ranking, *project.previews.values()]
+        now = [project.results.ranking, *project.results.previews.values()]
         if len(shown) == len(now) and all(a is b for a, b in zip(shown, now, strict=True)):
             return  # a button that is replaced while somebody clicks it does nothing
         shown[:] = now
-        ranking = project.ranking[:MOST]
+        ranking, found = project.results.ranking, project.results.diagnosis
         buttons.clear()
         if not ranking:
             place[:] = []
             return
-        top = max([r.removed.interval()[1] for r in ranking] + [1e-12])
-        rows: list[Any] = [pn.pane.HTML("<h2>Candidates</h2>", margin=0)]
-        rows += [_candidate(project, r, top, buttons) for r in ranking]
-        found = project.diagnosis
+        least = None if found is None else least_worth_adding(found.as_json())
+        forest = ranking_html([r.as_json() for r in ranking], least)
+        rows: list[Any] = [_wide(f"<h2>Candidates</h2>{forest}", "card")]
+        rows += [_candidate(project, r, least, buttons) for r in ranking[:MOST]]
         if found is not None and found.suggested_captures:
             items = "".join(f"<li>{escape(s)}</li>" for s in found.suggested_captures)
-            rows.append(pn.pane.HTML(f"<h3>Captures that would decide more</h3><ul>{items}</ul>", margin=0))
+            rows.append(_wide(f"<h3>Captures that would decide more</h3><ul>{items}</ul>"))
         place[:] = rows
         busy()
 
@@ -133,48 +125,18 @@ def candidates_view(project: Project, visit: Visit) -> Any:
     return place
 
 
-def _candidate(project: Project, one: RankedEffect, top: float, buttons: list[Any]) -> Any:
-    low, high = one.removed.interval()
-    left, right = (100 * max(0.0, min(1.0, v / top)) for v in (low, high))
-    middle = 100 * max(0.0, min(1.0, one.removed.value / top))
-    alike = ""
-    if one.indistinguishable_from:
-        names = " or ".join(plain(n) for n in one.indistinguishable_from)
-        alike = f"<p class='small warn-text'>These captures cannot tell it from {escape(names)}.</p>"
-    size = describe(one.model.instance(one.effect.name), one.model.bench)
-    text = (
-        f"<h3>{escape(plain(one.effect.name))} <span class='quiet'>{one.effect.stage}</span></h3>"
-        f"<div class='interval' role='img' aria-label='removes {number(one.removed.value)}, 95 % interval "
-        f"{number(low)} to {number(high)}'><i style='left:{left:.1f}%;width:{max(right - left, 0.5):.1f}%'></i>"
-        f"<b style='left:{middle:.1f}%' class='{'worth' if one.worth_adding else ''}'></b></div>"
-        f"<p class='small'>removes {number(one.removed.value)} ({number(low, 2)} to {number(high, 2)}), "
-        f"leaves {number(one.held_out.excess)}{'' if one.worth_adding else '; not worth adding'}</p>"
-        f"<p class='small quiet'>{escape(size[:160])}</p>{alike}"
-    )
+def _wide(html: str, *classes: str) -> Any:
+    return pn.pane.HTML(html, margin=0, sizing_mode="stretch_width", css_classes=list(classes))
+
+
+def _candidate(project: Project, one: RankedEffect, least: float | None, buttons: list[Any]) -> Any:
     button = pn.widgets.Button(name=f"Add {one.effect.name}", css_classes=["plain-button"], margin=0)
     button.on_click(lambda _: project.add(one.effect.name))
     buttons.append(button)
-    words = pn.Column(
-        pn.pane.HTML(text, margin=0, sizing_mode="stretch_width"), button, styles={"flex": "1 1 190px"}
+    text = str(candidate_html(one.as_json(), least))
+    half = {"flex": "1 1 190px"}
+    words = pn.Column(pn.pane.HTML(text, margin=0, sizing_mode="stretch_width"), button, styles=half)
+    pictures = str(preview_html(project.results.previews.get(one.effect.name)))
+    return pn.FlexBox(
+        words, pn.pane.HTML(pictures, margin=0, styles=half), gap="12px", css_classes=["card", "candidate"]
     )
-    return pn.FlexBox(words, _pictures(project, one), gap="12px", css_classes=["card", "candidate"])
-
-
-def _pictures(project: Project, one: RankedEffect) -> Any:
-    """What is missing in a picture, and what the candidate would put there, on one scale."""
-    preview = project.previews.get(one.effect.name)
-    if preview is None:
-        return pn.pane.HTML("", margin=0)
-    pictures = "".join(
-        f"<figure><img src='{difference_uri(values, preview.scale)}' alt='{alt}'>"
-        f"<figcaption>{words}</figcaption></figure>"
-        for values, words, alt in (
-            (preview.missing, "missing now", f"Measured less predicted in capture {escape(preview.capture)}"),
-            (
-                preview.change,
-                "it would add",
-                f"What {escape(plain(one.effect.name))} would add to the prediction",
-            ),
-        )
-    )
-    return pn.pane.HTML(f"<div class='pair'>{pictures}</div>", margin=0, styles={"flex": "1 1 190px"})

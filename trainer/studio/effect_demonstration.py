@@ -1,7 +1,7 @@
 """What one effect does to a test picture: a small virtual bench, its ideal picture, and the picture with the effect.
 
 The picture's pattern is computed once, by phase retrieval on the ideal bench. Everything else is the trainer's own
-light path, on a grid that is small enough for a slider: one thread takes 10 to 40 ms a picture.
+light path, on a grid that is small enough for a slider: one thread takes 5 to 40 ms a picture.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from trainer.model.model_stages import scene_for, stages_for
 from trainer.prediction.predict import Trace, counts, light_on_camera, trace
 from trainer.prediction.scene import Scene, Stages, bare_stages
 
-ROWS, COLUMNS = 120, 160
+ROWS, COLUMNS = 96, 128
 DISTANCE_MM = 10.0
 ITERATIONS = 80
 BRIGHTNESS = 0.6  # of full scale, where the ideal picture is white

@@ -6,7 +6,6 @@ import math
 from html import escape
 from typing import Any
 
-import matplotlib
 import numpy as np
 import panel as pn
 from bokeh.models import (
@@ -20,25 +19,14 @@ from bokeh.models import (
     WheelZoomTool,
 )
 from bokeh.models.annotations.geometry import Span
-from bokeh.palettes import Viridis256
 from bokeh.plotting import figure
 
+from trainer.report.palettes import DIFFERENCE, IRRADIANCE, gradient, palette
 from trainer.studio.effect_demonstration import EffectPicture
 
 LINE = "#8a8f98"  # of frames and cross-hairs: seen on light and on dark
-STOPS = 17  # of a colour bar
 NARROWEST, GAP = 220, 16  # of a picture and between two, CSS pixels
 SHARE = 99.0  # per cent of the pixels that the difference's colours hold
-
-
-def _palette(name: str, instead: str) -> list[str]:
-    """A matplotlib colour map as 256 colours."""
-    known = matplotlib.colormaps[name if name in matplotlib.colormaps else instead]
-    return [matplotlib.colors.to_hex(known(k / 255)) for k in range(256)]
-
-
-# Both are perceptually uniform and safe for colour-blind readers; in both, dark is nothing.
-IRRADIANCE, DIFFERENCE = list(Viridis256), _palette("berlin", "RdBu_r")
 
 
 class EffectPictures:
@@ -51,11 +39,13 @@ class EffectPictures:
 
     def __init__(self, first: EffectPicture) -> None:
         height, width = first.ideal.shape
+        # The ideal picture never changes, and is sent once.
+        self._ideal = ColumnDataSource(data={"ideal": [first.ideal]})
         self._source = ColumnDataSource(data=_columns(first))
         self._top = _round_up(float(np.percentile(first.ideal, 99.8)))
         self._spread = 1.0
-        self._difference = LinearColorMapper(palette=DIFFERENCE, low=-1, high=1)
-        irradiance = LinearColorMapper(palette=IRRADIANCE, low=0, high=self._top)
+        self._difference = LinearColorMapper(palette=list(palette(DIFFERENCE)), low=-1, high=1)
+        irradiance = LinearColorMapper(palette=list(palette(IRRADIANCE)), low=0, high=self._top)
         self._x, self._y = Range1d(start=0, end=width), Range1d(start=height, end=0)
         self._whole = (width, height)
         across, down = Span(dimension="width", line_color=LINE), Span(dimension="height", line_color=LINE)
@@ -131,7 +121,14 @@ class EffectPictures:
         plot.axis.visible = False
         plot.grid.visible = False
         plot.image(  # type: ignore[call-arg]
-            image=name, source=self._source, x=0, y=0, dw=width, dh=height, color_mapper=mapper, name=name
+            image=name,
+            source=self._ideal if name == "ideal" else self._source,
+            x=0,
+            y=0,
+            dw=width,
+            dh=height,
+            color_mapper=mapper,
+            name=name,
         )
         rows = [("row, column", "$y{0}, $x{0}"), (name.replace("_", " "), "@" + name + "{0,0}")]
         plot.add_tools(HoverTool(tooltips=rows))
@@ -140,7 +137,6 @@ class EffectPictures:
 
 def _columns(picture: EffectPicture) -> dict[str, list[Any]]:
     return {
-        "ideal": [picture.ideal],
         "with_effect": [picture.with_effect],
         "difference": [picture.difference],
     }
@@ -158,13 +154,12 @@ def _title(text: str, note: str = "") -> str:
     return f"<h3>{escape(text)} <small>{escape(note)}</small></h3>"
 
 
-def _bar(colours: list[str], ends: tuple[str, str, str], unit: str) -> str:
+def _bar(colours: str, ends: tuple[str, str, str], unit: str) -> str:
     """A colour bar with three labels."""
-    stops = ", ".join(colours[round(k * 255 / (STOPS - 1))] for k in range(STOPS))
     low, middle, high = (escape(e) for e in ends)
     return (
         f'<div class="bar" role="img" aria-label="Colours from {low} to {high} {unit}">'
-        f'<div class="colours" style="background: linear-gradient(to right, {stops})"></div>'
+        f'<div class="colours" style="background: linear-gradient(to right, {gradient(colours)})"></div>'
         f'<div class="ends"><span>{low}</span><span>{middle} {escape(unit)}</span><span>{high}</span></div></div>'
     )
 

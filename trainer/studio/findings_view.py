@@ -22,12 +22,12 @@ def findings_view(project: Project, visit: Visit) -> Any:
     place = pn.Column(sizing_mode="stretch_width", css_classes=["findings"])
 
     def show() -> None:
-        found = project.problems
+        found = project.set.problems
         if found is None:
             place[:] = [_text("<p class='quiet'>Checking the captures …</p>")]
             return
         if not found:
-            count = len(project.captures or ())
+            count = len(project.set.captures or ())
             place[:] = [
                 pn.pane.HTML(
                     f"<p class='sound'>{count} captures, and nothing is wrong with them.</p>", margin=0
@@ -44,7 +44,7 @@ def findings_view(project: Project, visit: Visit) -> Any:
                 f"</b> {escape(problem.message)}</p>"
             )
             row: list[Any] = [pn.pane.HTML(text, margin=0, styles={"flex": "1 1 320px"})]
-            fix = fix_of(project.folder, problem) if project.folder is not None else None
+            fix = fix_of(project.set.folder, problem) if project.set.folder is not None else None
             if fix is not None:
                 button = pn.widgets.Button(name=fix.what, css_classes=["main-button"], margin=0)
                 button.on_click(partial(_clicked, project, fix))

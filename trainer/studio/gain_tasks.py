@@ -100,10 +100,10 @@ def show_gain(
     )
 
 
-def export_model(say: Say, folder: Path, model: Model, out: Path) -> dict[str, Any]:
-    """Write the bundle for the headset."""
+def export_model(say: Say, folder: Path, model: Model, network: Path | None, out: Path) -> dict[str, Any]:
+    """Write the bundle for the headset, with the network in a file where there is one."""
     say("progress", (0.2, "writing the bundle"))
-    return dict(export_bundle(model, opened(folder), out))
+    return dict(export_bundle(model, opened(folder), out, network=network))
 
 
 def keep(picture: GainPicture, path: Path) -> None:

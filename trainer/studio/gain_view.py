@@ -13,7 +13,7 @@ from bokeh.palettes import Greys256
 from bokeh.plotting import figure
 
 from firmware_iface.errors import InputError
-from trainer.report.heat_maps import blocks
+from trainer.captures.block_means import blocks
 from trainer.studio.gain_tasks import (
     OWN,
     PICTURES,
@@ -89,11 +89,11 @@ class _Pictures:
 
 def gain_view(project: Project, visit: Visit) -> Any:
     """The pictures, what displays them, and the bundle for the headset."""
-    if project.captures is None or project.folder is None:
+    if project.set.captures is None or project.set.folder is None:
         return pn.pane.HTML("<p class='quiet'>There are no captures yet.</p>", css_classes=["card"])
-    captures = project.captures
+    captures = project.set.captures
     displays = [PREDICTED, OTHER, RECORDED]
-    if noted(project.folder) is not None:
+    if noted(project.set.folder) is not None:
         displays.insert(0, OWN)
     picture = pn.widgets.Select(name="Target", options=list(PICTURES), width=120, margin=0)
     colour = pn.widgets.Select(name="Colour", options=list(captures.channels), width=100, margin=0)
@@ -115,10 +115,10 @@ def gain_view(project: Project, visit: Visit) -> Any:
     place = pn.FlexBox(gap="12px", sizing_mode="stretch_width")
     shown: list[GainPicture] = []
     other.visible = False
-    reveal.visible = noted(project.folder) is not None
+    reveal.visible = noted(project.set.folder) is not None
 
     def display(_: Any) -> None:
-        if project.model is None or project.folder is None:
+        if project.set.model is None or project.set.folder is None:
             return
         chosen = other.value_input or other.value if where.value in (OTHER, RECORDED) else where.value
         if not chosen:
@@ -130,11 +130,11 @@ def gain_view(project: Project, visit: Visit) -> Any:
             except InputError as error:
                 project.say(str(error), "error")
             return
-        arguments = (project.folder, project.model, picture.value, colour.value, plane.value, chosen)
+        arguments = (project.set.folder, project.set.model, picture.value, colour.value, plane.value, chosen)
         project.run("Show the gain", show_gain, arguments, _kept)
 
     def _kept(found: GainPicture) -> None:
-        path = project.model_path
+        path = project.set.model_path
         if path is not None:
             file = path.with_name(f"{path.stem}-{found.name}.npz")
             keep(found, file)
@@ -146,7 +146,7 @@ def gain_view(project: Project, visit: Visit) -> Any:
         project.export(folder)
 
     def show() -> None:
-        found = project.gain
+        found = project.results.gain
         if not isinstance(found, GainPicture):
             if not shown:
                 words.object = (
@@ -176,11 +176,11 @@ def gain_view(project: Project, visit: Visit) -> Any:
         )
 
     def work() -> None:
-        idle = project.work is None and project.model is not None
+        idle = project.work is None and project.set.model is not None
         show_it.disabled = export.disabled = not idle
 
     def uncover(_: Any) -> None:
-        hidden = hidden_in(project.folder) if project.folder is not None else None
+        hidden = hidden_in(project.set.folder) if project.set.folder is not None else None
         items = "".join(f"<li>{escape(one)}</li>" for one in hidden or ["nothing at all"])
         truth.object = f"<h3>Hidden in this bench</h3><ul>{items}</ul>"
 

@@ -15,8 +15,8 @@ from firmware_iface.virtual import CATALOGUE_KINDS, BenchDescription, VirtualHea
 from firmware_iface.virtual.bench_description import ChannelDescription
 from runtime.bundle.whole_files import whole_file
 from trainer.captures.acquire import acquire_captures
+from trainer.captures.block_means import blocks
 from trainer.captures.open_bench import nominal_bench
-from trainer.report.heat_maps import blocks
 from trainer.studio.jobs import Say
 
 NOTE = "guess.json"  # in the capture set: the bench's kind and number

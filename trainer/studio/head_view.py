@@ -43,18 +43,19 @@ def head_view(project: Project, visit: Visit, theme: str) -> Any:
     other.on_click(leave)
 
     def show() -> None:
-        path = project.model_path
-        if project.folder is None or path is None:
+        folder, path = project.set.folder, project.set.model_path
+        if folder is None or path is None:
             names.object = ""
         else:
             kept = escape(path.name) if path.is_file() else f"{escape(path.name)} (at the first change)"
             names.object = (
-                f"<span>Captures <b title='{escape(str(project.folder))}'>{escape(project.folder.name)}</b></span>"
+                f"<span>Captures <b title='{escape(str(folder))}'>{escape(folder.name)}</b></span>"
                 f"<span>Model <b title='{escape(str(path))}'>{kept}</b></span>"
             )
-        undo.disabled, redo.disabled = not project.can_undo(), not project.can_redo()
+        busy = project.work is not None
+        undo.disabled, redo.disabled = busy or not project.set.can_undo(), busy or not project.set.can_redo()
         for button in (undo, redo, other):
-            button.visible = project.folder is not None
+            button.visible = folder is not None
 
     visit.on("set model job diagnosis", show)
     return pn.FlexBox(
@@ -68,10 +69,10 @@ def notice_view(project: Project, visit: Visit) -> Any:
 
     def show() -> None:
         severity, sentence = project.notice
-        if not sentence and project.effects_fault:
-            severity, sentence = "error", project.effects_fault
-        if not sentence and project.set_fault:
-            severity, sentence = "error", project.set_fault
+        if not sentence and project.effects.fault:
+            severity, sentence = "error", project.effects.fault
+        if not sentence and project.set.fault:
+            severity, sentence = "error", project.set.fault
         text.text, text.tone = sentence, "bad" if severity == "error" else "plain"
         text.visible = bool(sentence)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +15,17 @@ import torch
 from runtime.program.outputs import emptied
 from runtime.program.progress import Progress
 from trainer.captures.batches import load
+from trainer.captures.block_means import blocks
 from trainer.captures.capture_set import CaptureSet, chosen, opened
 from trainer.captures.check_set import check_captures
 from trainer.captures.held_out import capture_roles
 from trainer.captures.problems import Problem
 from trainer.diagnosis.candidate_fits import try_effect
 from trainer.diagnosis.capture_errors import CaptureErrors, capture_errors
-from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors
+from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors, with_previews
+from trainer.diagnosis.error_budget import error_budget
 from trainer.diagnosis.explanation import add, explain
+from trainer.diagnosis.previews import CandidatePreview, previews
 from trainer.diagnosis.ranking import RankedEffect, rank
 from trainer.diagnosis.screen import screen_batches
 from trainer.diagnosis.verdict import Thresholds
@@ -33,12 +37,11 @@ from trainer.fitting.predictor import evaluate_captures
 from trainer.model.history import recorded
 from trainer.model.model import Model
 from trainer.model.model_stages import ideal_irradiance
-from trainer.report.heat_maps import blocks, from_zero, symmetric
+from trainer.networks.approximator import Approximator, read_approximator, write_approximator
+from trainer.report.heat_maps import from_zero, symmetric
 from trainer.studio.jobs import Say
 
 SHOWN_PX = 480  # along a picture's longer side, where the whole of it is shown
-PREVIEW_PX = 160
-MOST_PREVIEWS = 8
 SMALL_PX = 60_000  # of a picture: below, processes of a pool cost more time than they save
 PROGRESS_S = 0.15  # between two words on progress
 
@@ -72,30 +75,6 @@ class CapturePrediction:
     errors: CaptureErrors | None
 
 
-@dataclass(frozen=True)
-class CandidatePreview:
-    """What a candidate would change in a picture.
-
-    Attributes
-    ----------
-    effect : str
-    capture : str
-        The picture.
-    missing : float32 array [h, w], counts
-        Measured less predicted without the candidate; means of blocks.
-    change : float32 array [h, w], counts
-        Predicted with the candidate less predicted without it.
-    scale : float, counts
-        End of the colour scale of both.
-    """
-
-    effect: str
-    capture: str
-    missing: np.ndarray
-    change: np.ndarray
-    scale: float
-
-
 def block_side(pixels: int) -> int:
     """Side of the blocks, a power of two, with which that many pixels fit the page."""
     return 1 << max(0, (-(-pixels // SHOWN_PX) - 1).bit_length())
@@ -112,13 +91,21 @@ def fit_gains(say: Say, folder: Path, model: Model) -> Model:
     return with_gains(captures, model, capture_roles(captures).fitted)
 
 
-def predict(say: Say, folder: Path, model: Model, capture: str, effects_version: int) -> CapturePrediction:
+def predict(
+    say: Say, folder: Path, model: Model, capture: str, network: Path | None, effects_version: int
+) -> CapturePrediction:
     """One capture, measured and predicted, and where they differ."""
     captures = opened(folder)
     row = chosen(captures, (capture,))[0]
-    residual, errors = capture_errors(captures, row, model)
+    learned = None if network is None else _network_in(network, network.stat().st_mtime_ns)
+    residual, errors = capture_errors(captures, row, model, learned)
     measured, predicted = residual.measured.astype(np.float32), residual.predicted.astype(np.float32)
     return shown_as(capture, measured, predicted, residual.mask > 0, errors)
+
+
+@lru_cache(maxsize=1)
+def _network_in(path: Path, time_ns: int) -> Approximator:
+    return read_approximator(path)[0]
 
 
 def shown_as(
@@ -144,15 +131,13 @@ def shown_as(
     )
 
 
-def find_missing(
-    say: Say, folder: Path, model: Model, effects: Sequence[Path]
-) -> tuple[Diagnosis, list[CandidatePreview]]:
+def find_missing(say: Say, folder: Path, model: Model, effects: Sequence[Path]) -> Diagnosis:
     """What `diagnose` does, and what each candidate would change."""
     captures, known = _begin(folder, effects)
     with open_pool(_workers(captures)) as pool:
         found = diagnose(captures, model, known, pool, Thresholds(), _progress(say))
     say("progress", (0.97, "drawing what each candidate would change"))
-    return found, _previews(captures, found.model, found.ranking[:MOST_PREVIEWS])
+    return with_previews(captures, found)
 
 
 def add_effect(
@@ -176,7 +161,7 @@ def explain_all(say: Say, folder: Path, model: Model, effects: Sequence[Path]) -
 
     with open_pool(_workers(captures)) as pool:
         found = explain(captures, model, known, pool, Thresholds(), save, _progress(say))
-    return found.diagnosis
+    return with_previews(captures, found.diagnosis)
 
 
 def try_own(
@@ -198,7 +183,7 @@ def try_own(
         held = tuple(c.capture for c in roles.held_out)
         fits.append(try_effect(folder, ids, held, model, start, True))
     ranking = rank(before, fits, known, Thresholds(), ideal.excess, len(known))
-    return ranking, _previews(captures, model, ranking)
+    return ranking, previews(captures, model, ranking)
 
 
 def learn_panel_field(say: Say, folder: Path, model: Model) -> tuple[Model, float, float]:
@@ -214,8 +199,7 @@ def learn_panel_field(say: Say, folder: Path, model: Model) -> tuple[Model, floa
 
 
 def train_network(say: Say, folder: Path, model: Model, steps: int, out: Path) -> tuple[Path, float, float]:
-    """A network trained beyond the model: its file, and the PSNR of held-out predictions without and with it, dB."""
-    from trainer.training.image_metrics import prediction_metrics
+    """A network trained beyond the model: its file, and the held-out excess without and with it."""
     from trainer.training.recipe import recipe_named
     from trainer.training.training_run import NETWORK, train
     from trainer.training.training_sets import training_sets
@@ -230,10 +214,13 @@ def train_network(say: Say, folder: Path, model: Model, steps: int, out: Path) -
     out.mkdir(parents=True, exist_ok=True)
     network = train(
         sets.fitted, recipe_named("compact"), steps, out, sets.held_out, about=sets.about,
-        progress=lambda step, loss: progress(0.1 + 0.9 * step / steps, f"step {step} of {steps}, loss {loss:.3g}"),
+        progress=lambda step, loss: progress(0.1 + 0.8 * step / steps, f"step {step} of {steps}, loss {loss:.3g}"),
     )  # fmt: skip
-    before, after = (prediction_metrics(sets.held_out, one).as_json() for one in (None, network))
-    return out / NETWORK, float(before["psnr_db"]), float(after["psnr_db"])
+    progress(0.9, "comparing with captures that the network has not seen")
+    before, after = (error_budget(captures, sets.model, one).unexplained for one in (None, network))
+    about = {**sets.about, "steps": steps, "excess_before": before, "excess_after": after}
+    write_approximator(out / NETWORK, network, about)
+    return out / NETWORK, before, after
 
 
 def _begin(folder: Path, effects: Sequence[Path]) -> tuple[CaptureSet, Any]:
@@ -284,28 +271,3 @@ def _complete(captures: CaptureSet, model: Model, effects: Sequence[Path]) -> Di
         if not Thresholds().complete(errors.excess, ideal.excess):
             return None
         return diagnose(captures, model, catalogue(effects), pool, ideal=ideal, with_probes=False)
-
-
-def _previews(captures: CaptureSet, model: Model, ranking: Sequence[RankedEffect]) -> list[CandidatePreview]:
-    """What each candidate would change in the held-out capture that the model predicts worst."""
-    if not ranking:
-        return []
-    roles = capture_roles(captures)
-    row = (
-        max(roles.held_out, key=lambda c: _excess(captures, c, model))
-        if len(roles.held_out) < 5
-        else roles.held_out[0]
-    )
-    residual, _ = capture_errors(captures, row, model)
-    factor = max(1, -(-max(residual.measured.shape) // PREVIEW_PX))
-    missing = blocks(np.where(residual.mask > 0, residual.residual, np.nan), factor).astype(np.float32)
-    found = []
-    for one in ranking:
-        there, _ = capture_errors(captures, row, one.model)
-        change = blocks(there.predicted - residual.predicted, factor).astype(np.float32)
-        found.append(CandidatePreview(one.effect.name, row.capture, missing, change, symmetric([missing])[1]))
-    return found
-
-
-def _excess(captures: CaptureSet, row: Any, model: Model) -> float:
-    return evaluate_captures(captures, [row], model).excess

@@ -32,7 +32,7 @@ _LOG = logging.getLogger(__name__)
 
 
 class WorkerProcess:
-    """A process that is started ahead of its first task and started again after it was ended.
+    """A process that `start` makes ready ahead of its first task, and that is started again after it was ended.
 
     Parameters
     ----------
@@ -51,7 +51,12 @@ class WorkerProcess:
         self._connection: Connection | None = None
         self._heard: Say | None = None
         self._closed = False
-        self._start()
+
+    def start(self) -> None:
+        """Start the process, where it does not run yet."""
+        with self._lock:
+            if self._process is None:
+                self._start()
 
     @property
     def busy(self) -> bool:
@@ -164,6 +169,13 @@ class WorkerProcess:
             heard(kind, value)
             if kind in ("done", "failed"):
                 return
+
+
+def picture_worker() -> WorkerProcess:
+    """The process that predicts pictures, started: it takes seconds to import what it needs."""
+    worker = WorkerProcess("hololoop studio: pictures", "trainer.studio.job_tasks")
+    worker.start()
+    return worker
 
 
 def sentence_of(error: BaseException) -> str:

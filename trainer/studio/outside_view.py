@@ -8,9 +8,9 @@ from typing import Any
 import panel as pn
 
 from firmware_iface.errors import InputError
+from trainer.diagnosis.diagnosis import Diagnosis
 from trainer.effects.definition import STAGES
-from trainer.report.diagnosis_sections import stages
-from trainer.report.heat_maps import HeatMap
+from trainer.report.diagnosis_sections import stages, stages_html
 from trainer.studio.probe_template import write_effect_of_probe
 from trainer.studio.project import Project
 from trainer.studio.visit import Visit
@@ -32,13 +32,13 @@ def outside_view(project: Project, visit: Visit) -> Any:
     train.on_click(lambda _: project.train_network(int(steps.value or 400)))
 
     def written(_: Any) -> None:
-        if project.captures is None:
+        if project.set.captures is None:
             return
-        bench = project.captures.bench
+        bench = project.set.captures.bench
         found = (
             None
-            if project.diagnosis is None
-            else next((p for p in project.diagnosis.probes if p.stage == stage.value), None)
+            if project.results.diagnosis is None
+            else next((p for p in project.results.diagnosis.probes if p.stage == stage.value), None)
         )
         shape = bench.camera.shape if stage.value == "sensor" else bench.panel.shape
         try:
@@ -48,7 +48,7 @@ def outside_view(project: Project, visit: Visit) -> Any:
                 found,
                 shape,
                 project.home,
-                project.known,
+                project.effects.known,
             )
         except (InputError, OSError) as error:
             project.say(str(error), "error")
@@ -61,7 +61,7 @@ def outside_view(project: Project, visit: Visit) -> Any:
     write.on_click(written)
 
     def show() -> None:
-        found = project.diagnosis
+        found = project.results.diagnosis
         if found is None or not found.probes:
             pictures.object = (
                 "<p class='quiet'>Diagnose fits each stage's free-form probe; its pictures come here.</p>"
@@ -72,12 +72,12 @@ def outside_view(project: Project, visit: Visit) -> Any:
                 stage.value = found.stage
 
     def work() -> None:
-        idle = project.work is None and project.captures is not None
+        idle = project.work is None and project.set.captures is not None
         learn.disabled = train.disabled = write.disabled = not idle
 
     def listed() -> None:
-        rows = "".join(f"<li><code>{escape(str(p))}</code></li>" for p in project.effect_files)
-        fault = f"<p class='bad-text'>{escape(project.effects_fault)}</p>" if project.effects_fault else ""
+        rows = "".join(f"<li><code>{escape(str(p))}</code></li>" for p in project.effects.paths)
+        fault = f"<p class='bad-text'>{escape(project.effects.fault)}</p>" if project.effects.fault else ""
         files.object = (f"<h3>Watched files</h3><ul>{rows}</ul>" if rows else "") + fault
 
     visit.on("diagnosis model", show)
@@ -115,30 +115,8 @@ def outside_view(project: Project, visit: Visit) -> Any:
     return pn.FlexBox(left, right, gap="16px", align_items="flex-start", sizing_mode="stretch_width")
 
 
-def _pictures(found: Any) -> str:
+def _pictures(found: Diagnosis) -> str:
     section = stages(found.as_json(), found.probe_pictures)
     if section is None or not section["groups"]:
         return "<p>No stage's probe finds anything.</p>"
-    parts = [str(section["chart"] or "")]
-    for group in section["groups"]:
-        shown = "".join(
-            _map(p["picture"]) if p["picture"] is not None else _curve(p) for p in group["probes"]
-        )
-        parts.append(
-            f"<h3>{escape(group['stage'])}: {escape(group['note'])}</h3><div class='probes'>{shown}</div>"
-        )
-    return "".join(parts)
-
-
-def _map(one: HeatMap) -> str:
-    low, _, high = one.scale
-    return (
-        f"<figure><img src='{one.uri}' alt='{escape(one.alt, quote=True)}' "
-        f"style='aspect-ratio:{one.width}/{one.height}'>"
-        f"<div class='scale'><span>{low.text}</span><i style='background:linear-gradient(90deg,{one.bar})'></i>"
-        f"<span>{high.text} {escape(one.unit)}</span></div><figcaption>{escape(one.title)}</figcaption></figure>"
-    )
-
-
-def _curve(one: dict[str, Any]) -> str:
-    return f"<figure>{one['chart']}<figcaption>{escape(one['title'])}</figcaption></figure>"
+    return str(stages_html(section))

@@ -9,6 +9,7 @@ from typing import Any
 
 import panel as pn
 
+from trainer.report.html_report import LOOK
 from trainer.studio.catalogue_view import catalogue_view
 from trainer.studio.comparison_view import comparison_view
 from trainer.studio.diagnosis_view import candidates_view, diagnosis_view
@@ -23,14 +24,16 @@ from trainer.studio.project import Project
 from trainer.studio.start_view import start_view
 from trainer.studio.visit import Visit
 
-STYLE = Path(__file__).with_name("studio.css")
+# Served as files, which the browser reads once: copied into each component they would be nearly all of the page.
+STYLE_FOLDERS = {"look": LOOK, "controls": Path(__file__).with_name("look")}
+STYLES = ("look/page.css", "controls/studio.css")
 FRAME = Path(__file__).with_name("studio.html")
 SECTIONS = ("Bench", "No name fits", "Gain", "Catalogue")
 
 
 def prepare() -> None:
     """Load what every page needs."""
-    pn.extension(raw_css=[STYLE.read_text(encoding="utf-8")], loading_indicator=False, notifications=False)
+    pn.extension(css_files=list(STYLES), loading_indicator=False, notifications=False)
 
 
 def studio_page(project: Project) -> Any:
@@ -41,7 +44,7 @@ def studio_page(project: Project) -> Any:
     system = str(pn.state.cookies.get("hololoop_system", "light"))
     visit = Visit(project, document, dark=(system if theme == "auto" else theme) == "dark")
     frame = pn.Template(FRAME.read_text(encoding="utf-8"))
-    frame.add_variable("style", STYLE.read_text(encoding="utf-8"))
+    frame.add_variable("styles", STYLES)
     frame.add_variable("theme", "dark" if visit.dark else "light")
     frame.add_variable("follows", theme not in ("light", "dark"))
     frame.add_panel("head", head_view(project, visit, theme))
@@ -56,11 +59,11 @@ def _fill(place: Any, project: Project, visit: Visit) -> None:
     shown: list[Path | None] = []
 
     def show() -> None:
-        if shown == [project.folder]:
+        if shown == [project.set.folder]:
             return
-        shown[:] = [project.folder]
+        shown[:] = [project.set.folder]
         visit.capture = ""
-        if project.folder is None:
+        if project.set.folder is None:
             place[:] = [notice_view(project, visit), start_view(project, visit)]
         else:
             place[:] = [
@@ -126,4 +129,4 @@ def _bench(project: Project, visit: Visit) -> Any:
 
 def _catalogue(project: Project, visit: Visit) -> Any:
     """The catalogue of effects, with pictures that move."""
-    return catalogue_view(project.known)
+    return catalogue_view(project.effects.known)

@@ -39,6 +39,8 @@ class PictureQueue:
         Called with what the check of the set has found.
     failed : callable
         Called with a sentence where nothing can be predicted.
+    worker : WorkerProcess
+        Predicts.
     """
 
     def __init__(
@@ -47,9 +49,10 @@ class PictureQueue:
         tell: Callable[..., None],
         checked: Callable[[list[Problem]], None],
         failed: Callable[[str], None],
+        worker: WorkerProcess,
     ) -> None:
         self._lock, self._tell, self._checked, self._failed = lock, tell, checked, failed
-        self._worker = WorkerProcess("hololoop studio: pictures", job_tasks.__name__)
+        self._worker = worker
         self._closed = threading.Event()
         self._shown, self._other = 0, -1
         self.effects_version = 0
@@ -66,18 +69,20 @@ class PictureQueue:
             self._folder, self._captures, self._held_out = folder, captures, tuple(held_out)
             self._shown, self._other = self._shown + 1, self._other - 1
             self._models: dict[int, Model] = {}
+            self._network: Path | None = None
             self._predictions: OrderedDict[Key, CapturePrediction] = OrderedDict()
             self._errors: dict[Key, CaptureErrors | None] = {}
             self._faults: dict[Key, str] = {}
             self._wanted: list[Key] = []
             self._is_checked = False
 
-    def show(self, model: Model) -> None:
-        """Predict by another model from now on."""
+    def show(self, model: Model, network: Path | None = None) -> None:
+        """Predict by another model from now on, with the network in a file where there is one."""
         with self._lock:
             self._drop(self._shown)
             self._shown += 1
             self._models[self._shown] = model
+            self._network = network
 
     def show_other(self, model: Model | None) -> None:
         """Predict by a second model, too; None: no longer."""
@@ -163,7 +168,8 @@ class PictureQueue:
         if set(self._captures.channels) - set(model.gain):
             self._worker.submit(job_tasks.fit_gains, (folder, model), lambda k, v: self._gained(key[0], k, v))
         else:
-            arguments = (folder, model, key[1], self.effects_version)
+            network = self._network if key[0] == self._shown else None
+            arguments = (folder, model, key[1], network, self.effects_version)
             self._worker.submit(job_tasks.predict, arguments, lambda k, v: self._predicted(key, k, v))
 
     def _gained(self, revision: int, kind: str, value: Any) -> None:

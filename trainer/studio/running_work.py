@@ -95,6 +95,10 @@ class RunningWork:
             self._finish()
             self._say(str(error), "error")
 
+    def prepare(self) -> None:
+        """Start the process, so that the first task finds it ready."""
+        self._worker.start()
+
     def cancel(self) -> None:
         """End the work that is under way."""
         if not self._worker.cancel():

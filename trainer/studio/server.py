@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import logging
+import secrets
 import socket
 import webbrowser
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from firmware_iface.errors import InputError
-from trainer.studio.access import TokenAccess, new_token
-from trainer.studio.page import prepare, studio_page
-from trainer.studio.project import Project
+from trainer.studio.jobs import picture_worker
+
+if TYPE_CHECKING:
+    from trainer.studio.project import Project
 
 ADDRESS = "127.0.0.1"
+TOKEN_BYTES = 24
 FIRST_PORT, PORTS = 5006, 50
 UNUSED_MS = 30_000  # a page that nobody looks at is forgotten after this; the project stays
 
@@ -69,8 +72,16 @@ def serve(
     """
     token = _checked_token(token)
     asked, port = port, _free_port(port)
-    prepare()
-    project = Project(Path.cwd(), effects)
+    worker = picture_worker()  # imports what it needs while this process does, too
+    try:
+        from trainer.studio.page import prepare
+        from trainer.studio.project import Project
+
+        prepare()
+        project = Project(Path.cwd(), effects, worker)
+    except BaseException:
+        worker.close()
+        raise
     try:
         if captures is not None:
             project.open_set(captures, model)
@@ -96,14 +107,17 @@ def serve(
             server.stop()
     finally:
         project.close()
-    path = project.model_path
+    path = project.set.model_path
     written = str(path) if path is not None and path.is_file() else None
-    return Served(address, None if project.folder is None else str(project.folder), written)
+    return Served(address, None if project.set.folder is None else str(project.set.folder), written)
 
 
 def make_server(project: Project, port: int, token: str) -> Any:
     """A server of the page, not started."""
     from panel.io.server import get_server
+
+    from trainer.studio.access import TokenAccess
+    from trainer.studio.page import STYLE_FOLDERS, studio_page
 
     logging.getLogger("bokeh.server.views.ws").setLevel(logging.CRITICAL)  # it logs each refused origin
     logging.getLogger("tornado.access").setLevel(logging.ERROR)
@@ -116,6 +130,7 @@ def make_server(project: Project, port: int, token: str) -> Any:
         auth_provider=TokenAccess(token, port),
         title={"/": "hololoop studio"},
         location=False,
+        static_dirs={name: str(folder) for name, folder in STYLE_FOLDERS.items()},
         check_unused_sessions_milliseconds=10_000,
         unused_session_lifetime_milliseconds=UNUSED_MS,
         websocket_max_message_size=64 * 2**20,
@@ -124,7 +139,7 @@ def make_server(project: Project, port: int, token: str) -> Any:
 
 def _checked_token(token: str | None) -> str:
     if token is None:
-        return new_token()
+        return secrets.token_urlsafe(TOKEN_BYTES)
     if len(token) < 8 or not all(c.isascii() and (c.isalnum() or c in "-_.~") for c in token):
         raise InputError(
             "--token: give at least 8 letters, digits or any of - _ . ~, or leave it out for a new one"

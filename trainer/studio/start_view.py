@@ -86,8 +86,8 @@ def start_view(project: Project, visit: Visit) -> Any:
 
     def seen() -> None:
         work = project.work
-        if isinstance(project.gain, np.ndarray) and work is not None:
-            uri = _picture(project.gain)
+        if isinstance(project.results.gain, np.ndarray) and work is not None:
+            uri = _picture(project.results.gain)
             picture.object = (
                 f"<figure class='live-picture'><img src='{uri}' alt='The last picture of the camera'>"
                 f"<figcaption>What the camera sees: {escape(work.what)}</figcaption></figure>"

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from firmware_iface.errors import InputError
-from trainer.networks.approximator import Approximator, Architecture, write_approximator
+from trainer.networks.approximator import NETWORK, Approximator, Architecture, write_approximator
 from trainer.networks.discriminator import Discriminator
 from trainer.training.checkpoint import read_checkpoint, write_checkpoint
 from trainer.training.image_metrics import prediction_metrics
@@ -34,7 +34,6 @@ from trainer.training.processes import launched_fabric
 from trainer.training.recipe import Recipe
 from trainer.training.training_pairs import Pairs
 
-NETWORK = "network.safetensors"
 EVERY = 500  # steps between checkpoints and between metrics of the held-out pictures
 
 StepReport = Callable[[int, float], None]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,11 +15,12 @@ from trainer.effects import catalogue
 
 pn = pytest.importorskip("panel", reason="panel is not installed: pip install hololoop[studio]")
 
-from trainer.studio.catalogue_view import catalogue_view, effect_words  # noqa: E402
+from trainer.studio.catalogue_view import _CatalogueView, catalogue_view, effect_words  # noqa: E402
 from trainer.studio.formula_svg import formula_svg  # noqa: E402
 
 KNOWN = {name: one for name, one in catalogue().items() if one.source == "built in"}
-SOURCE = "[...Bokeh.documents[0]._all_models.values()].find(m => m.type == 'ColumnDataSource' && 'ideal' in m.data)"
+MODELS = "[...Bokeh.documents[0]._all_models.values()]"
+SOURCE = f"{MODELS}.find(m => m.type == 'ColumnDataSource' && 'difference' in m.data)"
 LARGEST = f"() => Math.max(...Array.from({SOURCE}.data.difference[0], Math.abs))"
 
 
@@ -126,3 +128,22 @@ def test_play_moves_the_slider_until_it_is_paused(page: Any) -> None:
     assert slider.input_value() != before
     page.get_by_role("button", name="Pause").click()
     page.get_by_role("button", name="Play").wait_for()
+
+
+def test_an_effect_that_fails_at_some_values_is_a_sentence_beside_its_sliders(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "from trainer.effects import Panel, Parameter, effect\n\n\n"
+        '@effect(stage="panel", acts_on="display", parameters=[Parameter("depth", "1", scale=0.01)])\n'
+        "def my_depth(panel: Panel, depth) -> Panel:\n"
+        '    """All light is brighter."""\n'
+        "    if float(depth) > 0.09:\n"
+        "        raise ValueError('too deep')\n"
+        "    return panel.multiplied(1 + depth)\n"
+    )
+    view = _CatalogueView(catalogue([file]))
+    view._effect.value = "my_depth"
+    assert 'role="alert"' in view._fault.object and "too deep" in view._fault.object
+    assert "mine.py, line 8" in view._fault.object
+    view._set([0.0])
+    assert view._fault.object == ""

@@ -16,6 +16,7 @@ from typing import Any
 from urllib.error import HTTPError
 from urllib.request import HTTPCookieProcessor, Request, build_opener
 
+import numpy as np
 import pytest
 
 from firmware_iface.virtual import BenchDescription, VirtualHeadset, make_defect
@@ -24,11 +25,36 @@ from trainer.captures.acquire import acquire_captures
 from trainer.captures.open_bench import nominal_bench
 
 pytest.importorskip("panel", reason="the studio needs the extra 'studio'")
+from trainer.studio.gain_tasks import GainPicture, keep
+
 playwright = pytest.importorskip("playwright.sync_api", reason="browser tests need playwright (extra 'dev')")
 
 ROOT = Path(__file__).resolve().parent.parent.parent.parent
 TOKEN = "for-this-test-alone"
 SLOW_MS = 90_000
+HEADSET = """schema = 1
+bundle = "bundle"
+[panel]
+kind = "board"
+bus = "virtual:/nowhere/headset.sock"
+[lasers]
+bus = "virtual:/nowhere/headset.sock"
+power = { green = 0.5 }
+channel = [
+  { name = "green", wavelength_nm = 520.0, full_power_uw = 100.0, threshold_ma = 40.0, slope_uw_per_ma = 4.0 },
+]
+[camera]
+kind = "virtual"
+bus = "virtual:/nowhere/headset.sock"
+"""
+OWN_EFFECT = """from trainer.effects import Panel, Parameter, effect
+
+
+@effect(stage="panel", acts_on="display", parameters=[Parameter("depth", "1", scale=0.01)])
+def my_depth(panel: Panel, depth) -> Panel:
+    \"\"\"All light is brighter.\"\"\"
+    {body}
+"""
 FOCUSED = """() => {
     let one = document.activeElement;
     while (one.shadowRoot) one = one.shadowRoot.activeElement;
@@ -160,6 +186,99 @@ def test_the_whole_way_and_a_second_browser_and_a_reload(browser: Any, studio: S
     assert not page.foreign and not second.foreign
     for one in (page, second):
         one.context.close()
+
+
+def under(page: Any, heading: str, right: float, down: float) -> None:
+    """Click into the plot below a heading, at a place in pixels from the heading's corner."""
+    one = page.get_by_role("heading", name=heading).first
+    one.evaluate("element => element.scrollIntoView({block: 'start'})")
+    page.wait_for_timeout(300)
+    box = one.bounding_box()
+    assert box is not None
+    page.mouse.click(box["x"] + right, box["y"] + box["height"] + down)
+
+
+def test_a_click_on_a_place_or_a_band_lists_the_captures_that_are_worst_there(
+    browser: Any, studio: Studio
+) -> None:
+    page = opened(browser, studio.address)
+    playwright.expect(page.get_by_text("Worst over everything")).to_be_visible()
+    page.wait_for_timeout(500)
+    under(page, "Over the field", 100, 60)
+    playwright.expect(page.get_by_text("Worst around row")).to_be_visible()
+    under(page, "Over spatial frequency", 200, 110)
+    playwright.expect(page.get_by_text("cycles/pixel (click one to see it)")).to_be_visible()
+    worst = page.get_by_role("button").filter(has_text=": ")
+    assert worst.count() >= 1
+    name = worst.first.inner_text().split(":")[0].strip()
+    worst.first.click()
+    playwright.expect(page.get_by_text(f"Capture {name},")).to_be_visible()
+    page.context.close()
+
+
+def test_an_earlier_step_is_compared_with_the_present_model(browser: Any, home: Path, studio: Studio) -> None:
+    page = opened(browser, studio.address)
+    idle(page)
+    ladder = page.locator("svg").filter(has_text="+ zero order")
+    if not ladder.count():
+        button(page, "Add zero_order").click() if button(page, "Add zero_order").count() else button(
+            page, "Explain"
+        ).click()
+        playwright.expect(ladder).to_be_visible()
+        idle(page)
+    button(page, "Compare").click()
+    page.get_by_label("Second model").select_option("step 0")
+    playwright.expect(page.get_by_text("next to step 0")).to_be_visible()
+    playwright.expect(page.get_by_role("heading", name="Measured − the other")).to_be_visible()
+    button(page, "Compare no more").click()
+    playwright.expect(page.get_by_text("next to step 0")).to_have_count(0)
+    page.context.close()
+
+
+def test_a_recorded_gain_is_shown_and_a_headset_that_does_not_answer_is_a_sentence(
+    browser: Any, home: Path, studio: Studio
+) -> None:
+    light = np.random.default_rng(1).random((64, 96)).astype(np.float32)
+    kept = GainPicture("coffee", "green", "a bench of last week", light, light, light, 17.5, 31.25)
+    keep(kept, home / "kept.npz")
+    (home / "headset.toml").write_text(HEADSET)
+    page = opened(browser, studio.address)
+    idle(page)
+    button(page, "Gain").click()
+    where, file = page.get_by_label("Displayed by"), page.get_by_label("virtual:NAME, or a file")
+    where.select_option("recorded: a file that was kept")
+    file.fill(str(home / "kept.npz"))
+    button(page, "Show the gain").click()
+    playwright.expect(page.get_by_text("displayed by a bench of last week")).to_be_visible()
+    playwright.expect(page.get_by_text("31.2 dB")).to_be_visible()
+    where.select_option("a bench or headset, by its name or file")
+    file.fill(str(home / "headset.toml"))
+    button(page, "Show the gain").click()
+    verdict(page, "there is no emulated hardware at virtual:/nowhere/headset.sock")
+    assert "Traceback" not in page.content()
+    page.context.close()
+
+
+def test_a_failing_effect_file_is_a_sentence_in_the_page(browser: Any, home: Path) -> None:
+    file = home / "mine.py"
+    file.write_text(OWN_EFFECT.format(body="return panel.multiplied(1 + depth)"))
+    studio = Studio(home, "leaking", "--effects", "mine.py", "--model", "mine.toml")
+    try:
+        page = opened(browser, studio.address)
+        button(page, "Catalogue").click()
+        chooser = page.get_by_label("Effect", exact=True)
+        chooser.select_option("my_depth")
+        playwright.expect(page.get_by_role("heading", name="my_depth", exact=True)).to_be_visible()
+        file.write_text(OWN_EFFECT.format(body="raise ValueError('no such depth')"))
+        verdict(page, "no such depth")
+        verdict(page, "mine.py, line 7")
+        playwright.expect(chooser).to_be_visible()  # the catalogue stays as it was
+        file.write_text(OWN_EFFECT.format(body="return ("))
+        verdict(page, "mine.py")
+        assert "Traceback" not in page.content()
+        page.context.close()
+    finally:
+        assert studio.end() in (0, 130)
 
 
 def test_work_is_cancelled_and_a_killed_worker_is_a_sentence(browser: Any, studio: Studio) -> None:

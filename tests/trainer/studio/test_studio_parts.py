@@ -32,10 +32,12 @@ from trainer.effects.testing import captures_with
 from trainer.model.model import Model, instance_with
 from trainer.model.model_file import read_model, write_model
 from trainer.model.model_stages import ideal_irradiance
-from trainer.studio import colours, gain_tasks, guess_benches, jobs
+from trainer.report.ladder import ladder_rows, with_network
+from trainer.report.palettes import DIFFERENCE, palette
+from trainer.studio import gain_tasks, guess_benches, jobs
 from trainer.studio.findings_fixes import fix_of
 from trainer.studio.jobs import CANCELLED, ENDED, WorkerProcess, sentence_of
-from trainer.studio.ladder_view import ladder_rows
+from trainer.studio.learned_network import network_of
 from trainer.studio.model_steps import ModelSteps
 from trainer.studio.probe_template import write_effect_of_probe
 from trainer.studio.project import Project
@@ -263,6 +265,7 @@ class Heard:
 @pytest.fixture(scope="module")
 def worker() -> Iterator[WorkerProcess]:
     one = WorkerProcess("test")
+    one.start()
     yield one
     one.close()
 
@@ -324,28 +327,30 @@ def test_a_project_predicts_adds_undoes_and_sees_the_command_line(
     project: Project, captures: CaptureSet
 ) -> None:
     project.open_set(captures.folder)
-    until(lambda: project.errors is not None and project.problems is not None)
-    assert project.errors is not None and project.errors.errors.excess > 0.05
-    assert project.problems == [] or all(p.severity == "warning" for p in project.problems or ())
-    path = project.model_path
+    until(lambda: project.set.errors is not None and project.set.problems is not None)
+    assert project.set.errors is not None and project.set.errors.errors.excess > 0.05
+    assert project.set.problems == [] or all(p.severity == "warning" for p in project.set.problems or ())
+    path = project.set.model_path
     assert path is not None and not path.exists()
     project.add("zero_order")
     assert project.work is not None and project.work.name == "Add zero_order"
-    until(lambda: project.model is not None and project.model.names == ("zero_order",))
-    until(lambda: project.diagnosis is not None)
-    assert project.model is not None
+    until(lambda: project.set.model is not None and project.set.model.names == ("zero_order",))
+    until(lambda: project.results.diagnosis is not None)
+    assert project.set.model is not None
     assert path.is_file()
-    assert project.diagnosis is not None and project.diagnosis.verdict == "complete"
-    until(lambda: project.errors)
-    assert project.errors.errors.excess < 1e-3
-    assert [r["label"] for r in ladder_rows(project.model.history)] == ["ideal model", "+ zero order"]
+    assert project.results.diagnosis is not None and project.results.diagnosis.verdict == "complete"
+    until(lambda: project.set.errors)
+    assert project.set.errors.errors.excess < 1e-3
+    assert [r["label"] for r in ladder_rows(project.set.model.history)] == ["ideal model", "+ zero order"]
     project.undo()
-    assert project.model.names == () and project.can_redo() and read_model(path, catalogue()).names == ()
+    assert (
+        project.set.model.names == () and project.set.can_redo() and read_model(path, catalogue()).names == ()
+    )
     project.redo()
-    assert project.model.names == ("zero_order",)
+    assert project.set.model.names == ("zero_order",)
     write_model(path, read_model(path, catalogue()).without("zero_order"))
     until(lambda: "another program" in project.notice[1])
-    assert project.model.names == ()
+    assert project.set.model.names == ()
 
 
 def test_a_broken_set_is_a_sentence(project: Project, captures: CaptureSet, tmp_path: Path) -> None:
@@ -353,10 +358,10 @@ def test_a_broken_set_is_a_sentence(project: Project, captures: CaptureSet, tmp_
     shutil.copytree(captures.folder, folder)
     (folder / "bench.toml").write_text("[panel\n")
     project.open_set(folder)
-    assert project.captures is None and "bench.toml" in project.set_fault
-    until(lambda: project.problems)
+    assert project.set.captures is None and "bench.toml" in project.set.fault
+    until(lambda: project.set.problems)
     (folder / "bench.toml").write_text((captures.folder / "bench.toml").read_text())
-    until(lambda: project.captures is not None)
+    until(lambda: project.set.captures is not None)
     with pytest.raises(InputError, match="is not a folder"):
         project.open_set(tmp_path / "nowhere")
 
@@ -365,20 +370,20 @@ def test_a_saved_effect_file_takes_part_at_once(
     project: Project, captures: CaptureSet, tmp_path: Path
 ) -> None:
     project.open_set(captures.folder)
-    until(lambda: project.errors)
+    until(lambda: project.set.errors)
     path = write_effect_of_probe("my_stripe", "panel", None, (72, 96), tmp_path, ())
     project.add_effect_file(path)
-    until(lambda: any(r.effect.name == "my_stripe" for r in project.ranking))
-    assert "my_stripe" in project.previews
+    until(lambda: any(r.effect.name == "my_stripe" for r in project.results.ranking))
+    assert "my_stripe" in project.results.previews
     path.write_text(path.read_text() + "\nthis is not Python\n")
-    until(lambda: project.effects_fault)
-    assert str(path) in project.effects_fault and "line" in project.effects_fault
+    until(lambda: project.effects.fault)
+    assert str(path) in project.effects.fault and "line" in project.effects.fault
 
 
 def test_a_full_disk_is_a_sentence_and_the_model_stays(project: Project, captures: CaptureSet) -> None:
     """A limit on the size of files stands for the full disk."""
     project.open_set(captures.folder)
-    until(lambda: project.errors)
+    until(lambda: project.set.errors)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
     try:
@@ -388,10 +393,40 @@ def test_a_full_disk_is_a_sentence_and_the_model_stays(project: Project, capture
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     severity, sentence = project.notice
     assert severity == "error" and "cannot be written" in sentence and "\n" not in sentence
-    assert project.model is not None and project.model.names == ()
-    assert project.model_path is not None and not project.model_path.exists()
+    assert project.set.model is not None and project.set.model.names == ()
+    assert project.set.model_path is not None and not project.set.model_path.exists()
     project.add("zero_order")
-    until(lambda: project.model is not None and project.model.names == ("zero_order",))
+    until(lambda: project.set.model is not None and project.set.model.names == ("zero_order",))
+
+
+def test_a_network_that_is_a_gain_takes_part_and_goes_into_the_bundle(
+    project: Project, tmp_path: Path
+) -> None:
+    uneven = {"log_amplitude": [0.3, 0.2, -0.4, 0.0, -0.4]}
+    captures = captures_with(tmp_path / "uneven", catalogue()["illumination"], uneven, patterns=6)
+    project.open_set(captures.folder)
+    before = until(lambda: project.set.errors).errors.excess
+    project.train_network(60)
+    until(lambda: project.work is None and project.notice[1], 200)
+    network = project.set.network
+    assert network is not None, project.notice
+    assert network.after < network.before == pytest.approx(before, rel=0.02)
+    assert "takes part" in project.notice[1]
+    after = until(lambda: project.set.errors).errors.excess
+    assert after == pytest.approx(network.after, rel=0.02)
+    project.export(tmp_path / "bundle")
+    until(lambda: "The bundle is" in project.notice[1], 120)
+    assert "the network" in project.notice[1]
+    assert list((tmp_path / "bundle").rglob("*.onnx"))
+    assert project.set.model_path is not None
+    again = network_of(project.set.model_path, project.set.model_now, captures.folder.name)
+    assert again == network  # found again when the studio is started anew
+    other = project.set.model_now.having(
+        instance_with(catalogue()["zero_order"], captures.bench, {"leak_real": 0.1})
+    )
+    assert network_of(project.set.model_path, other, captures.folder.name) is None
+    rows = with_network(ladder_rows([{"nrmse": 0.5, "noise_nrmse": 0.1, "excess": before}]), network.after)
+    assert rows[-1]["label"] == "+ network" and rows[-1]["excess"] == network.after
 
 
 # What is gained
@@ -453,16 +488,20 @@ def test_tokens_and_ports() -> None:
 
 
 def test_differences_are_white_at_zero_and_equally_deep_on_both_sides() -> None:
-    palette = [tuple(int(c[k : k + 2], 16) for k in (1, 3, 5)) for c in colours.difference_palette()]
-    assert len(palette) == 255 and min(palette[127]) > 235
-    light = [0.2126 * r + 0.7152 * g + 0.0722 * b for r, g, b in palette]
+    colours = [tuple(int(c[k : k + 2], 16) for k in (1, 3, 5)) for c in palette(DIFFERENCE)]
+    assert len(colours) == 255 and min(colours[127]) > 235
+    light = [0.2126 * r + 0.7152 * g + 0.0722 * b for r, g, b in colours]
     assert all(a < b + 2 for a, b in pairwise(light[:128]))
     assert light[0] == pytest.approx(light[-1], abs=25)
 
 
-def test_a_notebook_shows_the_same_pictures(captures: CaptureSet, tmp_path: Path) -> None:
+def test_a_notebook_shows_the_same_views(captures: CaptureSet, tmp_path: Path) -> None:
     import hololoop
 
     hololoop.compare(captures).view().save(tmp_path / "view.html", resources="inline", title="captures")
     text = (tmp_path / "view.html").read_text(encoding="utf-8")
     assert "\\u2212 predicted" in text or "Measured − predicted" in text
+    assert "Over spatial frequency" in text and "gray level" in text
+    assert len(hololoop.compare(captures).view("failures")) == 1
+    with pytest.raises(InputError, match="there is no view 'ladders'"):
+        hololoop.explain(captures, workers=1).view("ladders")
