@@ -27,8 +27,8 @@ from runtime.lightpath.light_path import (
     image_field,
     panel_phase,
     panel_spectrum,
+    states,
 )
-from runtime.lightpath.modulation import states
 from runtime.program.progress import Progress, no_progress, part_of
 
 SETTLED = 0.3  # a step that lowers chi squared by less, per parameter, is the last

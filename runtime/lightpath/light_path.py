@@ -15,8 +15,8 @@ Arrays are [row, column]; leading axes are batches. The sizes are those of a `Gr
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 from array_api_compat import array_namespace
@@ -32,7 +32,7 @@ from runtime.lightpath.grid import (
     image_frequencies,
     image_window,
 )
-from runtime.lightpath.modulation import Modulation, factor_at, states
+from runtime.lightpath.modulation import Modulation, factor_at
 from runtime.lightpath.periodic_axis import take
 
 Array = Any
@@ -85,6 +85,17 @@ class LightPath:
     irradiance_filter: Array | None = None
     far_field: tuple[Array, Array] | None = None
     modulation: Modulation | None = None
+
+
+def states(path: LightPath) -> Iterator[LightPath]:
+    """The states of a panel during an exposure, each as a light path with one state; their irradiances add."""
+    if path.modulation is None:
+        yield path
+        return
+    ends, factors, shares = path.modulation
+    for k in range(factors.shape[0]):
+        one = (ends, factors[k : k + 1, ...], shares[k : k + 1])
+        yield replace(path, modulation=one, weights=path.weights * shares[k])
 
 
 def panel_phase(path: LightPath, gray: Array) -> Array:

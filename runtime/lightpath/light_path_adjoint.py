@@ -23,10 +23,11 @@ from runtime.lightpath.light_path import (
     panel_field,
     panel_spectrum,
     pixel_area_spectrum,
+    states,
     sub_pixel_offset,
     sum_modes,
 )
-from runtime.lightpath.modulation import factor_at, slope_at, states
+from runtime.lightpath.modulation import factor_at, slope_at
 from runtime.lightpath.periodic_axis import put
 
 Array = Any

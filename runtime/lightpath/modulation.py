@@ -7,28 +7,12 @@ add. Written against the array API.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from array_api_compat import array_namespace
 
-if TYPE_CHECKING:
-    from runtime.lightpath.light_path import LightPath
-
 Array = Any
 Modulation = tuple[Array, Array, Array]
-
-
-def states(path: LightPath) -> Iterator[LightPath]:
-    """The states of a panel during an exposure, each as a light path with one state; their irradiances add."""
-    if path.modulation is None:
-        yield path
-        return
-    ends, factors, shares = path.modulation
-    for k in range(factors.shape[0]):
-        one = (ends, factors[k : k + 1, ...], shares[k : k + 1])
-        yield replace(path, modulation=one, weights=path.weights * shares[k])
 
 
 def factor_at(modulation: Modulation, phase: Array) -> Array:

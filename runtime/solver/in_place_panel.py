@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from runtime.lightpath.light_path import LightPath, nominal_phase
-from runtime.lightpath.modulation import factor_at, slope_at, states
+from runtime.lightpath.light_path import LightPath, nominal_phase, states
+from runtime.lightpath.modulation import factor_at, slope_at
 from runtime.solver.array_backend import Backend
 from runtime.solver.in_place_crosstalk import Crosstalk
 from runtime.solver.iris_band import Band, Run

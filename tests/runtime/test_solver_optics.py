@@ -15,9 +15,9 @@ from runtime.lightpath.light_path import (
     mode_irradiance,
     panel_spectrum,
     pixel_irradiance,
+    states,
 )
 from runtime.lightpath.light_path_adjoint import irradiance_and_pullback, pixel_irradiance_adjoint
-from runtime.lightpath.modulation import states
 from runtime.solver.array_backend import Backend, backend
 from runtime.solver.in_place_path import Optics
 from tests.runtime.benches import converted, ideal_path, random_path, torch_path

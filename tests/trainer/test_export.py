@@ -27,7 +27,17 @@ from trainer.model.model_stages import scene_for, stages_for
 from trainer.networks.approximator import write_approximator
 from trainer.prediction.predict import light_path
 
-CAMERA = ("sensor_blur", "misregistration", "vignetting", "stray_light", "sensor_response", "laser_drift")
+CAMERA = (
+    "sensor_blur",
+    "misregistration",
+    "vignetting",
+    "stray_light",
+    "sensor_response",
+    "laser_drift",
+    "vibration",
+    "frame_motion",
+    "fixed_pattern",
+)
 
 
 def every_effect(colours: bool = False) -> tuple[EffectInstance, ...]:

@@ -87,6 +87,9 @@ def assert_same(a: Model, b: Model) -> None:
     assert (a.bench, a.gain, a.method, a.history, a.names) == (b.bench, b.gain, b.method, b.history, b.names)
     for one, other in zip(a.present, b.present, strict=True):
         assert one.order == other.order
+        assert (one.nodes is None) == (other.nodes is None)
+        if one.nodes is not None:
+            np.testing.assert_array_equal(one.nodes, other.nodes)
         for first, second in ((one.values, other.values), (one.errors, other.errors)):
             assert (first is None) == (second is None)
             for name, array in (first or {}).items():
@@ -102,12 +105,49 @@ def test_a_model_of_every_effect_comes_back_exactly(tmp_path: Path, names: tuple
     path = tmp_path / "model.toml"
     write_model(path, model, {"written_by": "a test", "captures": 12})
     assert_same(model, read_model(path, KNOWN, model.bench))
-    assert [p.name for p in tmp_path.iterdir()] == ["model.toml"]
+    # Only what is a number a pixel, or a free-form map, is too long for the text.
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["model.safetensors", "model.toml"]
     assert tomllib.loads(path.read_text(encoding="utf-8"))["about"] == {
         "written_by": "a test",
         "captures": 12,
     }
     assert max(map(len, path.read_text(encoding="utf-8").splitlines())) <= 120
+
+
+def with_map(nodes: np.ndarray) -> Model:
+    on = bench()
+    effect = catalogue()["panel_wavefront"]
+    return Model(on, (replace(absent(effect, on), nodes=nodes),))
+
+
+def test_a_free_form_map_comes_back_and_the_text_tells_of_it(tmp_path: Path) -> None:
+    model = with_map(np.random.default_rng(0).normal(size=(7, 9)))
+    write_model(tmp_path / "m.toml", model)
+    assert_same(model, read_model(tmp_path / "m.toml", KNOWN))
+    assert "7 x 9 nodes of a bicubic spline, in rad" in (tmp_path / "m.toml").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [("3.0", "write { array = ... }"), ('{ array = "gone" }', "gone"), (None, "at least 4 x 4 finite")],
+)
+def test_a_map_that_is_none_is_refused(tmp_path: Path, given: str | None, message: str) -> None:
+    path = tmp_path / "m.toml"
+    write_model(path, with_map(np.zeros((7, 9)) if given else np.full((7, 9), np.nan)))
+    if given:
+        text = path.read_text(encoding="utf-8")
+        path.write_text(text.replace('{ array = "panel_wavefront.map" }', given), encoding="utf-8")
+    with pytest.raises(InputError, match=re.escape(message)):
+        read_model(path, KNOWN)
+
+
+def test_an_effect_without_a_map_takes_none(tmp_path: Path) -> None:
+    path = tmp_path / "m.toml"
+    write_model(path, Model(bench(), (absent(catalogue()["distance"], bench()),)))
+    text = path.read_text(encoding="utf-8").replace("order = 0\n", 'order = 0\nmap = { array = "x" }\n', 1)
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match="this effect has no map"):
+        read_model(path, KNOWN)
 
 
 def test_an_empty_model_comes_back(tmp_path: Path) -> None:

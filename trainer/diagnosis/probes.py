@@ -18,8 +18,7 @@ from torch import Tensor
 
 from runtime.excess import PredictionErrors, RemovedExcess, joined, removed_excess
 from runtime.lightpath.legendre import legendre_count, legendre_curve, legendre_surface
-from runtime.lightpath.light_path import mode_irradiance, panel_phase, panel_spectrum
-from runtime.lightpath.modulation import states
+from runtime.lightpath.light_path import mode_irradiance, panel_phase, panel_spectrum, states
 from trainer.captures.batches import Batch, load, load_batch
 from trainer.captures.capture_set import chosen, opened
 from trainer.captures.held_out import with_stopping

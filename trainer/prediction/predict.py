@@ -24,8 +24,8 @@ from runtime.camera.sampling import (
 )
 from runtime.lightpath.fft import rfft2
 from runtime.lightpath.grid import FINE
-from runtime.lightpath.light_path import LightPath, mode_irradiance, panel_phase, panel_spectrum
-from runtime.lightpath.modulation import Modulation, states
+from runtime.lightpath.light_path import LightPath, mode_irradiance, panel_phase, panel_spectrum, states
+from runtime.lightpath.modulation import Modulation
 from runtime.lightpath.propagation import (
     band_limit,
     far_field_matrix,
