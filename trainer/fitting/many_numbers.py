@@ -24,9 +24,9 @@ from trainer.model.model_stages import stages_of
 from trainer.prediction.predict import Trace, counts, light_on_camera, trace
 
 MANY = 100  # numbers of an effect from which on it is fitted without a table of its derivatives
-PASSES = 14  # most products with the table and its transpose, for one step
-CLOSE = 0.03  # share of the gradient that a step may leave
-SIGNS = 6  # random directions from which the errors of the numbers are estimated
+PASSES = 10  # most products with the table and its transpose, for one step
+CLOSE = 0.1  # share of the gradient that a step may leave
+SIGNS = 3  # random directions from which the errors of the numbers are estimated
 
 Vector = NDArray[np.float64]
 
@@ -74,9 +74,7 @@ class ManySlopes:
         self._normal = sum((o @ o.T).double() for o in others)
         self._normal += 1e-9 * torch.diag(torch.diagonal(self._normal)) + 1e-30 * torch.eye(len(self._normal))
         with torch.no_grad():
-            self._base = [
-                q.counts(model, q.light(model, t)) for q, t in zip(predictors, points, strict=True)
-            ]
+            self._base = [q.counts(model, q.light(model, t)) for q, t in zip(predictors, points, strict=True)]
 
     def moved(self, change: Vector, held: bool = True) -> Model:
         """The model with its numbers changed, in units of their scales; `held` within their physical range."""

@@ -1,0 +1,134 @@
+"""Sparse shapes in a probe's map: dust and dead pixels, each with its place and its size."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.ndimage import label, uniform_filter
+
+from trainer.diagnosis.proposals.probe_maps import TRANSMISSION, ProbeMap
+from trainer.diagnosis.proposals.reading import Array, Number, Reading, Values, share_explained
+from trainer.formatting import number
+
+ABOVE = 6.0  # of the map's noise: what is a blob
+MOST_BLOBS = 120
+MOST_AREA = 0.2  # share of a map that blobs may cover: more is no sparse shape
+LEAST_RADIUS = 0.4  # of a node's distance: a dead pixel is a disc of 0.56
+LEAST_STRENGTH = 0.08  # of the middle blob: weaker ones are the descent's own
+
+
+def blobs_in(one: ProbeMap, own: bool = False) -> list[Reading]:
+    """The discs of a map.
+
+    Parameters
+    ----------
+    one : ProbeMap
+        Complex, or of a camera's gain.
+    own : bool
+        Each disc has its own transmission; otherwise all have the same.
+    """
+    found = _found(one)
+    if found is None:
+        return []
+    rows, columns, radii, inside = found
+    count = len(rows)
+    y, x = one.grid
+    shape = np.ones(one.values.shape, dtype=one.values.dtype)
+    for k in range(count):
+        covered = np.clip(radii[k] + 0.5 - np.hypot(y - rows[k], x - columns[k]), 0, 1)
+        shape = shape * (1 + covered * (inside - 1))
+    shape = shape - 1
+    is_complex = one.place is TRANSMISSION
+    spread = one.place.spread
+    places = (
+        Number("row", spread, 0.2, tuple(rows), 0.0, -1e4, 1e4, "of each disc's centre, from the middle"),
+        Number(
+            "column", spread, 0.2, tuple(columns), 0.0, -1e4, 1e4, "of each disc's centre, from the middle"
+        ),
+        Number("radius", spread, 0.2, tuple(radii), 1.0, 0.2, 1e3, "of each disc"),
+    )
+
+    def of_each(value: float) -> float | tuple[float, ...]:
+        return (float(value),) * count if own else float(value)
+
+    whose = "of each disc" if own else "of the discs"
+    if is_complex:
+        passed = (
+            Number("real", "1", 0.05, of_each(inside.real), 1.0, -2.0, 2.0, f"part of what passes {whose}"),
+            Number(
+                "imaginary", "1", 0.05, of_each(inside.imag), 0.0, -2.0, 2.0, f"part of what passes {whose}"
+            ),
+        )
+        line = "    inside = torch.complex(real, imaginary)"
+    else:
+        passed = (Number("passed", "1", 0.05, of_each(inside.real), 1.0, 0.0, 10.0, f"light {whose}"),)
+        line = "    inside = passed"
+
+    def described(values: Values) -> str:
+        radius = (
+            f"radius {number(float(np.min(values['radius'])))} to {number(float(np.max(values['radius'])))}"
+        )
+        if not is_complex:
+            return f"{count} specks of {radius} {spread} that pass {number(float(np.mean(values['passed'])))} of the light"
+        factor = complex(np.mean(values["real"]), np.mean(values["imaginary"]))
+        turn = number(math.degrees(np.angle(factor)))
+        return f"{count} specks of {radius} {spread} that pass {number(abs(factor))} of the amplitude, turned by {turn} deg"
+
+    return [
+        Reading(
+            name="specks_of_their_own" if own else "specks",
+            about="Specks: small discs that absorb and delay.",
+            describe=described,
+            formula=r"v = \prod_k \left[1 + c_k(y, x)\,(\tau"
+            + ("_k" if own else "")
+            + r" - 1)\right] - 1,\quad c_k = \mathrm{clip}\left(r_k + \tfrac12 - "
+            r"\sqrt{(y-y_k)^2 + (x-x_k)^2},\,0,\,1\right)",
+            numbers=(*places, *passed),
+            code=(line, "    value = discs(y, x, row, column, radius, inside) - 1"),
+            found=shape,
+            explained=share_explained(one.values, shape),
+            imports=("from trainer.effects import discs",),
+        )
+    ]
+
+
+def _found(one: ProbeMap) -> tuple[list[float], list[float], list[float], complex] | None:
+    """Rows, columns and radii of the blobs, and what passes them; None where the map is not sparse."""
+    strength = np.abs(uniform_filter(one.values.real, 3) + 1j * uniform_filter(one.values.imag, 3))
+    noise = float(np.median(strength)) / 0.8  # of a map that is noise nearly everywhere
+    if noise <= 0:
+        return None
+    above = strength > ABOVE * noise
+    if not above.any() or above.mean() > MOST_AREA:
+        return None
+    marked, count = label(above)
+    if count > 4 * MOST_BLOBS:
+        return None
+    y, x = one.grid
+    steps = [2 * r / (n - 1) for r, n in zip(one.reach, one.values.shape, strict=True)]
+    cores = [(strength * (marked == k)).max() for k in range(1, count + 1)]
+    order = [k + 1 for k in np.argsort(cores)[::-1][:MOST_BLOBS]]
+    deep = one.values[strength > 0.7 * np.max(cores)]
+    inside = 1 + complex(deep.mean())
+    full = abs(inside - 1)
+    rows, columns, radii = [], [], []
+    for k in order:
+        near = _grown(marked == k)
+        weight = np.abs(one.values) * near
+        weight = np.maximum(weight - 2 * noise, 0)
+        mass = float(weight.sum())
+        if mass <= 0 or cores[k - 1] < LEAST_STRENGTH * full:
+            continue
+        radius = math.sqrt(mass * steps[0] * steps[1] / (math.pi * full))
+        if radius < LEAST_RADIUS * steps[0]:
+            continue
+        rows.append(float((weight * y).sum() / mass))
+        columns.append(float((weight * x).sum() / mass))
+        radii.append(radius)
+    return (rows, columns, radii, inside) if rows else None
+
+
+def _grown(mark: Array) -> Array:
+    """A mark and its neighbours: a blob's rim is below the noise's multiple."""
+    return np.asarray(uniform_filter(mark.astype(np.float64), 3) > 1e-6)
