@@ -71,8 +71,8 @@ class ManySlopes:
             for p in model.instance(n).effect.parameters
         ]
         self.scales: Vector = np.concatenate([np.full(int(np.prod(s)), c) for _, _, s, c in self._parts])
-        self._normal = sum((o @ o.T).double() for o in others)
-        self._normal += 1e-9 * torch.diag(torch.diagonal(self._normal)) + 1e-30 * torch.eye(len(self._normal))
+        normal = torch.stack([(o @ o.T).double() for o in others]).sum(0)
+        self._normal = normal + 1e-9 * torch.diag(torch.diagonal(normal)) + 1e-30 * torch.eye(len(normal))
         with torch.no_grad():
             self._base = [q.counts(model, q.light(model, t)) for q, t in zip(predictors, points, strict=True)]
 
@@ -122,8 +122,8 @@ class ManySlopes:
 
     def explained(self, rows: Sequence[Tensor]) -> Tensor:
         """Least-squares coefficients [n] of the other derivatives, for rows [pixels]."""
-        right = sum((o @ r).double() for o, r in zip(self.others, rows, strict=True))
-        return torch.linalg.solve(self._normal, right)
+        right = [(o @ r).double() for o, r in zip(self.others, rows, strict=True)]
+        return torch.linalg.solve(self._normal, torch.stack(right).sum(0))
 
     def step(self, residuals: Sequence[Tensor]) -> Vector:
         """Change of the numbers, in units of their scales, that leaves least of the residuals.

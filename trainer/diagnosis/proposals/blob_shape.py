@@ -53,6 +53,7 @@ def blobs_in(one: ProbeMap, own: bool = False) -> list[Reading]:
         return (float(value),) * count if own else float(value)
 
     whose = "of each disc" if own else "of the discs"
+    passed: tuple[Number, ...]
     if is_complex:
         passed = (
             Number("real", "1", 0.05, of_each(inside.real), 1.0, -2.0, 2.0, f"part of what passes {whose}"),
@@ -70,10 +71,12 @@ def blobs_in(one: ProbeMap, own: bool = False) -> list[Reading]:
             f"radius {number(float(np.min(values['radius'])))} to {number(float(np.max(values['radius'])))}"
         )
         if not is_complex:
-            return f"{count} specks of {radius} {spread} that pass {number(float(np.mean(values['passed'])))} of the light"
+            passed_light = number(float(np.mean(values["passed"])))
+            return f"{count} specks of {radius} {spread} that pass {passed_light} of the light"
         factor = complex(np.mean(values["real"]), np.mean(values["imaginary"]))
         turn = number(math.degrees(np.angle(factor)))
-        return f"{count} specks of {radius} {spread} that pass {number(abs(factor))} of the amplitude, turned by {turn} deg"
+        size = number(abs(factor))
+        return f"{count} specks of {radius} {spread} that pass {size} of the amplitude, turned by {turn} deg"
 
     return [
         Reading(

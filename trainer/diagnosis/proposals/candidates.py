@@ -100,4 +100,4 @@ def _readers(place: Place) -> tuple[Read, ...]:
 
 def _multiplied(reading: Reading) -> bool:
     """Whether the shape times a surface is another shape; a surface's own product is one again."""
-    return reading.name not in ("surface", "specks", "rings") and reading.explained > LEAST
+    return reading.name not in ("surface", "specks", "radial") and reading.explained > LEAST

@@ -130,8 +130,8 @@ class Proposals:
     def as_json(self) -> dict[str, Any]:
         """The object that `propose --json` prints.
 
-        Keys `proposals` and `verdict`, and `sentence`, `heldout` and `left`. `verdict` is that of the given model, `heldout` its errors; `left` the errors and the verdict with the accepted
-        proposals.
+        Keys `proposals` and `verdict`, and `sentence`, `heldout` and `left`. `verdict` is that of the given model,
+        `heldout` its errors; `left` are the errors and the verdict with the accepted proposals.
         """
         left = self.left or self.diagnosis.held_out
         return {

@@ -66,10 +66,10 @@ def radial_in(one: ProbeMap) -> list[Reading]:
     far = 2 * one.radius
     return [
         Reading(
-            name="rings",
+            name="radial",
             about="A function of the distance from a centre.",
             describe=lambda v: (
-                f"rings about row {number(float(v['row']))}, column {number(float(v['column']))} {spread} from the "
+                f"a function of the distance from row {number(float(v['row']))}, column {number(float(v['column']))} {spread} from the "
                 f"middle, terms of {with_unit(float(np.hypot.reduce(v['terms'])), unit)} in all"
             ),
             formula=r"v = \sum_{k=1}^{4} a_k \rho^{2k},\quad \rho^2 = \frac{(y-y_0)^2 + (x-x_0)^2}{R^2}",
