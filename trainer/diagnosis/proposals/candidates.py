@@ -64,7 +64,7 @@ def candidates_of(
         Standard deviation of the measured signal.
     """
     report = progress or no_progress
-    maps = [m for found in probes for m in maps_of(found, bench, signal)]
+    maps = _maps(probes, bench, signal)
     found: list[Candidate] = []
     for k, one in enumerate(maps):
         report(k / len(maps), f"looking at the {one.place.stage} probe")
@@ -83,8 +83,13 @@ def refinements_of(
     """Shapes of the same kind with more freedom, for the probes by which the candidate was found."""
     if best.reading.name != "specks":
         return []
-    maps = [m for found in probes for m in maps_of(found, bench, signal) if m.place is best.place]
+    maps = [m for m in _maps(probes, bench, signal) if m.place is best.place]
     return [Candidate(best.place, r, best.worth) for m in maps for r in blobs_in(m, own=True)]
+
+
+def _maps(probes: Sequence[ProbeResult], bench: Bench, signal: float) -> list[ProbeMap]:
+    shapes = {p.stage: bench.camera.shape if p.stage == "sensor" else bench.panel.shape for p in probes}
+    return [m for p in probes for m in maps_of(p, shapes[p.stage], signal)]
 
 
 def _readers(place: Place) -> tuple[Read, ...]:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from trainer.captures.bench_file import Bench
 from trainer.diagnosis.probes import PUPIL_EXTENT, ProbeResult
 
 PANEL_PLACES = (
@@ -203,17 +202,18 @@ class ProbeMap:
         return tuple(self.values.shape) == self.shape
 
 
-def maps_of(found: ProbeResult, bench: Bench, signal: float) -> list[ProbeMap]:
+def maps_of(found: ProbeResult, shape: tuple[int, int], signal: float = 1.0) -> list[ProbeMap]:
     """The maps of a probe that an effect could replace, each with its weight.
 
     Parameters
     ----------
     found : ProbeResult
-    bench : Bench
+    shape : (int, int), pixels
+        Of the camera for the sensor's probe, of the panel otherwise.
     signal : float, counts
         Standard deviation of the measured signal, against which added counts are weighed.
     """
-    maps = [m for place in PLACES if place.stage == found.stage for m in _maps_at(place, found, bench)]
+    maps = [m for place in PLACES if place.stage == found.stage for m in _maps_at(place, found, shape)]
     powers = [
         float((np.abs(m.values - m.values.mean()) ** 2).mean())
         / (signal**2 if m.place.unit == "counts" else 1.0)
@@ -238,7 +238,7 @@ def _transmission(maps: Sequence[ProbeMap], removed: float) -> list[ProbeMap]:
     return [ProbeMap(TRANSMISSION, values, amplitude.shape, amplitude.reach, removed)]
 
 
-def _maps_at(place: Place, found: ProbeResult, bench: Bench) -> list[ProbeMap]:
+def _maps_at(place: Place, found: ProbeResult, shape: tuple[int, int]) -> list[ProbeMap]:
     arrays = [
         np.asarray(values, dtype=np.float64)
         for title, values, _ in found.pictures
@@ -250,20 +250,16 @@ def _maps_at(place: Place, found: ProbeResult, bench: Bench) -> list[ProbeMap]:
         return [ProbeMap(place, np.mean([a.reshape(-1) for a in arrays], axis=0), (0, 0), (0.0, 0.0))]
     values = arrays[0]
     middle = float(np.median(values))
-    if place in (AMPLITUDE, GAIN, PASSED):
+    if place is PASSED:
+        values = values - 1
+    elif place in (AMPLITUDE, GAIN):
         values = values / middle - 1 if middle > 0 else values * 0
     else:
         values = values - middle
     if place.spread == "pixels":
-        shape = bench.camera.shape if place.stage == "sensor" else bench.panel.shape
         # The maps' corners are the corner pixels' centres.
         return [ProbeMap(place, values, shape, ((shape[0] - 1) / 2, (shape[1] - 1) / 2))]
-    extent = PUPIL_EXTENT
-    inside = _inside_band(values, extent)
-    return [ProbeMap(place, inside, (0, 0), (1.0, 1.0))]
-
-
-def _inside_band(values: NDArray[np.float64], extent: float) -> NDArray[np.float64]:
-    """The part of a pupil's map within the panel's band."""
-    keep = [round((n - 1) / 2 * (1 - 1 / extent)) for n in values.shape]
-    return values[keep[0] : values.shape[0] - keep[0], keep[1] : values.shape[1] - keep[1]]
+    outside = [round((n - 1) / 2 * (1 - 1 / PUPIL_EXTENT)) for n in values.shape]
+    rows, columns = (slice(k, n - k) for k, n in zip(outside, values.shape, strict=True))
+    reach = [PUPIL_EXTENT * (1 - 2 * k / (n - 1)) for k, n in zip(outside, values.shape, strict=True)]
+    return [ProbeMap(place, values[rows, columns], (0, 0), (reach[0], reach[1]))]

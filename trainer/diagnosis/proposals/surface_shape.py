@@ -69,8 +69,9 @@ def radial_in(one: ProbeMap) -> list[Reading]:
             name="radial",
             about="A function of the distance from a centre.",
             describe=lambda v: (
-                f"a function of the distance from row {number(float(v['row']))}, column {number(float(v['column']))} {spread} from the "
-                f"middle, terms of {with_unit(float(np.hypot.reduce(v['terms'])), unit)} in all"
+                f"a function of the distance from row {number(float(v['row']))}, column "
+                f"{number(float(v['column']))} {spread} from the middle, terms of "
+                f"{with_unit(float(np.hypot.reduce(v['terms'])), unit)} in all"
             ),
             formula=r"v = \sum_{k=1}^{4} a_k \rho^{2k},\quad \rho^2 = \frac{(y-y_0)^2 + (x-x_0)^2}{R^2}",
             numbers=(

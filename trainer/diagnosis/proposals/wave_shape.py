@@ -112,13 +112,15 @@ def _reading(one: ProbeMap, seen: tuple[float, ...], shape: Array) -> Reading:
 def waves_in_gray(one: ProbeMap) -> list[Reading]:
     """A ripple over the gray levels."""
     level = np.linspace(0, 1, one.values.size)
-    values = one.values - np.polynomial.Polynomial.fit(level, one.values, 2)(level)
+    smooth = np.stack([level**k for k in range(3)], axis=1)  # what phase_response describes
     tried = []
-    for cycles in np.arange(1.5, one.values.size / 3, 0.05):
-        angle = 2 * math.pi * cycles * level
+    for cycles in np.arange(SLOWEST, one.values.size / 3, 0.05):
+        angle = 2 * math.pi * cycles * (level - 0.5)
         basis = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        terms = np.linalg.lstsq(basis, values, rcond=None)[0]
-        tried.append((float(((values - basis @ terms) ** 2).sum()), cycles, terms, basis @ terms))
+        whole = np.concatenate([basis, smooth], axis=1)
+        terms = np.linalg.lstsq(whole, one.values, rcond=None)[0]
+        left = float(((one.values - whole @ terms) ** 2).sum())
+        tried.append((left, cycles, terms[:2], basis @ terms[:2]))
     if not tried:
         return []
     _, cycles, terms, shape = min(tried, key=lambda t: t[0])
@@ -132,12 +134,14 @@ def waves_in_gray(one: ProbeMap) -> list[Reading]:
             name="ripple",
             about="A ripple over the gray levels, as a look-up table's steps make it.",
             describe=described,
-            formula=r"v = a\cos 2\pi n g + b\sin 2\pi n g",
+            formula=r"v = a\cos 2\pi n (g - \tfrac12) + b\sin 2\pi n (g - \tfrac12)",
             numbers=(
                 Number(
-                    "cosine", "rad", 0.02, float(terms[0]), 0.0, -3.0, 3.0, "part that is even about gray 0"
+                    "cosine", "rad", 0.02, float(terms[0]), 0.0, -3.0, 3.0, "part that is even about mid-gray"
                 ),
-                Number("sine", "rad", 0.02, float(terms[1]), 0.0, -3.0, 3.0, "part that is odd about gray 0"),
+                Number(
+                    "sine", "rad", 0.02, float(terms[1]), 0.0, -3.0, 3.0, "part that is odd about mid-gray"
+                ),
                 Number(
                     "cycles",
                     "1",
@@ -150,7 +154,7 @@ def waves_in_gray(one: ProbeMap) -> list[Reading]:
                 ),
             ),
             code=(
-                "    phase = 2 * math.pi * cycles * level",
+                "    phase = 2 * math.pi * cycles * (level - 0.5)",
                 "    value = cosine * torch.cos(phase) + sine * torch.sin(phase)",
             ),
             found=shape,
