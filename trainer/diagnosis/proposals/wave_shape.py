@@ -127,7 +127,7 @@ def waves_in_gray(one: ProbeMap) -> list[Reading]:
 
     def described(values: Values) -> str:
         amplitude = math.hypot(values["cosine"], values["sine"])
-        return f"a ripple of {number(amplitude)} rad, {number(values['cycles'])} cycles over the gray levels"
+        return f"a ripple of amplitude {number(amplitude)} rad, {number(values['cycles'])} cycles over the gray levels"
 
     return [
         Reading(
@@ -187,7 +187,8 @@ def _refined(
     y, x, values = few
 
     def left(p: Array) -> Array:
-        return values - _wave(tuple(p), y, x, values, radius)[2]
+        rest = values - _wave(tuple(p), y, x, values, radius)[2]
+        return rest - rest.mean()
 
     tried = [
         (float((left(np.array([*start, chirp, bend])) ** 2).sum()), chirp, bend)
@@ -207,14 +208,15 @@ def _refined(
 def _wave(
     p: tuple[float, ...], y: Array, x: Array, values: Array, radius: float
 ) -> tuple[float, float, Array]:
-    """Cosine, sine, and the wave that explains most of some values."""
+    """Cosine, sine, and the wave that with a constant explains most of some values."""
     fy, fx, chirp, bend = p
     size = math.hypot(fy, fx) or 1e-12
     t, s = (x * fx + y * fy) / size, (y * fx - x * fy) / size
     phase = 2 * math.pi * size * (t + (chirp * t**2 + bend * s**2) / (2 * radius))
     c, d = np.cos(phase), np.sin(phase)
-    cc, dd, cd = float((c * c).sum()), float((d * d).sum()), float((c * d).sum())
-    right = float((c * values).sum()), float((d * values).sum())
+    a, b = c - c.mean(), d - d.mean()
+    cc, dd, cd = float((a * a).sum()), float((b * b).sum()), float((a * b).sum())
+    right = float((a * values).sum()), float((b * values).sum())
     both = cc * dd - cd**2 or 1e-30
     cosine, sine = (right[0] * dd - right[1] * cd) / both, (right[1] * cc - right[0] * cd) / both
     return cosine, sine, cosine * c + sine * d
