@@ -13,9 +13,13 @@ from trainer.formatting import number
 
 ABOVE = 6.0  # of the map's noise: what is a blob
 MOST_BLOBS = 120
+APART = 1.0  # pixels between a disc that is fitted and a further one
 MOST_AREA = 0.2  # share of a map that blobs may cover: more is no sparse shape
 LEAST_RADIUS = 0.4  # of a node's distance: a dead pixel is a disc of 0.56
 LEAST_STRENGTH = 0.08  # of the middle blob: weaker ones are the descent's own
+
+
+Found = tuple[list[float], list[float], list[float], complex]  # rows, columns, radii, what passes
 
 
 def blobs_in(one: ProbeMap, own: bool = False) -> list[Reading]:
@@ -29,8 +33,37 @@ def blobs_in(one: ProbeMap, own: bool = False) -> list[Reading]:
         Each disc has its own transmission; otherwise all have the same.
     """
     found = _found(one)
-    if found is None:
+    return [] if found is None else [_reading(one, found, own)]
+
+
+def more_blobs_in(one: ProbeMap, values: Values) -> list[Reading]:
+    """The discs that were fitted, and those that the map of what is left shows beside them.
+
+    Parameters
+    ----------
+    one : ProbeMap
+        Of a probe that was fitted with the discs in the model.
+    values : mapping
+        The fitted discs': `row`, `column`, `radius`, and `real` and `imaginary` or `passed`.
+    """
+    names = ("passed",) if "passed" in values else ("real", "imaginary")
+    inside = complex(*(float(np.mean(values[n])) for n in names))
+    found = _found(one, inside)
+    rows, columns, radii = (np.asarray(values[n], dtype=float) for n in ("row", "column", "radius"))
+    fresh = []
+    for row, column, radius, *_ in zip(*found[:3], strict=True) if found else ():
+        if (np.hypot(rows - row, columns - column) > radii + radius + APART).all():
+            fresh.append((row, column, radius))
+    if not fresh:
         return []
+    together = [
+        [*known.tolist(), *new]
+        for known, new in zip((rows, columns, radii), zip(*fresh, strict=True), strict=True)
+    ]
+    return [_reading(one, (together[0], together[1], together[2], inside), False)]
+
+
+def _reading(one: ProbeMap, found: Found, own: bool) -> Reading:
     rows, columns, radii, inside = found
     count = len(rows)
     y, x = one.grid
@@ -78,26 +111,24 @@ def blobs_in(one: ProbeMap, own: bool = False) -> list[Reading]:
         size = number(abs(factor))
         return f"{count} specks of {radius} {spread} that pass {size} of the amplitude, turned by {turn} deg"
 
-    return [
-        Reading(
-            name="specks_of_their_own" if own else "specks",
-            about="Specks: small discs that absorb and delay.",
-            describe=described,
-            formula=r"v = \prod_k \left[1 + c_k(y, x)\,(\tau"
-            + ("_k" if own else "")
-            + r" - 1)\right] - 1,\quad c_k = \mathrm{clip}\left(r_k + \tfrac12 - "
-            r"\sqrt{(y-y_k)^2 + (x-x_k)^2},\,0,\,1\right)",
-            numbers=(*places, *passed),
-            code=(line, "    value = discs(y, x, row, column, radius, inside) - 1"),
-            found=shape,
-            explained=share_explained(one.values, shape),
-            imports=("from trainer.effects import discs",),
-        )
-    ]
+    return Reading(
+        name="specks_of_their_own" if own else "specks",
+        about="Specks: small discs that absorb and delay.",
+        describe=described,
+        formula=r"v = \prod_k \left[1 + c_k(y, x)\,(\tau"
+        + ("_k" if own else "")
+        + r" - 1)\right] - 1,\quad c_k = \mathrm{clip}\left(r_k + \tfrac12 - "
+        r"\sqrt{(y-y_k)^2 + (x-x_k)^2},\,0,\,1\right)",
+        numbers=(*places, *passed),
+        code=(line, "    value = discs(y, x, row, column, radius, inside) - 1"),
+        found=shape,
+        explained=share_explained(one.values, shape),
+        imports=("from trainer.effects import discs",),
+    )
 
 
-def _found(one: ProbeMap) -> tuple[list[float], list[float], list[float], complex] | None:
-    """Rows, columns and radii of the blobs, and what passes them; None where the map is not sparse."""
+def _found(one: ProbeMap, known: complex | None = None) -> Found | None:
+    """The blobs, of which what passes may be `known`; None where the map is not sparse."""
     strength = np.abs(uniform_filter(one.values.real, 3) + 1j * uniform_filter(one.values.imag, 3))
     noise = float(np.median(strength)) / 0.8  # of a map that is noise nearly everywhere
     if noise <= 0:
@@ -113,7 +144,7 @@ def _found(one: ProbeMap) -> tuple[list[float], list[float], list[float], comple
     cores = [(strength * (marked == k)).max() for k in range(1, count + 1)]
     order = [k + 1 for k in np.argsort(cores)[::-1][:MOST_BLOBS]]
     deep = one.values[strength > 0.7 * np.max(cores)]
-    inside = 1 + complex(deep.mean())
+    inside = 1 + complex(deep.mean()) if known is None else known
     full = abs(inside - 1)
     rows, columns, radii = [], [], []
     for k in order:

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from runtime.program.progress import Progress, no_progress
 from trainer.captures.bench_file import Bench
 from trainer.diagnosis.probes import ProbeResult
-from trainer.diagnosis.proposals.blob_shape import blobs_in
+from trainer.diagnosis.proposals.blob_shape import blobs_in, more_blobs_in
 from trainer.diagnosis.proposals.gray_shape import steps_in_gray
 from trainer.diagnosis.proposals.probe_maps import GAIN, GRAY, TRANSMISSION, Place, ProbeMap, maps_of
-from trainer.diagnosis.proposals.reading import Reading
+from trainer.diagnosis.proposals.reading import Reading, Values
 from trainer.diagnosis.proposals.row_column_shape import rows_and_columns_in
 from trainer.diagnosis.proposals.surface_shape import radial_in, smooth_in, times_surface
 from trainer.diagnosis.proposals.wave_shape import waves_in, waves_in_gray
@@ -85,6 +85,13 @@ def refinements_of(
         return []
     maps = [m for m in _maps(probes, bench, signal) if m.place is best.place]
     return [Candidate(best.place, r, best.worth) for m in maps for r in blobs_in(m, own=True)]
+
+
+def more_of(candidate: Candidate, probe: ProbeResult, bench: Bench, values: Values) -> Candidate | None:
+    """The candidate's fitted specks and those that a probe of what is left shows, if it shows any."""
+    maps = [m for m in _maps([probe], bench, 1.0) if m.place is candidate.place]
+    found = [r for m in maps for r in more_blobs_in(m, values)]
+    return Candidate(candidate.place, found[0], candidate.worth) if found else None
 
 
 def _maps(probes: Sequence[ProbeResult], bench: Bench, signal: float) -> list[ProbeMap]:
