@@ -20,6 +20,7 @@ from trainer.model.model import Model
 
 ROUNDS = 4  # most proposals that are used together
 MOST = 6  # files
+SMALL_PART = 0.1  # of the excess: a named effect that explains less than this does not name what is missing
 
 
 @dataclass(frozen=True)
@@ -50,13 +51,13 @@ class Proposals:
         accepted = [p for p in self.proposals if p.worth_adding]
         if found.verdict == "complete":
             return f"{found.sentence} Nothing needs to be proposed."
-        if found.verdict == "missing":
-            assert found.best is not None
+        if found.best is not None and not has_no_name(found):
             return f"{found.sentence} Add {found.best.effect.name} first; then look at what has no name."
         if not accepted or self.left is None:
             if below_the_noise(found.held_out):
                 return found.sentence
-            return f"{found.sentence} No shape that was read off the probes is worth adding."
+            none = "No shape that was read off the probes is worth adding"
+            return f"{found.sentence} {none}{f': add {found.best.effect.name}' if found.best else ''}."
         before, after = number(found.held_out.excess, 2), number(self.left.excess, 2)
         names = " and ".join(p.name for p in accepted)
         together = " together" if len(accepted) > 1 else ""
@@ -87,6 +88,17 @@ class Proposals:
         }
 
 
+def has_no_name(found: Diagnosis) -> bool:
+    """Whether most of what a diagnosed model lacks is in no catalogue.
+
+    A shape that no effect has may by chance look a little like one that has a name: the low orders of random columns
+    look like a beam that is not uniform.
+    """
+    if found.verdict == "complete" or below_the_noise(found.held_out):
+        return False
+    return found.best is None or found.best.removed.value < SMALL_PART * found.held_out.excess
+
+
 def propose(
     captures: CaptureSet,
     model: Model,
@@ -113,11 +125,13 @@ def propose(
     thresholds = thresholds or Thresholds()
     report = progress or no_progress
     found = diagnose(captures, model, known, pool, thresholds, part_of(report, 0, 0.4), with_probes=False)
-    if found.verdict != "outside_catalogue" or not found.probes:
+    if not has_no_name(found):
         report(1.0, "done")
         return Proposals(found)
     work = RoundWork(capture_roles(captures), known, pool, drafts, thresholds, found.ideal_excess)
-    current, errors, probes = found.model, found.held_out, list(found.probes)
+    current, errors = found.model, found.held_out
+    report(0.4, "probing the stages")
+    probes = list(found.probes) or probe_all(work.roles, current, errors, pool, no_progress)
     accepted: list[Proposal] = []
     others: list[Proposal] = []
     for count in range(ROUNDS):
