@@ -10,6 +10,9 @@ import pytest
 import torch
 
 from runtime.excess import RemovedExcess
+from tests.trainer.hidden import bench_file, ran
+from trainer.captures.capture_set import read_captures
+from trainer.cli import main
 from trainer.diagnosis.probes import ProbeResult
 from trainer.diagnosis.proposals.blob_shape import blobs_in
 from trainer.diagnosis.proposals.candidates import candidates_of
@@ -28,14 +31,16 @@ from trainer.diagnosis.proposals.probe_maps import (
     Place,
     ProbeMap,
 )
+from trainer.diagnosis.proposals.proposing import Proposals, propose
 from trainer.diagnosis.proposals.reading import Reading
 from trainer.diagnosis.proposals.row_column_shape import rows_and_columns_in
 from trainer.diagnosis.proposals.surface_shape import radial_in, smooth_in, times_surface
 from trainer.diagnosis.proposals.wave_shape import waves_in, waves_in_gray
 from trainer.effects import testing
-from trainer.effects.effect_catalogue import load_effects
+from trainer.effects.effect_catalogue import catalogue, load_effects
 from trainer.effects.own_effect import applied
-from trainer.model.model import instance_with
+from trainer.fitting.pool import open_pool
+from trainer.model.model import Model, instance_with
 from trainer.prediction.scene import bare_stages, scene_at
 
 SHAPE = (72, 96)
@@ -216,3 +221,119 @@ def test_a_written_effect_that_is_absent_changes_nothing(place: Place, tmp_path:
 
 
 # The command
+
+
+SPECKS = 'kind = "specks"\ncount = 5\nsmallest_radius_px = 2.0\nlargest_radius_px = 4.0'
+FRINGES = 'kind = "fringes"'
+
+
+def captured(capsys: pytest.CaptureFixture[str], folder: Path, *defects: str) -> Path:
+    bench = bench_file(folder, *defects, width=96, height=72, distance_mm=8)
+    ran(capsys, "capture", "--bench", bench, "--out", folder / "captures")
+    return folder / "captures"
+
+
+def proposed(capsys: pytest.CaptureFixture[str], captures: Path, folder: Path) -> dict:
+    return ran(capsys, "propose", captures, "--out", folder / "proposals", "--workers", 1)
+
+
+def explained_with(capsys: pytest.CaptureFixture[str], captures: Path, folder: Path, found: dict) -> dict:
+    """What `explain` says with the files that are worth adding."""
+    files = [folder / "proposals" / p["file"] for p in found["proposals"] if p["worth_adding"]]
+    words = [word for file in files for word in ("--effects", file)]
+    out = folder / "model.toml"
+    return ran(capsys, "explain", captures, *words, "--out", out, "--workers", 1)
+
+
+def proposals(captures: Path, drafts: Path) -> Proposals:
+    """What is proposed where the catalogue has two effects only, which saves their trials."""
+    few = {n: e for n, e in catalogue().items() if n in ("illumination", "stray_light")}
+    read = read_captures(captures)
+    with open_pool(1) as pool:
+        return propose(read, Model(read.bench), few, pool, drafts)
+
+
+def test_specks_are_proposed_and_accepted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = proposals(captured(capsys, tmp_path, SPECKS), tmp_path)
+    first = found.proposals[0]
+    assert (first.name, first.candidate.place.stage) == ("panel_specks", "panel")
+    assert first.worth_adding and first.removed.interval()[0] > 0
+    assert first.excess_after < 5e-4
+    keys = {"file", "stage", "what", "excess_after", "excess_removed", "ci95", "worth_adding"}
+    assert set(first.as_json()) == keys and "5 specks" in first.as_json()["what"]
+    # The file starts where the fit ended.
+    (effect,) = load_effects(first.write(tmp_path))
+    assert effect.starts is not None
+    (start,) = effect.starts([])
+    assert all(np.allclose(start[n], v, rtol=1e-4, atol=1e-5) for n, v in first.fitted.values.items())
+
+
+def test_bent_fringes_are_proposed_and_accepted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = proposals(captured(capsys, tmp_path, FRINGES), tmp_path)
+    first = found.proposals[0]
+    assert (first.name, first.worth_adding) == ("sensor_fringes", True)
+    assert first.excess_after < 3e-4
+    values = first.fitted.values
+    assert values["period"] == pytest.approx(17, rel=0.01)
+    assert values["chirp"] == pytest.approx(0.3, abs=0.02)
+    assert math.hypot(values["cosine"], values["sine"]) == pytest.approx(0.22, rel=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "files"),
+    [
+        ("specks", {"panel_specks.py"}),
+        ("fringes", {"sensor_fringes.py"}),
+        ("stripes", {"panel_amplitude_columns.py"}),
+        ("outside", {"sensor_fringes.py", "panel_specks.py"}),
+    ],
+)
+def test_named_benches_end_at_the_noise_with_what_is_proposed(
+    name: str, files: set[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    captures = tmp_path / "captures"
+    ran(capsys, "capture", "--bench", f"virtual:{name}", "--out", captures, "--patterns", 16)
+    found = proposed(capsys, captures, tmp_path)
+    accepted = [p for p in found["proposals"] if p["worth_adding"]]
+    assert {p["file"] for p in accepted} == files
+    assert found["proposals"][: len(accepted)] == accepted
+    keys = {"file", "stage", "what", "excess_after", "excess_removed", "ci95", "worth_adding"}
+    assert all(set(p) == keys for p in found["proposals"])
+    assert sorted(p.name for p in (tmp_path / "proposals").iterdir()) == sorted(
+        p["file"] for p in found["proposals"]
+    )
+    assert accepted[-1]["excess_after"] < 5e-4
+    better = explained_with(capsys, captures, tmp_path, found)
+    assert better["verdict"] == "complete" and better["steps"][-1]["excess"] < 5e-4
+
+
+def test_nothing_is_proposed_for_a_complete_model_or_before_what_has_a_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for defects, verdict in (((), "complete"), (('kind = "distance"',), "missing")):
+        folder = tmp_path / verdict
+        folder.mkdir()
+        found = proposed(capsys, captured(capsys, folder, *defects), folder)
+        assert (found["verdict"], found["proposals"]) == (verdict, [])
+        assert list((folder / "proposals").iterdir()) == []
+        assert ("Add distance first" in found["sentence"]) == (verdict == "missing")
+
+
+def test_a_folder_of_proposals_is_replaced_only_when_that_is_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    captures = captured(capsys, tmp_path)
+    out = tmp_path / "proposals"
+    out.mkdir()
+    (out / "panel_specks.py").write_text("edited")
+    words = ["propose", str(captures), "--out", str(out), "--workers", "1"]
+    assert main(words) == 2
+    assert "is there already and is not empty" in capsys.readouterr().err
+    (out / "notes.txt").write_text("kept")
+    assert main([*words, "--overwrite"]) == 2
+    assert "notes.txt" in capsys.readouterr().err
+    (out / "notes.txt").unlink()
+    assert main([*words, "--overwrite"]) == 0
+    assert list(out.iterdir()) == []
+    assert sorted(p.name for p in tmp_path.iterdir() if p.name.startswith(".")) == []
