@@ -5,20 +5,23 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.ndimage import label, uniform_filter
+from numpy.typing import NDArray
+from scipy.ndimage import binary_fill_holes, distance_transform_edt, label, uniform_filter
 
 from trainer.diagnosis.proposals.probe_maps import TRANSMISSION, ProbeMap
-from trainer.diagnosis.proposals.reading import Array, Number, Reading, Values, share_explained
+from trainer.diagnosis.proposals.reading import Number, Reading, Values, share_explained
 from trainer.formatting import number
 
 ABOVE = 6.0  # of the map's noise: what is a blob
 MOST_BLOBS = 120
+MOST_TOUCHING = 6  # discs in one blob
 APART = 1.0  # pixels between a disc that is fitted and a further one
 MOST_AREA = 0.2  # share of a map that blobs may cover: more is no sparse shape
 LEAST_RADIUS = 0.4  # of a node's distance: a dead pixel is a disc of 0.56
 LEAST_STRENGTH = 0.08  # of the middle blob: weaker ones are the descent's own
 
 
+Mask = NDArray[np.bool_]
 Found = tuple[list[float], list[float], list[float], complex]  # rows, columns, radii, what passes
 
 
@@ -148,21 +151,40 @@ def _found(one: ProbeMap, known: complex | None = None) -> Found | None:
     full = abs(inside - 1)
     rows, columns, radii = [], [], []
     for k in order:
-        near = _grown(marked == k)
-        weight = np.abs(one.values) * near
-        weight = np.maximum(weight - 2 * noise, 0)
-        mass = float(weight.sum())
-        if mass <= 0 or cores[k - 1] < LEAST_STRENGTH * full:
+        if cores[k - 1] < LEAST_STRENGTH * full:
             continue
-        radius = math.sqrt(mass * steps[0] * steps[1] / (math.pi * full))
-        if radius < LEAST_RADIUS * steps[0]:
-            continue
-        rows.append(float((weight * y).sum() / mass))
-        columns.append(float((weight * x).sum() / mass))
-        radii.append(radius)
+        whole = _grown(marked == k)
+        for part in _parts(whole, binary_fill_holes(whole & (strength > 0.5 * full))):
+            weight = np.maximum(np.abs(one.values) * part - 2 * noise, 0)
+            mass = float(weight.sum())
+            radius = math.sqrt(mass * steps[0] * steps[1] / (math.pi * full))
+            if radius < LEAST_RADIUS * steps[0]:
+                continue
+            rows.append(float((weight * y).sum() / mass))
+            columns.append(float((weight * x).sum() / mass))
+            radii.append(radius)
     return (rows, columns, radii, inside) if rows else None
 
 
-def _grown(mark: Array) -> Array:
+def _parts(whole: Mask, solid: Mask) -> list[Mask]:
+    """A blob divided into the discs that touch in it: each has a centre that is far from the solid part's rim."""
+    depth = distance_transform_edt(solid)
+    k, m = np.indices(whole.shape)
+    discs: list[tuple[int, int, float]] = []
+    while len(discs) < MOST_TOUCHING:
+        at = np.unravel_index(int(depth.argmax()), depth.shape)
+        deepest = float(depth[at])
+        if deepest < (0.5 * discs[0][2] if discs else 1.0) or (deepest < 1.5 and discs):
+            break
+        discs.append((int(at[0]), int(at[1]), deepest))
+        # What lies within a disc, or within a rim's roughness of it, is no centre of another.
+        depth = np.where(np.hypot(k - at[0], m - at[1]) < 1.25 * deepest + 0.5, 0, depth)
+    if len(discs) < 2:
+        return [whole]
+    nearest = np.argmin([np.hypot(k - row, m - column) - size for row, column, size in discs], axis=0)
+    return [whole & (nearest == n) for n in range(len(discs))]
+
+
+def _grown(mark: Mask) -> Mask:
     """A mark and its neighbours: a blob's rim is below the noise's multiple."""
     return np.asarray(uniform_filter(mark.astype(np.float64), 3) > 1e-6)
