@@ -98,14 +98,15 @@ def test_bent_fringes_are_read_with_their_numbers(angle: float, chirp: float, be
 
 def test_specks_are_read_with_places_sizes_and_what_passes() -> None:
     y, x = pixels()
-    true = [(-20.3, 11.6, 4.0), (13.7, -30.2, 2.2), (25.1, 40.4, 3.1), (0.4, 2.8, 1.2)]
+    # The last two touch.
+    true = [(-20.3, 11.6, 4.0), (13.7, -30.2, 2.2), (0.4, 2.8, 1.2), (25.1, 30.4, 3.1), (22.4, 36.1, 3.9)]
     inside = 0.2 * np.exp(1j)
     whole = np.ones(SHAPE, complex)
     for row, column, radius in true:
         whole *= 1 + np.clip(radius + 0.5 - np.hypot(y - row, x - column), 0, 1) * (inside - 1)
     (found,) = blobs_in(map_at(TRANSMISSION, whole - 1 + noise() + 1j * noise(1)))
     places = np.stack([start(found, n) for n in ("row", "column", "radius")], axis=1)
-    assert len(places) == len(true)
+    assert len(places) == len(true), places
     for one in true:
         near = places[np.hypot(places[:, 0] - one[0], places[:, 1] - one[1]).argmin()]
         assert np.allclose(near, one, atol=0.3)
@@ -223,7 +224,7 @@ def test_a_written_effect_that_is_absent_changes_nothing(place: Place, tmp_path:
 # The command
 
 
-SPECKS = 'kind = "specks"\ncount = 5\nsmallest_radius_px = 2.0\nlargest_radius_px = 4.0'
+SPECKS = 'kind = "specks"\ncount = 3\nsmallest_radius_px = 2.0\nlargest_radius_px = 4.0'
 FRINGES = 'kind = "fringes"'
 
 
@@ -258,9 +259,10 @@ def test_specks_are_proposed_and_accepted(tmp_path: Path, capsys: pytest.Capture
     first = found.proposals[0]
     assert (first.name, first.candidate.place.stage) == ("panel_specks", "panel")
     assert first.worth_adding and first.removed.interval()[0] > 0
-    assert first.excess_after < 5e-4
+    # What is finer than a pixel at the specks' edges is in no model.
+    assert first.excess_after < min(6e-4, 0.02 * found.diagnosis.held_out.excess)
     keys = {"file", "stage", "what", "excess_after", "excess_removed", "ci95", "worth_adding"}
-    assert set(first.as_json()) == keys and "5 specks" in first.as_json()["what"]
+    assert set(first.as_json()) == keys and "3 specks" in first.as_json()["what"]
     # The file starts where the fit ended.
     (effect,) = load_effects(first.write(tmp_path))
     assert effect.starts is not None

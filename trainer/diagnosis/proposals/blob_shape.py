@@ -17,7 +17,7 @@ MOST_BLOBS = 120
 MOST_TOUCHING = 6  # discs in one blob
 APART = 1.0  # pixels between a disc that is fitted and a further one
 MOST_AREA = 0.2  # share of a map that blobs may cover: more is no sparse shape
-LEAST_RADIUS = 0.4  # of a node's distance: a dead pixel is a disc of 0.56
+LEAST_RADIUS = 0.5  # of a node's distance: a dead pixel is a disc of 0.56
 LEAST_STRENGTH = 0.08  # of the middle blob: weaker ones are the descent's own
 
 
