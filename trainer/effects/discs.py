@@ -41,7 +41,8 @@ def discs(y: Tensor, x: Tensor, row: Tensor, column: Tensor, radius: Tensor, ins
             continue
         square = (y[rows, columns] - row[k]) ** 2 + (x[rows, columns] - column[k]) ** 2
         covered = torch.clamp(radius[k] + 0.5 - torch.sqrt(square + 1e-6), 0, 1)
-        whole[rows, columns] = whole[rows, columns] * (1 + covered * (each[k] - 1))
+        before = whole[rows, columns].clone()  # a view would be changed before its derivative is taken
+        whole[rows, columns] = before * (1 + covered * (each[k] - 1))
     return whole
 
 
