@@ -14,7 +14,7 @@ from tests.trainer.hidden import bench_file, ran
 from trainer.captures.capture_set import read_captures
 from trainer.cli import main
 from trainer.diagnosis.probes import ProbeResult
-from trainer.diagnosis.proposals.blob_shape import blobs_in
+from trainer.diagnosis.proposals.blob_shape import blobs_in, blobs_of_their_own, more_blobs_in
 from trainer.diagnosis.proposals.candidates import candidates_of
 from trainer.diagnosis.proposals.effect_file import write_effect
 from trainer.diagnosis.proposals.gray_shape import steps_in_gray
@@ -58,7 +58,8 @@ def map_at(place: Place, values: np.ndarray) -> ProbeMap:
 
 def pixels() -> tuple[np.ndarray, np.ndarray]:
     y, x = (np.arange(n) - (n - 1) / 2 for n in SHAPE)
-    return np.meshgrid(y, x, indexing="ij")  # type: ignore[return-value]
+    grid = np.meshgrid(y, x, indexing="ij")
+    return grid[0], grid[1]
 
 
 def noise(seed: int = 0) -> np.ndarray:
@@ -111,6 +112,14 @@ def test_specks_are_read_with_places_sizes_and_what_passes() -> None:
         near = places[np.hypot(places[:, 0] - one[0], places[:, 1] - one[1]).argmin()]
         assert np.allclose(near, one, atol=0.3)
     assert complex(start(found, "real"), start(found, "imaginary")) == pytest.approx(inside, abs=0.1)
+
+    # With one of them left out, the map of what is left shows it again.
+    others = {n: v[1:] if v.ndim else v for n, v in found.starts.items()}
+    row, column, radius = places[0]
+    disc = np.clip(radius + 0.5 - np.hypot(y - row, x - column), 0, 1) * (inside - 1)
+    (again,) = more_blobs_in(map_at(TRANSMISSION, disc + noise() + 1j * noise(1)), others)
+    assert np.allclose(start(again, "row")[-1], row, atol=0.3) and len(start(again, "row")) == len(true)
+    assert not more_blobs_in(map_at(TRANSMISSION, noise() + 1j * noise(1)), others)
 
 
 def test_noise_has_no_specks_and_no_shape_worth_a_fit() -> None:
@@ -174,7 +183,8 @@ def readings(place: Place) -> list[Reading]:
         y, x = pixels()
         disc = np.clip(3.5 - np.hypot(y - 8.2, x + 5.1), 0, 1) * (0.3 + 0.4j - 1)
         one = map_at(place, disc + 0.1 * (noise() + 1j * noise(1)))
-        return [*blobs_in(one), *blobs_in(one, own=True)]
+        (common,) = blobs_in(one)
+        return [common, blobs_of_their_own(one, common.starts)]
     one = map_at(place, fringes() * (1 + 0.8 * pixels()[1] / 48))
     waves = waves_in(one)
     product = times_surface(one, waves[0])

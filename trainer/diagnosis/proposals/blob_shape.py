@@ -25,18 +25,24 @@ Mask = NDArray[np.bool_]
 Found = tuple[list[float], list[float], list[float], complex]  # rows, columns, radii, what passes
 
 
-def blobs_in(one: ProbeMap, own: bool = False) -> list[Reading]:
-    """The discs of a map.
+def blobs_in(one: ProbeMap) -> list[Reading]:
+    """The discs of a map, complex or of a camera's gain, that all pass the same."""
+    found = _found(one)
+    return [] if found is None else [_reading(one, found, False)]
+
+
+def blobs_of_their_own(one: ProbeMap, values: Values) -> Reading:
+    """The discs that were fitted, each with its own transmission.
 
     Parameters
     ----------
     one : ProbeMap
-        Complex, or of a camera's gain.
-    own : bool
-        Each disc has its own transmission; otherwise all have the same.
+        Of the place where the discs are.
+    values : mapping
+        As in `more_blobs_in`.
     """
-    found = _found(one)
-    return [] if found is None else [_reading(one, found, own)]
+    places = tuple([float(v) for v in np.asarray(values[n])] for n in ("row", "column", "radius"))
+    return _reading(one, (places[0], places[1], places[2], _passing(values)), True)
 
 
 def more_blobs_in(one: ProbeMap, values: Values) -> list[Reading]:
@@ -49,8 +55,7 @@ def more_blobs_in(one: ProbeMap, values: Values) -> list[Reading]:
     values : mapping
         The fitted discs': `row`, `column`, `radius`, and `real` and `imaginary` or `passed`.
     """
-    names = ("passed",) if "passed" in values else ("real", "imaginary")
-    inside = complex(*(float(np.mean(values[n])) for n in names))
+    inside = _passing(values)
     found = _found(one, inside)
     rows, columns, radii = (np.asarray(values[n], dtype=float) for n in ("row", "column", "radius"))
     fresh = []
@@ -64,6 +69,12 @@ def more_blobs_in(one: ProbeMap, values: Values) -> list[Reading]:
         for known, new in zip((rows, columns, radii), zip(*fresh, strict=True), strict=True)
     ]
     return [_reading(one, (together[0], together[1], together[2], inside), False)]
+
+
+def _passing(values: Values) -> complex:
+    """What passes the fitted discs, on average."""
+    names = ("passed",) if "passed" in values else ("real", "imaginary")
+    return complex(*(float(np.mean(values[n])) for n in names))
 
 
 def _reading(one: ProbeMap, found: Found, own: bool) -> Reading:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from runtime.program.progress import Progress, no_progress
 from trainer.captures.bench_file import Bench
 from trainer.diagnosis.probes import ProbeResult
-from trainer.diagnosis.proposals.blob_shape import blobs_in, more_blobs_in
+from trainer.diagnosis.proposals.blob_shape import blobs_in, blobs_of_their_own, more_blobs_in
 from trainer.diagnosis.proposals.gray_shape import steps_in_gray
 from trainer.diagnosis.proposals.probe_maps import GAIN, GRAY, TRANSMISSION, Place, ProbeMap, maps_of
 from trainer.diagnosis.proposals.reading import Reading, Values
@@ -77,20 +77,22 @@ def candidates_of(
     return [c for c in found if c.worth > WEAK * found[0].worth][:MOST]
 
 
-def refinements_of(
-    best: Candidate, probes: Sequence[ProbeResult], bench: Bench, signal: float
-) -> list[Candidate]:
-    """Shapes of the same kind with more freedom, for the probes by which the candidate was found."""
-    if best.reading.name != "specks":
-        return []
-    maps = [m for m in _maps(probes, bench, signal) if m.place is best.place]
-    return [Candidate(best.place, r, best.worth) for m in maps for r in blobs_in(m, own=True)]
+def more_of(
+    candidate: Candidate, probe: ProbeResult, bench: Bench, values: Values, own: bool
+) -> Candidate | None:
+    """The candidate's fitted specks with more freedom.
 
-
-def more_of(candidate: Candidate, probe: ProbeResult, bench: Bench, values: Values) -> Candidate | None:
-    """The candidate's fitted specks and those that a probe of what is left shows, if it shows any."""
-    maps = [m for m in _maps([probe], bench, 1.0) if m.place is candidate.place]
-    found = [r for m in maps for r in more_blobs_in(m, values)]
+    Parameters
+    ----------
+    probe : ProbeResult
+        Of what is left with the specks.
+    values : mapping
+        The specks' fitted numbers.
+    own : bool
+        Each with its own transmission; otherwise with the specks that the probe shows beside them, if it shows any.
+    """
+    (one,) = (m for m in _maps([probe], bench, 1.0) if m.place is candidate.place)
+    found = [blobs_of_their_own(one, values)] if own else more_blobs_in(one, values)
     return Candidate(candidate.place, found[0], candidate.worth) if found else None
 
 

@@ -11,12 +11,12 @@ import numpy as np
 
 from firmware_iface.errors import InputError
 from runtime.excess import PredictionErrors, RemovedExcess, removed_excess
-from runtime.program.progress import Progress, part_of
+from runtime.program.progress import Progress, no_progress, part_of
 from trainer.captures.batches import load
 from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.candidate_fits import CandidateFit, try_effect
 from trainer.diagnosis.probes import ProbeResult, probe
-from trainer.diagnosis.proposals.candidates import Candidate, candidates_of, more_of, refinements_of
+from trainer.diagnosis.proposals.candidates import Candidate, candidates_of, more_of
 from trainer.diagnosis.proposals.effect_file import write_effect
 from trainer.diagnosis.ranking import rank
 from trainer.diagnosis.verdict import Thresholds
@@ -137,12 +137,8 @@ class RoundWork:
         ]
         signal = float(np.sqrt(before.variance.sum() / max(before.pixels.sum(), 1)))
         candidates = candidates_of(telling, model.bench, signal, part_of(report, 0, 0.1))
-        fits = self._fitted(model, candidates, part_of(report, 0.1, 0.5, "fitting what the probes show"))
+        fits = self._fitted(model, candidates, part_of(report, 0.1, 0.6, "fitting what the probes show"))
         best = self._best(before, fits)
-        if best is not None and fits[best][1].held_out.excess > ENOUGH:
-            more = refinements_of(fits[best][0], telling, model.bench, signal)
-            fits = {**fits, **self._fitted(model, more, part_of(report, 0.5, 0.6, "refining the best"))}
-            best = self._best(before, fits)
         others = tuple(
             _proposal(n, c, f.model, f.held_out, before, False)
             for n, (c, f) in fits.items()
@@ -154,9 +150,9 @@ class RoundWork:
         candidate = fits[best][0]
         together, errors = self._together(fits[best][1])
         for k in range(MORE):
-            if errors.excess <= ENOUGH or not candidate.reading.name.startswith("specks"):
+            if errors.excess <= ENOUGH or candidate.reading.name != "specks":
                 break
-            report(0.7 + 0.3 * k / MORE, "looking for more specks")
+            report(0.7 + 0.3 * k / MORE, "looking closer at the specks")
             grown = self._grown(together, errors, best, candidate)
             if grown is None:
                 break
@@ -174,18 +170,26 @@ class RoundWork:
     def _grown(
         self, model: Model, errors: PredictionErrors, name: str, candidate: Candidate
     ) -> tuple[Candidate, tuple[Model, PredictionErrors]] | None:
-        """The specks with those that a probe of what is left shows; None where that is not clearly better."""
-        ids, held = self._probed, self._held
-        task = (self.roles.folder, ids, held, model, candidate.place.stage)
-        (found,) = self.pool.map(probe, [task])
-        more = more_of(candidate, ProbeResult.judged(found, errors), model.bench, model.instance(name).values)
-        if more is None:
-            return None
-        fits = self._fitted(model.without(name), [more], lambda done, what="": None, name)
-        if name not in fits:
-            return None
-        grown = self._together(fits[name][1])
-        return (more, grown) if grown[1].excess < BETTER * errors.excess else None
+        """The specks with those that a probe of what is left shows, or each with its own transmission.
+
+        None where neither is clearly better.
+        """
+        (found,) = self.pool.map(
+            probe, [(self.roles.folder, self._probed, self._held, model, candidate.place.stage)]
+        )
+        left = ProbeResult.judged(found, errors)
+        values = model.instance(name).values
+        for own in (False, True):
+            if own and self.thresholds.complete(errors.excess, self.ideal_excess):
+                break
+            more = more_of(candidate, left, model.bench, values, own)
+            fits = {} if more is None else self._fitted(model.without(name), [more], no_progress, name)
+            if more is None or name not in fits:
+                continue
+            grown = self._together(fits[name][1])
+            if grown[1].excess < BETTER * errors.excess:
+                return more, grown
+        return None
 
     @property
     def _held(self) -> tuple[str, ...]:
