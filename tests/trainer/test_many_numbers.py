@@ -115,13 +115,15 @@ def test_the_screen_expects_what_the_fit_of_many_numbers_removes(
 
 def test_discs_cover_their_area_and_have_derivatives() -> None:
     y, x = torch.meshgrid(torch.arange(-20.0, 21), torch.arange(-30.0, 31), indexing="ij")
-    numbers = [torch.tensor(v, requires_grad=True) for v in ([-3.2, 9.7], [4.4, -11.3], [5.3, 2.6])]
+    row, column, radius = (
+        torch.tensor(v, requires_grad=True) for v in ([-3.2, 9.7], [4.4, -11.3], [5.3, 2.6])
+    )
     inside = torch.tensor(0.25, requires_grad=True)
-    whole = discs(y, x, *numbers, inside)
+    whole = discs(y, x, row, column, radius, inside)
     covered = float((1 - whole).detach().sum()) / 0.75
     assert covered == pytest.approx(np.pi * (5.3**2 + 2.6**2), rel=0.02)
     weights = torch.as_tensor(np.random.default_rng(0).standard_normal(whole.shape), dtype=torch.float32)
-    slopes = torch.autograd.grad((weights * whole).sum(), [*numbers, inside])
+    slopes = torch.autograd.grad((weights * whole).sum(), [row, column, radius, inside])
     assert all(bool((s != 0).all()) for s in slopes)
     # One beyond the border changes nothing; places and sizes may differ by less than a pixel.
     away = discs(y, x, torch.tensor([90.0]), torch.tensor([0.0]), torch.tensor([3.0]), torch.tensor(0.0))

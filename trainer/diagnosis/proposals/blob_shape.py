@@ -15,7 +15,10 @@ from trainer.formatting import number
 ABOVE = 6.0  # of the map's noise: what is a blob
 MOST_BLOBS = 120
 MOST_TOUCHING = 6  # discs in one blob
-APART = 1.0  # pixels between a disc that is fitted and a further one
+OUTSIDE, APART = (
+    0.6,
+    0.5,
+)  # a further disc: most of it, and its centre by so many pixels, outside the fitted ones
 MOST_AREA = 0.2  # share of a map that blobs may cover: more is no sparse shape
 LEAST_RADIUS = 0.5  # of a node's distance: a dead pixel is a disc of 0.56
 LEAST_STRENGTH = 0.08  # of the middle blob: weaker ones are the descent's own
@@ -60,7 +63,7 @@ def more_blobs_in(one: ProbeMap, values: Values) -> list[Reading]:
     rows, columns, radii = (np.asarray(values[n], dtype=float) for n in ("row", "column", "radius"))
     fresh = []
     for row, column, radius, *_ in zip(*found[:3], strict=True) if found else ():
-        if (np.hypot(rows - row, columns - column) > radii + radius + APART).all():
+        if (np.hypot(rows - row, columns - column) > radii + OUTSIDE * radius + APART).all():
             fresh.append((row, column, radius))
     if not fresh:
         return []
