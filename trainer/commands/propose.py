@@ -118,7 +118,7 @@ worth_adding false fitted too, but a better one was accepted before them; they a
     run=run,
     show=show,
     outputs=outputs,
-    examples=("propose captures/ --out proposals/", "propose captures/ --model model.toml --out proposals/"),
+    examples=("propose captures/ --model model.toml --out proposals/",),
     after="Read the files, edit them as you like, and use them: explain captures/ --effects proposals/NAME.py "
     "--out model.toml",
 )
