@@ -18,7 +18,13 @@ from trainer.commands.inputs import (
 from trainer.commands.number_text import sizes_text, small_text
 from trainer.commands.outputs import report_option, report_out
 from trainer.commands.thresholds import threshold_options, thresholds_of
-from trainer.commands.verdict_page import say_suggested, say_verdict, then_export, then_write_or_learn
+from trainer.commands.verdict_page import (
+    say_suggested,
+    say_verdict,
+    then_export,
+    then_propose,
+    then_write_or_learn,
+)
 from trainer.commands.workers import worker_options, workers_of
 
 MOST_ROWS = 12
@@ -93,6 +99,7 @@ def show(result: Result, args: Namespace, screen: Screen) -> None:
     elif result["verdict"] == "complete":
         then_export(args.model, args, screen)
     else:
+        then_propose(args.model, args, screen)
         then_write_or_learn(result.get("stage"), args.model, args, screen)
 
 

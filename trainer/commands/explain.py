@@ -20,7 +20,13 @@ from trainer.commands.inputs import (
 from trainer.commands.number_text import small_text
 from trainer.commands.outputs import model_out, out_option, report_option
 from trainer.commands.thresholds import threshold_options, thresholds_of
-from trainer.commands.verdict_page import say_suggested, say_verdict, then_export, then_write_or_learn
+from trainer.commands.verdict_page import (
+    say_suggested,
+    say_verdict,
+    then_export,
+    then_propose,
+    then_write_or_learn,
+)
 from trainer.commands.workers import worker_options, workers_of
 
 if TYPE_CHECKING:
@@ -155,6 +161,7 @@ def show(result: Result, args: Namespace, screen: Screen) -> None:
     if result["verdict"] == "complete":
         then_export(args.out, args, screen)
     elif result["verdict"] == "outside_catalogue":
+        then_propose(args.out, args, screen)
         then_write_or_learn(result.get("stage"), args.out, args, screen)
     else:
         screen.next(command_line("diagnose", args.captures, args=args, model=args.out))

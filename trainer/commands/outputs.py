@@ -9,6 +9,7 @@ from runtime.program.outputs import Output, files_written
 
 BUNDLE = ("bundle.json", "*.safetensors", "*.onnx")
 CAPTURES = ("bench.toml", "captures.csv", "phase", "image")
+PROPOSALS = ("drive_*.py", "panel_*.py", "pupil_*.py", "sensor_*.py", "__pycache__")
 ROUNDS = ("round-*",)
 RUN = ("checkpoint.pt", "network.safetensors", "curves", "running")
 UNFINISHED_RUN = ("checkpoint.pt", "curves", "running")

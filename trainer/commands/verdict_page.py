@@ -43,6 +43,12 @@ def then_export(model: Path | None, args: Namespace, screen: Screen) -> None:
         )
 
 
+def then_propose(model: Path | None, args: Namespace, screen: Screen) -> None:
+    """The command that writes effect files for what is in no catalogue."""
+    line = command_line("propose", args.captures, "--out", "proposals", args=args, model=model)
+    screen.next(line, "Have effect files written for what the probes show")
+
+
 def then_write_or_learn(stage: Any, model: Path | None, args: Namespace, screen: Screen) -> None:
     """The commands for what is in no catalogue: an effect of one's own, a learned field, a network."""
     stage = stage if stage in ("drive", "panel", "pupil", "sensor") else "panel"

@@ -2,7 +2,7 @@
 
 A score test: how much of the residual lies in the span of the effect's derivative at "absent" (or at the best of its
 starting points, where the derivative at absent does not reach), with the gains and the parameters of all present
-effects projected out.
+effects projected out; those of present effects with more than 100 numbers stay as they are.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from trainer.effects.evidence import Evidence
 from trainer.effects.own_effect import starts_of
 from trainer.fitting.jacobian import keys_of, slopes_of, weighted_residuals
 from trainer.fitting.least_squares_gain import with_gain
+from trainer.fitting.many_numbers import ManySlopes, has_many
 from trainer.fitting.predictor import Predictor
 from trainer.fitting.start_points import start_cost, start_points
 from trainer.model.model import EffectInstance, Model, absent, instance_with
@@ -81,7 +82,8 @@ def screen_batches(batches: list[Batch], model: Model, effects: tuple[Effect, ..
             reach = model if not opens_iris else model.having(absent(effect, model.bench))
             predictors = [Predictor(reach, b) for b in batches]
             points = [p.trace(model) for p in predictors]
-            nuisance = _stacked(model, keys_of(model, model.names), predictors, points)
+            few = [p.effect.name for p in model.present if not has_many(p)]
+            nuisance = _stacked(model, keys_of(model, few), predictors, points)
             prepared[opens_iris] = (predictors, points, *nuisance)
         predictors, points, residual, present = prepared[opens_iris]
         noise = sum(float((b.mask * b.noise).sum()) for b in batches)
@@ -91,8 +93,12 @@ def screen_batches(batches: list[Batch], model: Model, effects: tuple[Effect, ..
         trial = model.having(start)
         moved = [p.trace(trial, effect.stage, t) for p, t in zip(predictors, points, strict=True)]
         trial = with_gain(trial, predictors, moved)
-        residual_there, slopes = _stacked(trial, keys_of(trial, [effect.name]), predictors, moved)
-        after = (_remaining(residual_there, torch.cat([slopes, present])) - noise) / scale
+        if has_many(start):
+            left = _remaining_of_many(trial, effect.name, predictors, moved, present)
+        else:
+            residual_there, slopes = _stacked(trial, keys_of(trial, [effect.name]), predictors, moved)
+            left = _remaining(residual_there, torch.cat([slopes, present]))
+        after = (left - noise) / scale
         results.append(ScreenResult(effect.name, start, before, after))
     return results
 
@@ -110,7 +116,7 @@ def _start(effect: Effect, model: Model, predictors: list[Predictor], points: li
     # A start need only be near: one colour and plane are enough.
     few, there = predictors[:1], points[:1]
     costs = [start_cost(model, few, there, start) for start in starts]
-    if max(costs) - min(costs) < 1e-9 * max(costs):
+    if max(costs) - min(costs) < 1e-9 * max(costs) and not any(has_many(start) for start in starts):
         # A period or a place changes nothing while the amplitude is zero: compare one step ahead.
         costs = [_one_step_ahead(model, few, there, start) for start in starts]
     return starts[costs.index(min(costs))]
@@ -122,6 +128,18 @@ def _one_step_ahead(
     """Squared error that a straight-line step from a start would leave."""
     trial = model.having(start)
     return _remaining(*_stacked(trial, keys_of(trial, [start.effect.name]), predictors, points))
+
+
+def _remaining_of_many(
+    trial: Model, name: str, predictors: list[Predictor], points: list[Trace], present: Tensor
+) -> float:
+    """Squared error that a straight-line step of an effect with many numbers would leave."""
+    residuals, _ = weighted_residuals(trial, predictors, points)
+    others = list(present.split([r.numel() for r in residuals], dim=1))
+    slopes = ManySlopes(trial, [name], predictors, points, others)
+    there = slopes.along_with_others(slopes.step(residuals))
+    left = slopes.alone([r - t for r, t in zip(residuals, there, strict=True)])
+    return sum(float((one.double() ** 2).sum()) for one in left)
 
 
 def _stacked(

@@ -1,6 +1,7 @@
 """Named physical effects, and all that an effect of your own needs: `from trainer.effects import Parameter, effect`."""
 
 from trainer.effects.definition import STAGES, Effect, Parameter, effect
+from trainer.effects.discs import discs
 from trainer.effects.effect_catalogue import Catalogue, catalogue, find_effect
 from trainer.effects.evidence import Evidence
 from trainer.effects.pull import Wave, pull, waves
@@ -20,6 +21,7 @@ __all__ = [
     "Wave",
     "bare_stages",
     "catalogue",
+    "discs",
     "effect",
     "find_effect",
     "pull",

@@ -4,6 +4,8 @@ Columns of the Jacobian are secants one small physical step wide. Each costs one
 stage on. A secant is also good for an iris edge or a laser line, whose derivative is zero or jumps where the effect
 is absent. The fit minimises the squared error in counts, unweighted: the reported excess. The gain of each colour is
 always fitted too.
+
+An effect of more than 100 numbers has no such table: its part of each step comes from `many_numbers`.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from trainer.effects.evidence import Evidence
 from trainer.effects.own_effect import measured_by
 from trainer.fitting.jacobian import keys_of, slopes_of, stepped, weighted_residuals
 from trainer.fitting.least_squares_gain import with_gain
+from trainer.fitting.many_numbers import ManySlopes, has_many
 from trainer.fitting.predictor import Predictor
 from trainer.model.model import Model, Values
 
@@ -70,6 +73,9 @@ def fit(
         Called with the share of the iterations that is done.
     """
     with torch.no_grad():
+        many = tuple(n for n in free if has_many(model.instance(n)))
+        if many:
+            return _fit_many(model, tuple(free), many, batches, iterations, tolerance, progress)
         return _fit(model, tuple(free), batches, iterations, tolerance, progress)
 
 
@@ -123,6 +129,64 @@ def _fit(
     inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
     covariance = inverse @ scatter @ inverse
     return FitResult(_with_errors(model, keys, covariance), errors, covariance, keys)
+
+
+def _fit_many(
+    model: Model,
+    free: tuple[str, ...],
+    many: tuple[str, ...],
+    batches: Sequence[Batch],
+    iterations: int,
+    tolerance: float,
+    progress: Progress | None,
+) -> FitResult:
+    """The same fit where the effects `many` have too many numbers for a table of derivatives."""
+    predictors = [Predictor(model, b) for b in batches]
+    few = tuple(n for n in free if n not in many)
+    first = min((model.instance(n).effect.stage for n in free), key=STAGES.index)
+    keys = keys_of(model, few)
+    points = [p.trace(model) for p in predictors]
+    if not model.gain or any(b.channel not in model.gain for b in batches):
+        model = with_gain(model, predictors, points)
+    channels = list(dict.fromkeys(b.channel for b in batches))
+    residuals, errors = weighted_residuals(model, predictors, points)
+    for iteration in range(iterations):
+        if progress:
+            progress(iteration / iterations)
+        before = errors.excess
+        table = slopes_of(model, keys, channels, predictors, points)
+        slopes = ManySlopes(model, many, predictors, points, table)
+        change = slopes.step(residuals)
+        # What the few numbers do best when the many have moved.
+        rest = slopes.explained(
+            [r - s for r, s in zip(residuals, slopes.along_with_others(change), strict=True)]
+        ).numpy()
+        accepted = False
+        for share in (1.0, 0.5, 0.2, 0.05):
+            trial = _moved(slopes.moved(share * change), keys, channels, share * rest)
+            trial_points = [p.trace(trial, first, t) for p, t in zip(predictors, points, strict=True)]
+            trial_residuals, trial_errors = weighted_residuals(trial, predictors, trial_points)
+            if trial_errors.excess < before:
+                accepted = True
+                break
+        if not accepted:
+            break
+        model, points, residuals, errors = trial, trial_points, trial_residuals, trial_errors
+        if before - errors.excess < max(tolerance * abs(errors.excess), 2e-6):
+            break
+    table = slopes_of(model, keys, channels, predictors, points)
+    slopes = ManySlopes(model, many, predictors, points, table)
+    spread = slopes.errors(residuals)
+    model = with_measured_values(model, free, batches)
+    inverse = np.linalg.pinv(_normal(table), rcond=1e-12, hermitian=True)
+    covariance = inverse @ _scatter(table, residuals) @ inverse
+    every = (*keys, *keys_of(model, many))
+    whole = np.zeros((len(every) + len(channels),) * 2)
+    places = [*range(len(keys)), *range(len(every), len(whole))]
+    whole[np.ix_(places, places)] = covariance
+    inner = np.arange(len(keys), len(every))
+    whole[inner, inner] = spread**2
+    return FitResult(_with_errors(model, every, whole), errors, whole, every)
 
 
 @torch.no_grad()

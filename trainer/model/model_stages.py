@@ -78,9 +78,15 @@ def stages_for(scene: Scene, present: tuple[EffectInstance, ...], tensors: Any =
     return stages
 
 
-def stages_of(scene: Scene, model: Model) -> Stages:
-    """The scene's stages under a model: its effects, and the field learned at the panel after them."""
-    stages = stages_for(scene, model.present)
+def stages_of(scene: Scene, model: Model, tensors: Any = None) -> Stages:
+    """The scene's stages under a model: its effects, and the field learned at the panel after them.
+
+    Parameters
+    ----------
+    tensors : mapping, optional
+        As in `stages_for`.
+    """
+    stages = stages_for(scene, model.present, tensors)
     if model.panel_field is None:
         return stages
     maps = {name: torch.as_tensor(surface, dtype=scene.dtype) for name, surface in model.panel_field.items()}

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import re
+import textwrap
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from runtime.bundle.whole_files import whole_file
 from trainer.diagnosis.probes import ProbeResult
+from trainer.diagnosis.proposals.probe_maps import maps_of
+from trainer.diagnosis.proposals.wave_shape import waves_in, waves_in_gray
 from trainer.effects.new_effect import write_new_effect
-from trainer.effects.pull import Wave, waves
 from trainer.formatting import number
 
 # The maps of each probe in which the template's effect would be seen, by the beginning of their title.
@@ -21,6 +25,8 @@ SEEN_IN = {
     "pupil": ("amplitude passed",),
     "sensor": ("gain over the picture", "light added"),
 }
+
+ALONG_A_ROW = 0.95  # cosine of the angle up to which a wave counts as the panel template's columns
 
 
 def write_effect_of_probe(
@@ -67,16 +73,14 @@ def write_effect_of_probe(
 def filled(text: str, stage: str, found: ProbeResult, shape: tuple[int, int]) -> str:
     """A template's text with what a probe shows: in words in its docstring, in numbers in its starts."""
     words, starts = [], []
+    places = {m.place.title: m for m in maps_of(found, shape) if m.place.title in SEEN_IN[stage]}
     for title, values, unit in found.pictures:
         if title.startswith(SEEN_IN[stage]):
-            array = np.squeeze(np.asarray(values, dtype=np.float64))
-            words.append(f"  {title}: {_extent(array, unit)}")
-            for wave in waves(array, most=2):
-                size = _amplitude(array, wave)
-                words.append(
-                    f"    a wave of {_cycles(wave, array)}, amplitude {number(size)} {unit}".rstrip()
-                )
-                starts.append(_start(stage, wave, size, array, shape))
+            words.append(f"  {title}: {_extent(np.squeeze(np.asarray(values, dtype=np.float64)), unit)}")
+            one = next(m for name, m in places.items() if title.startswith(name))
+            for wave in waves_in_gray(one) if stage == "drive" else waves_in(one):
+                words += textwrap.wrap(wave.describe(wave.starts), 110, initial_indent="    ")
+                starts.append(_start(stage, wave.starts))
     told = "\n".join(words) or "  nothing in the maps that this effect could be seen in"
     removed = number(found.removed.value)
     head = f"What the {stage} probe showed when this file was written (excess removed: {removed}):\n"
@@ -98,31 +102,18 @@ def _extent(array: np.ndarray, unit: str) -> str:
     )
 
 
-def _cycles(wave: Wave, array: np.ndarray) -> str:
-    cycles = [abs(f) * n for f, n in zip(wave.frequency, array.shape, strict=True)]
-    axes = ("",) if array.ndim == 1 else (" down the rows", " along the columns")
-    return " and ".join(f"{number(c)} cycles{axis}" for c, axis in zip(cycles, axes, strict=True))
-
-
-def _amplitude(array: np.ndarray, wave: Wave) -> float:
-    """Amplitude of a wave in an array, by projection."""
-    places = np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in array.shape), indexing="ij")
-    angle = 2 * np.pi * sum(f * p for f, p in zip(wave.frequency, places, strict=True))
-    shape = wave.cosine * np.cos(angle) + wave.sine * np.sin(angle)
-    return float(2 * np.mean((array - array.mean()) * shape))
-
-
-def _start(
-    stage: str, wave: Wave, size: float, array: np.ndarray, shape: tuple[int, int]
-) -> dict[str, float]:
+def _start(stage: str, seen: dict[str, Any]) -> dict[str, float]:
     """Starting values of the template's own parameters; {} where the wave is none that it has."""
-    cosine, sine = size * wave.cosine, size * wave.sine
-    if stage == "drive":
-        return {"cosine": cosine, "sine": sine, "cycles": wave.frequency[0] * array.shape[0]}
-    fy, fx = (f * n / full for f, n, full in zip(wave.frequency, array.shape, shape, strict=True))
-    if stage == "panel":
-        return {"cosine": cosine, "sine": sine, "period": 1 / fx} if fx > 3 * abs(fy) else {}
-    if stage == "sensor":
-        period, angle = 1 / np.hypot(fy, fx), np.degrees(np.arctan2(fy, fx))
-        return {"cosine": cosine, "sine": sine, "period": float(period), "angle": float(angle)}
-    return {}
+    if stage == "pupil":
+        return {}
+    names = {"drive": ("cosine", "sine", "cycles"), "sensor": ("cosine", "sine", "period", "angle")}
+    if stage != "panel":
+        return {n: float(seen[n]) for n in names[stage]}
+    along = math.cos(math.radians(float(seen["angle"])))
+    if abs(along) < ALONG_A_ROW:
+        return {}
+    return {
+        "cosine": float(seen["cosine"]),
+        "sine": float(seen["sine"]),
+        "period": float(seen["period"]) / along,
+    }

@@ -1,0 +1,1 @@
+"""Effect files that the captures accept, for what has no name: read off the stages' fitted probes."""

@@ -1,0 +1,117 @@
+"""Which shapes to try at which place: those that explain a part of a probe's map worth a fit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+
+from runtime.program.progress import Progress, no_progress
+from trainer.captures.bench_file import Bench
+from trainer.diagnosis.probes import ProbeResult
+from trainer.diagnosis.proposals.blob_shape import blobs_in, blobs_of_their_own, more_blobs_in
+from trainer.diagnosis.proposals.gray_shape import steps_in_gray
+from trainer.diagnosis.proposals.probe_maps import GAIN, GRAY, TRANSMISSION, Place, ProbeMap, maps_of
+from trainer.diagnosis.proposals.reading import Reading, Values
+from trainer.diagnosis.proposals.row_column_shape import rows_and_columns_in
+from trainer.diagnosis.proposals.surface_shape import radial_in, smooth_in, times_surface
+from trainer.diagnosis.proposals.wave_shape import waves_in, waves_in_gray
+
+MOST = 5  # shapes that are fitted in one round
+LEAST = 0.02  # share of a map that a shape must explain
+NODES = 6  # times a shape's numbers over the map's nodes, which it must explain: noise fits as much
+WEAK = 0.1  # of the best candidate's worth: what is below is not fitted
+
+Read = Callable[[ProbeMap], list[Reading]]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A shape at a place.
+
+    Attributes
+    ----------
+    place : Place
+    reading : Reading
+    worth : float
+        Held-out excess that it may remove: the probe's, times its share of the maps.
+    """
+
+    place: Place
+    reading: Reading
+    worth: float
+
+    def name(self, taken: Collection[str]) -> str:
+        """A name for its effect that is not taken."""
+        parts = [self.place.stage, self.reading.name]
+        if self.place.name and self.place not in (GAIN, GRAY):
+            parts.insert(1, self.place.name)
+        stem = "_".join(parts)[:36]
+        names = [stem, *(f"{stem}_{k}" for k in range(2, 100))]
+        return next(n for n in names if n not in taken)
+
+
+def candidates_of(
+    probes: Sequence[ProbeResult], bench: Bench, signal: float, progress: Progress | None = None
+) -> list[Candidate]:
+    """Shapes that the probes' maps show, those that promise most first.
+
+    Parameters
+    ----------
+    probes : sequence of ProbeResult
+        Those that remove something.
+    bench : Bench
+    signal : float, counts
+        Standard deviation of the measured signal.
+    """
+    report = progress or no_progress
+    maps = _maps(probes, bench, signal)
+    found: list[Candidate] = []
+    for k, one in enumerate(maps):
+        report(k / len(maps), f"looking at the {one.place.stage} probe")
+        readings = [r for read in _readers(one.place) for r in read(one)]
+        products = [] if one.place is GRAY else [times_surface(one, r) for r in readings if _multiplied(r)]
+        for r in [*readings, *(p for p in products if p is not None)]:
+            if r.explained > max(LEAST, NODES * r.size / one.values.size):
+                found.append(Candidate(one.place, r, one.weight * r.explained))
+    found.sort(key=lambda c: -c.worth)
+    return [c for c in found if c.worth > WEAK * found[0].worth][:MOST]
+
+
+def more_of(
+    candidate: Candidate, probe: ProbeResult, bench: Bench, values: Values, own: bool
+) -> Candidate | None:
+    """The candidate's fitted specks with more freedom.
+
+    Parameters
+    ----------
+    probe : ProbeResult
+        Of what is left with the specks.
+    values : mapping
+        The specks' fitted numbers.
+    own : bool
+        Each with its own transmission; otherwise with the specks that the probe shows beside them, if it shows any.
+    """
+    (one,) = (m for m in _maps([probe], bench, 1.0) if m.place is candidate.place)
+    found = [blobs_of_their_own(one, values)] if own else more_blobs_in(one, values)
+    return Candidate(candidate.place, found[0], candidate.worth) if found else None
+
+
+def _maps(probes: Sequence[ProbeResult], bench: Bench, signal: float) -> list[ProbeMap]:
+    shapes = {p.stage: bench.camera.shape if p.stage == "sensor" else bench.panel.shape for p in probes}
+    return [m for p in probes for m in maps_of(p, shapes[p.stage], signal)]
+
+
+def _readers(place: Place) -> tuple[Read, ...]:
+    if place is TRANSMISSION:
+        return (blobs_in,)
+    if place is GRAY:
+        return (waves_in_gray, steps_in_gray)
+    smooth: tuple[Read, ...] = (waves_in, smooth_in, radial_in)
+    if place.spread != "pixels":
+        return smooth
+    return (*smooth, rows_and_columns_in, *((blobs_in,) if place is GAIN else ()))
+
+
+def _multiplied(reading: Reading) -> bool:
+    """Whether the shape times a surface is another shape; a surface's own product is one again."""
+    return reading.name not in ("surface", "specks", "radial") and reading.explained > LEAST

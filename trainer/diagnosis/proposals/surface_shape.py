@@ -1,0 +1,180 @@
+"""Smooth shapes in a probe's map: a low-order surface, and a function of the distance from a centre."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from runtime.lightpath.legendre import legendre_count, legendre_maps
+from trainer.diagnosis.proposals.probe_maps import ProbeMap
+from trainer.diagnosis.proposals.reading import Array, Number, Reading, share_explained, with_unit
+from trainer.formatting import number
+
+ORDER = 5  # of the surface
+ENVELOPE = 2  # order of the surface by which another shape is multiplied
+POWERS = 4  # of the squared distance
+CENTRES = np.linspace(-0.8, 0.8, 9)  # of the half width, where the search for a centre looks
+LEGENDRE = "from runtime.lightpath.legendre import legendre_surface"
+
+
+def smooth_in(one: ProbeMap) -> list[Reading]:
+    """The low-order surface of a map."""
+    basis = _surfaces(one, ORDER)
+    terms, shape = _fitted(basis, one.values)
+    unit, size = one.place.unit, float(np.std(shape))
+    return [
+        Reading(
+            name="surface",
+            about="A smooth surface.",
+            describe=lambda v: (
+                f"a surface of order {ORDER}, terms of {with_unit(float(np.hypot.reduce(v['terms'])), unit)} in all"
+            ),
+            formula=r"v = \sum_k a_k L_k(y, x)",
+            numbers=(
+                Number(
+                    "terms",
+                    unit,
+                    _scale(unit, size),
+                    tuple(terms),
+                    0.0,
+                    *_range(unit),
+                    f"of Legendre products of orders 1 to {ORDER}",
+                ),
+            ),
+            code=(_surface_line("value", "terms", one),),
+            found=shape,
+            explained=share_explained(one.values, shape),
+            imports=(LEGENDRE,),
+        )
+    ]
+
+
+def radial_in(one: ProbeMap) -> list[Reading]:
+    """The function of the distance from a centre that explains most of a map."""
+    y, x = one.grid
+    values = one.values - one.values.mean()
+    stride = max(1, int(np.sqrt(values.size / 4000)))
+    few = tuple(a[::stride, ::stride] for a in (y, x, values))
+    tried = []
+    for cy in CENTRES * one.reach[0]:
+        for cx in CENTRES * one.reach[1]:
+            basis = _powers(few[0] - cy, few[1] - cx, one.radius)
+            shape = _fitted(basis, few[2])[1]
+            tried.append((float(((few[2] - shape) ** 2).sum()), float(cy), float(cx)))
+    _, cy, cx = min(tried)
+    terms, shape = _fitted(_powers(y - cy, x - cx, one.radius), values)
+    unit, spread = one.place.unit, one.place.spread
+    far = 2 * one.radius
+    return [
+        Reading(
+            name="radial",
+            about="A function of the distance from a centre.",
+            describe=lambda v: (
+                f"a function of the distance from row {number(float(v['row']))}, column "
+                f"{number(float(v['column']))} {spread} from the middle, terms of "
+                f"{with_unit(float(np.hypot.reduce(v['terms'])), unit)} in all"
+            ),
+            formula=r"v = \sum_{k=1}^{4} a_k \rho^{2k},\quad \rho^2 = \frac{(y-y_0)^2 + (x-x_0)^2}{R^2}",
+            numbers=(
+                Number(
+                    "row", spread, 0.02 * one.radius, cy, 0.0, -far, far, "of the centre, from the middle"
+                ),
+                Number(
+                    "column", spread, 0.02 * one.radius, cx, 0.0, -far, far, "of the centre, from the middle"
+                ),
+                Number(
+                    "terms",
+                    unit,
+                    _scale(unit, float(np.std(shape))),
+                    tuple(terms),
+                    0.0,
+                    *_range(unit),
+                    "of the even powers of the distance, from the second on",
+                ),
+            ),
+            code=(
+                f"    square = ((y - row) ** 2 + (x - column) ** 2) / {one.radius:.6g} ** 2",
+                f"    value = sum(terms[k] * square ** (k + 1) for k in range({POWERS}))",
+            ),
+            found=shape,
+            explained=share_explained(one.values, shape),
+        )
+    ]
+
+
+def times_surface(one: ProbeMap, first: Reading) -> Reading | None:
+    """The product of a shape and a smooth surface, where it explains clearly more of the map than the shape alone."""
+    values = one.values - one.values.mean()
+    pattern = np.asarray(first.found) - np.mean(first.found)
+    basis = np.concatenate([pattern[None], pattern[None] * _surfaces(one, ENVELOPE)])
+    terms, shape = _fitted(basis, values)
+    explained = share_explained(one.values, shape)
+    if not terms or terms[0] <= 0 or explained < first.explained + 0.1 * (1 - first.explained):
+        return None
+    envelope = tuple(t / terms[0] for t in terms[1:])
+    return Reading(
+        name=f"{first.name}_times_surface",
+        about=first.about.rstrip(".") + ", whose strength changes smoothly over the field.",
+        describe=lambda v: (
+            f"{first.describe(v)}; their strength changes by {number(float(np.hypot.reduce(v['envelope'])))} "
+            "over the field"
+        ),
+        formula=first.formula + r";\quad v \to v\left(1 + \sum_k e_k L_k(y, x)\right)",
+        numbers=(
+            *first.numbers,
+            Number(
+                "envelope",
+                "1",
+                0.05,
+                envelope,
+                0.0,
+                -10.0,
+                10.0,
+                f"of Legendre products of orders 1 to {ENVELOPE}",
+            ),
+        ),
+        code=(
+            *first.code,
+            _surface_line("strength", "envelope", one),
+            "    value = value * (1 + strength)",
+        ),
+        found=shape,
+        explained=explained,
+        imports=(*first.imports, LEGENDRE),
+    )
+
+
+def _surface_line(name: str, terms: str, one: ProbeMap) -> str:
+    """The line of a file that makes a surface: coordinates run over -1 .. 1."""
+    if one.place.spread == "pixels":
+        stage = one.place.stage
+        return f"    {name} = legendre_surface({terms}, {stage}.y, {stage}.x)"
+    return f"    {name} = legendre_surface({terms}, torch.clamp(y, -1, 1), torch.clamp(x, -1, 1))"
+
+
+def _surfaces(one: ProbeMap, order: int) -> Array:
+    y, x = one.grid
+    half = (one.shape[0] / 2, one.shape[1] / 2) if one.place.spread == "pixels" else (1.0, 1.0)
+    maps = np.asarray(legendre_maps(y[:, :1] / half[0], x[:1, :] / half[1], order))
+    return maps.reshape(legendre_count(order), *one.values.shape)
+
+
+def _powers(y: Array, x: Array, radius: float) -> Array:
+    square = (y**2 + x**2) / radius**2
+    return np.stack([square ** (k + 1) for k in range(POWERS)])
+
+
+def _fitted(basis: Array, values: Array) -> tuple[list[float], Array]:
+    """Least-squares terms of maps (and a constant), and the sum of the maps without it."""
+    flat = basis.reshape(basis.shape[0], -1)
+    centred = flat - flat.mean(axis=1, keepdims=True)
+    normal = centred @ centred.T + 1e-12 * np.trace(centred @ centred.T) * np.eye(len(flat))
+    terms = np.linalg.solve(normal, centred @ (values - values.mean()).reshape(-1))
+    return [float(t) for t in terms], (terms @ flat).reshape(values.shape)
+
+
+def _scale(unit: str, size: float) -> float:
+    return 0.02 if unit != "counts" else float(f"{max(0.2 * size, 0.1):.2g}")
+
+
+def _range(unit: str) -> tuple[float, float]:
+    return (-1e4, 1e4) if unit == "counts" else (-20.0, 20.0)
