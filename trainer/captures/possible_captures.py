@@ -10,6 +10,7 @@ import numpy as np
 
 from firmware_iface.errors import InputError
 from trainer.captures.acquire import EXPOSURES_MS
+from trainer.captures.bench_file import Bench
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.capture_table import Capture
 from trainer.captures.patterns import PATTERN_KINDS, Gray, pattern_of_kind
@@ -17,6 +18,7 @@ from trainer.captures.patterns import PATTERN_KINDS, Gray, pattern_of_kind
 EXPOSURES = (0.25, 1.0, 4.0)  # of what is usual for the colour
 TURNS = 2  # patterns of each kind in each colour and plane, at least
 MANY_SCENES = 4  # colours and planes from which on one of each kind is enough
+PICTURE = "smooth_picture"  # whose computation says whether a plane is in reach
 LARGE = 640 * 480  # panel pixels, beyond which every second kind is left out: each takes long to predict
 
 
@@ -71,6 +73,11 @@ def possible_captures(
         Of the random patterns.
     limits_ms : (float, float), ms
         The shortest and the longest exposure.
+
+    Raises
+    ------
+    InputError
+        Where all planes are too far for a pattern to be computed.
     """
     bench = captures.bench
     scenes = [(c.name, float(p)) for p in dict.fromkeys(planes_mm) for c in bench.channels]
@@ -78,6 +85,8 @@ def possible_captures(
     turns = max(TURNS if len(scenes) < MANY_SCENES else 1, 1 + count // (len(scenes) * len(kinds)))
     found = []
     for channel, plane in scenes:
+        if not _in_reach(bench, channel, plane):
+            continue
         usual = usual_exposure_ms(captures, channel)
         exposures = tuple(float(f"{usual * f:.4g}") for f in EXPOSURES)
         exposures = tuple(e for e in exposures if limits_ms[0] <= e <= limits_ms[1]) or (usual,)
@@ -87,10 +96,7 @@ def possible_captures(
         first = _turns_taken(here)
         for kind in kinds:
             for turn in range(first[kind], first[kind] + turns):
-                try:
-                    gray = pattern_of_kind(bench, channel, plane, kind, turn, seed).gray
-                except InputError:  # the plane is too far for the pattern's own computation
-                    continue
+                gray = pattern_of_kind(bench, channel, plane, kind, turn, seed).gray
                 if gray.tobytes() not in shown:
                     shown.add(gray.tobytes())
                     found.append(PossibleCapture(channel, plane, kind, gray, exposures, place))
@@ -98,6 +104,15 @@ def possible_captures(
         planes = ", ".join(f"{p:g}" for p in dict.fromkeys(planes_mm))
         raise InputError(f"no pattern can be computed for the planes {planes} mm: give nearer --planes")
     return found
+
+
+def _in_reach(bench: Bench, channel: str, plane_mm: float) -> bool:
+    """Whether pictures can be computed for a plane."""
+    try:
+        pattern_of_kind(bench, channel, plane_mm, PICTURE, 0)
+    except InputError:
+        return False
+    return True
 
 
 def usual_exposure_ms(captures: CaptureSet, channel: str) -> float:
