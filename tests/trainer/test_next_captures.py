@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from firmware_iface.errors import InputError
+from firmware_iface.errors import DeviceError, InputError
+from firmware_iface.virtual import VirtualHeadset
 from tests.trainer.hidden import bench_file, ran
 from trainer.captures.acquire import acquire_from
 from trainer.captures.batches import load
@@ -267,7 +268,7 @@ def test_on_a_bench_it_captures_until_the_verdict_is_settled(
     out = tmp_path / "more"
     found = ran(capsys, "next", captures.folder, "--bench", bench, "--count", 6, "--out", out, "--workers", 1)
     assert found["settled"] is True and found["verdict"] == "missing"
-    assert found["in_doubt"] == []
+    assert found["in_doubt"] == [] and found["explained_by"] == ["spatial_coherence"]
     assert found["simulated"] is True
     assert "spatial_coherence is missing" in found["sentence"]
     assert 2 <= len(found["captures"]) <= 4
@@ -286,6 +287,34 @@ def test_on_a_bench_it_captures_until_the_verdict_is_settled(
     times = [c.time_s for c in grown.captures]
     assert times == sorted(times) and len(set(times)) == len(times)
     assert main(["check", str(out)]) == 0
+
+
+@pytest.mark.usefixtures("few_candidates")
+@pytest.mark.parametrize(("stop", "code"), [(KeyboardInterrupt, 130), (DeviceError("it is dark."), 2)])
+def test_captures_taken_before_it_stopped_are_kept(
+    stop: BaseException | type[BaseException],
+    code: int,
+    bench: Path,
+    captures: CaptureSet,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Ctrl-C, or a camera that fails, at the second capture."""
+    real, shown = VirtualHeadset._capture, []
+
+    def capture_or_stop(self: VirtualHeadset) -> np.ndarray:
+        shown.append(self.plane_mm)
+        if len(shown) == 2:
+            raise stop
+        return real(self)
+
+    monkeypatch.setattr(VirtualHeadset, "_capture", capture_or_stop)
+    out = tmp_path / "more"
+    line = ["next", str(captures.folder), "--bench", str(bench), "--count", "4", "--out", str(out)]
+    assert main([*line, "--workers", "1"]) == code
+    assert f"1 further capture was taken and is kept in {out}" in capsys.readouterr().err
+    assert len(read_captures(out)) == len(captures) + 1
 
 
 @pytest.mark.usefixtures("few_candidates")

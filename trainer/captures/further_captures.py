@@ -97,7 +97,7 @@ def take_further(
     ----------
     headset : Headset
     captures : CaptureSet
-        Its table is replaced when all were taken.
+        Its table is replaced after each.
     chosen : sequence of (mapping, uint8 array [H, W])
         Keys capture, pattern, channel, plane_mm, exposure_ms; others become columns. And the gray levels.
 
@@ -132,7 +132,7 @@ def take_further(
         Image.fromarray(counts.astype(np.uint16)).save(folder / image, compress_level=1)
         simulated = "yes" if headset.simulated else "no"
         rows.append({**one, "phase": phase, "image": image, "time_s": round(time, 6), "simulated": simulated})
-    _write_captures(folder, rows)
+        _write_captures(folder, rows)
     return read_captures(folder)
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING
 
+from firmware_iface.errors import DeviceError
 from runtime.program.command import Command, Result
+from runtime.program.interrupt import Interrupted
 from runtime.program.options import distances, seed_option, whole
 from runtime.program.outputs import Output
 from runtime.program.screen import Screen
@@ -34,12 +36,12 @@ if TYPE_CHECKING:
 PATTERNS = ("patterns.csv", "phase")
 MORE = """With --bench, PATTERNS becomes a copy of the set with the further captures in it, a capture set for every
 command; the set itself is not changed. What is new is taken two captures at a time and diagnosed again, until the
-verdict is settled: something is missing or nothing is, no other effect does as well, and the errors of the numbers
-change no picture by more than an effect must remove to be worth adding. Of a model that lacks nothing, each effect is
-taken out and looked for again, so that others that do as well in its place are found.
+verdict is settled: something is missing or nothing is, no other effect does as well, and the errors of the
+numbers change no picture by more than an effect must remove to be worth adding. Of a model that lacks nothing,
+each effect is taken out and looked for again, so that others that do as well in its place are found.
 
-expected_gain is in nats: half the logarithm of how much the information grows, on the model's numbers and on the
-choice between an effect and its rival, with the captures before it taken into account."""
+The expected gain is in nats: half the logarithm of how much the information grows, on the model's numbers and on
+the choice between an effect and its rival; what the captures before it say is taken into account."""
 
 
 def options(parser: ArgumentParser) -> None:
@@ -76,7 +78,13 @@ def options(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace, screen: Screen) -> Result:
-    """The captures that say most of what is in doubt."""
+    """The captures that say most of what is in doubt.
+
+    Raises
+    ------
+    Interrupted, DeviceError
+        After Ctrl-C or where a device fails, with a sentence on the captures that were taken before and are kept.
+    """
     thresholds_of(args)
     captures, known, model = inputs_of(args)
     from runtime.bundle.whole_files import whole_folder
@@ -88,8 +96,32 @@ def run(args: Namespace, screen: Screen) -> Result:
         args.out.parent.mkdir(parents=True, exist_ok=True)
         with whole_folder(args.out, replace=args.overwrite) as folder:
             work = _write if args.bench is None else _capture
-            result = work(args, folder, captures, model, known, pool, screen)
+            result, stopped = {}, None
+            try:
+                result = work(args, folder, captures, model, known, pool, screen)
+            except (KeyboardInterrupt, DeviceError) as error:
+                taken = _taken(folder, captures)
+                if not taken:
+                    raise
+                stopped = error
+    if stopped is not None:
+        these = (
+            "1 further capture was taken and is"
+            if taken == 1
+            else f"{taken} further captures were taken and are"
+        )
+        kept = f"{these} kept in {args.out}"
+        if isinstance(stopped, DeviceError):
+            raise DeviceError(f"{stopped} {kept}") from stopped
+        raise Interrupted(kept) from stopped
     return {**result, "out": str(args.out)}
+
+
+def _taken(folder: Path, captures: CaptureSet) -> int:
+    """How many captures a copy of a set has beyond the set's own."""
+    from trainer.captures.capture_set import read_captures
+
+    return len(read_captures(folder)) - len(captures) if (folder / "captures.csv").is_file() else 0
 
 
 def _write(
@@ -169,6 +201,7 @@ def _result(last: NextRound, rows: list[Result]) -> Result:
         "verdict": diagnosis.verdict,
         "stage": diagnosis.stage,
         "settled": last.settled,
+        "explained_by": list(last.doubts.model.names),
         "in_doubt": [{"effect": r.of or None, "rival": r.name} for r in last.doubts.rivals],
         "parameter_excess": last.found.parameter_excess,
         "heldout": diagnosis.held_out.as_json(),

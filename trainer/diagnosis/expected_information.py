@@ -7,7 +7,7 @@ that could imitate the model by other numbers gains nothing. Information of seve
 
 References
 ----------
-Atkinson and Fedorov 1975; Fedorov 1972.
+Atkinson and Fedorov 1975.
 """
 
 from __future__ import annotations
