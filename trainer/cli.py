@@ -21,6 +21,7 @@ from trainer.commands import (
     initialiser,
     loop,
     new_effect,
+    next_captures,
     propose,
     register,
     studio,
@@ -34,6 +35,7 @@ The usual way:
   hololoop-trainer check captures/                        is the capture set sound?
   hololoop-trainer compare captures/                      how far off is the ideal model, and where?
   hololoop-trainer explain captures/ --out model.toml     what is missing, effect after effect
+  hololoop-trainer next captures/ --model model.toml --count 4 --out patterns/     captures that decide what is in doubt
   hololoop-trainer field captures/ --model model.toml --out learned.toml     stripes, dust: the wave at the panel
   hololoop-trainer train captures/ --model model.toml --out run/     a network for what has no name
   hololoop-trainer export --model model.toml --out bundle/
@@ -47,6 +49,7 @@ IN_ORDER_OF_USE = (
     diagnose,
     add,
     explain,
+    next_captures,
     field,
     train,
     loop,

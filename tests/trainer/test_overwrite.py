@@ -107,6 +107,8 @@ def test_a_file_that_is_there_stays(
         ["initialiser", "{missing}", "--out", "{out}"],
         ["capture", "--bench", "virtual:demo", "--out", "{out}"],
         ["loop", "--bench", "virtual:demo", "--out", "{out}"],
+        ["next", "{missing}", "--count", "2", "--out", "{out}"],
+        ["next", "{missing}", "--bench", "virtual:demo", "--count", "2", "--out", "{out}"],
         ["train", "{missing}", "--out", "{out}"],
         ["demo", "--out", "{out}"],
     ],

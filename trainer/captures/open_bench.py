@@ -137,7 +137,7 @@ def open_bench(spec: str, seed: int = 0, known: Bench | None = None) -> Iterator
             f"--bench {spec} is a real headset: give --known or --model, which says what is known of its bench"
         )
     with open_devices(spec, seed) as devices:
-        _check(devices, known)
+        check_devices(devices, known)
         headset = RealHeadset(
             devices.panel,
             devices.lasers,
@@ -150,8 +150,20 @@ def open_bench(spec: str, seed: int = 0, known: Bench | None = None) -> Iterator
         yield OpenBench(headset, known, (known.distance_mm,))
 
 
-def _check(devices: Devices, bench: Bench) -> None:
-    """Raise InputError where the devices are not those of the bench."""
+def check_devices(devices: Devices | Any, bench: Bench) -> None:
+    """Refuse devices that are not those of a bench: other sizes, another bit depth, or a colour without a laser.
+
+    Parameters
+    ----------
+    devices : Devices
+        Or a virtual headset.
+    bench : Bench
+        What is known of the bench.
+
+    Raises
+    ------
+    InputError
+    """
     for what, actual, stated in (
         ("panel is (rows, columns)", devices.panel.shape, bench.panel.shape),
         ("camera's picture is (rows, columns)", devices.camera.shape, bench.camera.shape),

@@ -107,8 +107,7 @@ def choose_patterns(bench: Bench, channel: str, plane_mm: float, count: int, see
     """
     if count < 1:
         raise InputError(f"--patterns {count}: show at least one pattern, and better 7 or more")
-    entropy = [seed, [c.name for c in bench.channels].index(channel), round(plane_mm * 1000) % 2**32]
-    rng = np.random.default_rng(entropy)
+    rng = np.random.default_rng([seed, *_scene_entropy(bench, channel, plane_mm)])
     patterns, turns = [], dict.fromkeys(_ORDER, 0)
     for number in range(count):
         kind = _ORDER[number % len(_ORDER)]
@@ -116,6 +115,32 @@ def choose_patterns(bench: Bench, channel: str, plane_mm: float, count: int, see
         turns[kind] += 1
         patterns.append(Pattern(kind, _KINDS[kind](request)))
     return patterns
+
+
+def pattern_of_kind(
+    bench: Bench, channel: str, plane_mm: float, kind: str, turn: int, seed: int = 0
+) -> Pattern:
+    """One pattern of a family; the same seed gives the same one.
+
+    Parameters
+    ----------
+    kind : str
+        One of PATTERN_KINDS.
+    turn : int
+        How many patterns of this kind came before.
+
+    Returns
+    -------
+    Pattern
+
+    Raises
+    ------
+    InputError
+        Where the plane is out of reach.
+    """
+    entropy = [seed, turn, PATTERN_KINDS.index(kind), *_scene_entropy(bench, channel, plane_mm)]
+    request = _PatternRequest(bench, channel, plane_mm, np.random.default_rng(entropy), turn)
+    return Pattern(kind, _KINDS[kind](request))
 
 
 def dots_to_show(bench: Bench, channel: str, plane_mm: float, spacing: float) -> Gray:
@@ -141,6 +166,11 @@ def dots_to_show(bench: Bench, channel: str, plane_mm: float, spacing: float) ->
     request = _PatternRequest(bench, channel, plane_mm, np.random.default_rng(0), 0)
     picture = np.maximum(dot_pattern(bench.panel.shape, spacing).astype(float), 1e-3)
     return request.gray(_hologram(request, picture, _quadratic(request, 0.1)))
+
+
+def _scene_entropy(bench: Bench, channel: str, plane_mm: float) -> tuple[int, int]:
+    """What makes the random choices of one colour and plane other than those of the next."""
+    return [c.name for c in bench.channels].index(channel), round(plane_mm * 1000) % 2**32
 
 
 def _quadratic(s: _PatternRequest, edge: float) -> Array:
@@ -227,6 +257,7 @@ _KINDS: dict[str, Callable[[_PatternRequest], Gray]] = {
     "checkers": _checkers,
     "flat": _flat,
 }
+PATTERN_KINDS = tuple(_KINDS)
 
 
 def _tiles(s: _PatternRequest, draw: Callable[[Array, Array, float, float, float, float], Array]) -> Gray:

@@ -15,7 +15,7 @@ def threshold_options(parser: ArgumentParser) -> None:
     """--level, --share, --min-excess, --complete-share and --complete-excess."""
     group = parser.add_argument_group(
         "what counts",
-        "Shares are of the ideal model's excess: the mean squared error above the camera's noise, over "
+        "Shares are of the ideal model's excess: the mean squared error above the camera's noise, over\n"
         "the variance of the measured signal. No threshold is below the floor that repeated pictures show.",
     )
     share = number(0, 1)

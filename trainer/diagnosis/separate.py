@@ -61,13 +61,17 @@ def captures_that_separate(
     ]
 
 
+def with_all_gains(model: Model, channel: str) -> Model:
+    """The model with a gain for a colour that was not captured yet: that of another."""
+    return replace(model, gain={channel: next(iter(model.gain.values())), **model.gain})
+
+
 def _difference(one: Model, other: Model, batch: Batch) -> float:
     """Squared difference of two models' predictions of a batch, gain left free, over the signal's variance."""
     with torch.no_grad():
         predictions = []
         for model in (one, other):
-            gains = {batch.channel: next(iter(model.gain.values())), **model.gain}
-            model = replace(model, gain=gains)
+            model = with_all_gains(model, batch.channel)
             predictor = Predictor(model, batch)
             predictions.append(predictor.predict(model))
         a, b = predictions

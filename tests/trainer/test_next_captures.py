@@ -1,0 +1,369 @@
+"""The captures that say most: information that is what fits then find, rivals told apart, and sets that grow."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from firmware_iface.errors import DeviceError, InputError
+from firmware_iface.virtual import VirtualHeadset
+from tests.trainer.hidden import bench_file, ran
+from trainer.captures.acquire import acquire_from
+from trainer.captures.batches import load
+from trainer.captures.capture_set import CaptureSet, read_captures
+from trainer.captures.further_captures import copy_captures, new_ids
+from trainer.captures.patterns import PATTERN_KINDS, pattern_of_kind
+from trainer.captures.possible_captures import PossibleCapture, possible_captures
+from trainer.cli import main
+from trainer.diagnosis.capture_choice import next_captures
+from trainer.diagnosis.doubts import Doubts, Rival, doubts_of, fit_rows
+from trainer.diagnosis.expected_information import (
+    ExpectedInformation,
+    information_of_captures,
+    information_of_possible,
+    prior,
+)
+from trainer.effects.effect_catalogue import catalogue
+from trainer.effects.testing import small_bench
+from trainer.fitting.gauss_newton import fit
+from trainer.fitting.pool import open_pool
+from trainer.model.model import Model, absent
+
+KNOWN = catalogue()
+
+
+@pytest.fixture(autouse=True)
+def _one_core(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("trainer.fitting.pool.cores", lambda: 1)
+
+
+@pytest.fixture
+def few_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The commands know four effects: what is tested is not the catalogue's."""
+    names = ("spatial_coherence", "sensor_blur", "zero_order", "crosstalk")
+    monkeypatch.setattr("trainer.effects.effect_catalogue.BUILT_IN", tuple(KNOWN[n] for n in names))
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bench whose source has an extent, which at one plane is a camera's blur."""
+    folder = tmp_path_factory.mktemp("bench")
+    return bench_file(folder, 'kind = "spatial_coherence"', width=96, height=64, distance_mm=8)
+
+
+@pytest.fixture(scope="module")
+def captures(bench: Path) -> CaptureSet:
+    acquire_from(str(bench), bench.parent / "captures", patterns=4)
+    return read_captures(bench.parent / "captures")
+
+
+@pytest.fixture(scope="module")
+def doubts(captures: CaptureSet) -> Doubts:
+    """What the set leaves in doubt among four candidates."""
+    names = ("spatial_coherence", "sensor_blur", "zero_order", "crosstalk")
+    with open_pool(1) as pool:
+        return doubts_of(captures, Model(captures.bench), {n: KNOWN[n] for n in names}, pool)
+
+
+def fitted(captures: CaptureSet, name: str) -> Model:
+    """The model with one effect, fitted."""
+    model = Model(captures.bench).having(absent(KNOWN[name], captures.bench))
+    return fit(model, [name], load(captures, fit_rows(captures))).model
+
+
+def said(
+    captures: CaptureSet, one: PossibleCapture, model: Model, *rivals: Model
+) -> list[ExpectedInformation]:
+    return information_of_possible(captures.folder, one, model, rivals, 0.0)
+
+
+def shown(
+    captures: CaptureSet, plane_mm: float = 8.0, exposures: tuple[float, ...] = (20.0,)
+) -> PossibleCapture:
+    gray = pattern_of_kind(captures.bench, "green", plane_mm, "rough_picture", 3).gray
+    return PossibleCapture("green", plane_mm, "rough_picture", gray, exposures, 0)
+
+
+def test_every_kind_of_pattern_can_be_asked_for_and_comes_again() -> None:
+    bench = small_bench()
+    for kind in PATTERN_KINDS:
+        first, again, other = (pattern_of_kind(bench, "green", 6.0, kind, turn).gray for turn in (0, 0, 1))
+        assert first.shape == bench.panel.shape and first.dtype == np.uint8
+        assert np.array_equal(first, again)
+        assert not np.array_equal(first, other)
+
+
+def test_what_can_be_captured_has_all_planes_and_exposures_and_nothing_that_was_shown(
+    captures: CaptureSet,
+) -> None:
+    found = possible_captures(captures, [8.0, 12.8], 4)
+    assert {one.plane_mm for one in found} == {8.0, 12.8}
+    assert {one.kind for one in found} == set(PATTERN_KINDS)
+    usual = captures.captures[0].exposure_ms
+    assert all(one.exposures_ms[one.usual] == usual for one in found)
+    assert all(np.allclose(one.exposures_ms, [usual / 4, usual, 4 * usual], rtol=1e-3) for one in found)
+    there = {captures.gray(c).tobytes() for c in captures.captures}
+    assert not there & {one.gray.tobytes() for one in found if one.plane_mm == 8.0}
+    assert len({(one.plane_mm, one.gray.tobytes()) for one in found}) == len(found)
+    short = possible_captures(captures, [8.0], 4, limits_ms=(0.02, usual))
+    assert all(max(one.exposures_ms) == usual for one in short)
+    assert len(possible_captures(captures, [8.0], 40)) >= 40
+
+
+def test_the_information_is_that_of_the_fit(captures: CaptureSet) -> None:
+    """Errors from the expected information are those that the fit finds from its residuals."""
+    model = fitted(captures, "spatial_coherence")
+    rows = fit_rows(captures)
+    ids = tuple(c.capture for c in rows)
+    numbers = prior(model) + sum(
+        one.numbers for one in information_of_captures(captures.folder, ids, model, (), 0.0)
+    )
+    expected = np.sqrt(np.diag(np.linalg.inv(numbers)))
+    effect = model.instance("spatial_coherence")
+    assert effect.errors is not None
+    for place, name in enumerate(("extent_y", "extent_x")):
+        scale = effect.effect.parameter(name).scale
+        assert 0.4 < expected[place] * scale / float(effect.errors[name]) < 1.5
+
+
+def test_more_light_says_more_and_saturated_pixels_say_nothing(captures: CaptureSet) -> None:
+    model = fitted(captures, "spatial_coherence")
+    usual = captures.captures[0].exposure_ms
+    dark, light, blind = said(captures, shown(captures, exposures=(usual / 4, usual, 1e6)), model)
+    assert 3 < light.numbers[0, 0] / dark.numbers[0, 0] < 20
+    assert dark.saturated <= light.saturated < 0.05
+    assert blind.saturated > 0.99
+    assert np.abs(blind.numbers).max() < 1e-3 * light.numbers[0, 0]
+
+
+def test_a_rival_that_other_numbers_imitate_cannot_be_told(captures: CaptureSet) -> None:
+    """An effect with another value differs, but its own numbers take that up: no capture tells it apart."""
+    model = fitted(captures, "spatial_coherence")
+    present = model.instance("spatial_coherence")
+    nearly = {n: v * 1.01 if n.startswith("extent") else v for n, v in present.values.items()}
+    same = replace(model, present=(present.with_values(nearly),))
+    blur = fitted(captures, "sensor_blur")
+
+    def told(plane_mm: float, rival: Model) -> float:
+        (one,) = said(captures, shown(captures, plane_mm), model, rival)
+        matrix = one.rivals[0] + np.pad(prior(rival), (0, 1))
+        along = np.linalg.solve(matrix[:-1, :-1], matrix[:-1, -1])
+        return float(matrix[-1, -1] - matrix[:-1, -1] @ along)
+
+    (off,) = said(captures, shown(captures), model, same)
+    assert off.rivals[0][-1, -1] > 1.0
+    assert told(8.0, same) < 0.05 * off.rivals[0][-1, -1]
+    ids = tuple(c.capture for c in fit_rows(captures))
+    here = information_of_captures(captures.folder, ids, model, (blur,), 0.0)
+    assert all(one.difference[0] < 1e-3 for one in here)
+    assert told(12.8, blur) > 20 * told(8.0, blur)
+
+
+def test_a_plane_that_is_too_far_is_left_out(captures: CaptureSet) -> None:
+    assert {one.plane_mm for one in possible_captures(captures, [8.0, 9000.0], 1)} == {8.0}
+    with pytest.raises(InputError, match="for the planes 9000 mm"):
+        possible_captures(captures, [9000.0], 1)
+
+
+def test_the_doubt_is_named(doubts: Doubts) -> None:
+    assert doubts.diagnosis.verdict == "missing"
+    assert [{r.of, r.name} for r in doubts.rivals] == [{"spatial_coherence", "sensor_blur"}]
+    assert not doubts.decided
+
+
+def test_the_first_captures_are_two_where_the_rivals_part(captures: CaptureSet, doubts: Doubts) -> None:
+    """At the set's own plane an extent is a blur; elsewhere not. The second is there to judge by."""
+    with open_pool(1) as pool:
+        found = next_captures(captures, doubts, possible_captures(captures, [8.0, 12.8], 3), 3, pool)
+    first, second, third = found.chosen
+    assert first.plane_mm == second.plane_mm == 12.8
+    assert "sensor_blur" in first.why and "spatial_coherence" in first.why
+    assert "to judge by" in second.why
+    assert first.expected_gain > 2 * second.expected_gain > 0
+    assert second.expected_gain >= third.expected_gain > 0
+    assert len({one.gray.tobytes() for one in found.chosen}) == 3
+
+
+def test_without_rivals_the_captures_sharpen_the_numbers(captures: CaptureSet, doubts: Doubts) -> None:
+    alone = replace(doubts, rivals=())
+    with open_pool(1) as pool:
+        found = next_captures(captures, alone, possible_captures(captures, [8.0], 2), 2, pool)
+    assert all("sharpens spatial_coherence" in one.why or "extent" in one.why for one in found.chosen)
+    assert found.chosen[0].expected_gain > found.chosen[1].expected_gain > 0
+    assert 0 < found.parameter_excess < 2e-4
+
+
+def test_an_effect_that_is_in_the_model_is_doubted_too(captures: CaptureSet) -> None:
+    known = {n: KNOWN[n] for n in ("spatial_coherence", "sensor_blur", "zero_order")}
+    for name, other in (("spatial_coherence", "sensor_blur"), ("sensor_blur", "spatial_coherence")):
+        with open_pool(1) as pool:
+            found = doubts_of(captures, fitted(captures, name), known, pool)
+        assert found.diagnosis.verdict == "complete"
+        assert [(r.of, r.name) for r in found.rivals] == [(name, other)]
+        assert found.model.names == (name,)
+
+
+def test_a_distance_at_one_plane_may_be_a_wavelength(tmp_path: Path) -> None:
+    """Until a second plane is captured, where the two differ."""
+    spec = bench_file(tmp_path, 'kind = "distance"\noffset_mm = 0.2', width=96, height=64, distance_mm=8)
+    acquire_from(str(spec), tmp_path / "captures", patterns=4)
+    captures = read_captures(tmp_path / "captures")
+    known = {n: KNOWN[n] for n in ("distance", "wavelength", "zero_order")}
+    with open_pool(1) as pool:
+        found = doubts_of(captures, Model(captures.bench), known, pool)
+        assert [(r.of, r.name) for r in found.rivals] == [("distance", "wavelength")]
+        first = next_captures(captures, found, possible_captures(captures, [8.0, 4.8], 1), 1, pool).chosen[0]
+    assert first.plane_mm == 4.8
+    assert isinstance(found.rivals[0], Rival)
+
+
+def test_a_copy_of_a_set_says_the_same_and_ids_are_new(captures: CaptureSet, tmp_path: Path) -> None:
+    (tmp_path / "copy").mkdir()
+    copy = copy_captures(captures, tmp_path / "copy")
+    assert copy.bench == captures.bench
+    for one, other in zip(copy.captures, captures.captures, strict=True):
+        assert np.array_equal(copy.counts(one), captures.counts(other))
+        assert np.array_equal(copy.gray(one), captures.gray(other))
+        assert (one.capture, one.time_s, one.extra) == (other.capture, other.time_s, other.extra)
+    named = replace(captures, captures=(replace(captures.captures[0], capture="next-000"),))
+    assert new_ids(named, 2) == ["next-001", "next-002"]
+
+
+@pytest.mark.usefixtures("few_candidates")
+def test_patterns_are_written_ready_to_show(
+    captures: CaptureSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "patterns"
+    command = ("next", captures.folder, "--count", 3, "--out", out, "--workers", 1)
+    found = ran(capsys, *command)
+    assert found["verdict"] == "missing" and found["settled"] is False
+    assert found["out"] == str(out)
+    assert [{d["effect"], d["rival"]} for d in found["in_doubt"]] == [{"spatial_coherence", "sensor_blur"}]
+    with (out / "patterns.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [r["capture"] for r in rows] == [c["capture"] for c in found["captures"]]
+    assert len(rows) == 3
+    for row, one in zip(rows, found["captures"], strict=True):
+        assert {"capture", "channel", "plane_mm", "pattern", "phase", "exposure_ms", "why"} <= set(row)
+        assert one["expected_gain"] > 0 and one["why"] == row["why"]
+        assert float(row["plane_mm"]) == one["plane_mm"] and float(row["exposure_ms"]) == one["exposure_ms"]
+        with Image.open(out / row["phase"]) as picture:
+            assert picture.mode == "L" and picture.size == (96, 64)
+    assert sorted(p.name for p in out.iterdir()) == ["patterns.csv", "phase"]
+    assert main([str(word) for word in command]) == 2
+    assert "is there already" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("few_candidates")
+def test_on_a_bench_it_captures_until_the_verdict_is_settled(
+    bench: Path, captures: CaptureSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = captures.content_hash()
+    out = tmp_path / "more"
+    found = ran(capsys, "next", captures.folder, "--bench", bench, "--count", 6, "--out", out, "--workers", 1)
+    assert found["settled"] is True and found["verdict"] == "missing"
+    assert found["in_doubt"] == [] and found["explained_by"] == ["spatial_coherence"]
+    assert found["simulated"] is True
+    assert "spatial_coherence is missing" in found["sentence"]
+    assert 2 <= len(found["captures"]) <= 4
+    assert captures.content_hash() == before
+    grown = read_captures(out)
+    assert len(grown) == len(captures) + len(found["captures"])
+    for old, one in zip(captures.captures, grown.captures, strict=False):
+        assert np.array_equal(captures.counts(old), grown.counts(one))
+    for row, one in zip(found["captures"], grown.captures[len(captures) :], strict=True):
+        assert (row["capture"], row["plane_mm"], row["exposure_ms"]) == (
+            one.capture,
+            one.plane_mm,
+            one.exposure_ms,
+        )
+        assert row["phase"] == one.phase.relative_to(out).as_posix()
+    times = [c.time_s for c in grown.captures]
+    assert times == sorted(times) and len(set(times)) == len(times)
+    assert main(["check", str(out)]) == 0
+
+
+@pytest.mark.usefixtures("few_candidates")
+@pytest.mark.parametrize(("stop", "code"), [(KeyboardInterrupt, 130), (DeviceError("it is dark."), 2)])
+def test_captures_taken_before_it_stopped_are_kept(
+    stop: BaseException | type[BaseException],
+    code: int,
+    bench: Path,
+    captures: CaptureSet,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Ctrl-C, or a camera that fails, at the second capture."""
+    real, shown = VirtualHeadset._capture, []
+
+    def capture_or_stop(self: VirtualHeadset) -> np.ndarray:
+        shown.append(self.plane_mm)
+        if len(shown) == 2:
+            raise stop
+        return real(self)
+
+    monkeypatch.setattr(VirtualHeadset, "_capture", capture_or_stop)
+    out = tmp_path / "more"
+    line = ["next", str(captures.folder), "--bench", str(bench), "--count", "4", "--out", str(out)]
+    assert main([*line, "--workers", "1"]) == code
+    assert f"1 further capture was taken and is kept in {out}" in capsys.readouterr().err
+    assert len(read_captures(out)) == len(captures) + 1
+
+
+@pytest.mark.usefixtures("few_candidates")
+def test_nothing_is_captured_where_nothing_is_in_doubt(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spec = bench_file(tmp_path, width=96, height=64, distance_mm=8)
+    acquire_from(str(spec), tmp_path / "captures", patterns=4)
+    found = ran(
+        capsys,
+        *("next", tmp_path / "captures", "--bench", spec, "--count", 4, "--out", tmp_path / "more"),
+        *("--workers", 1),
+    )
+    assert (found["verdict"], found["settled"], found["captures"]) == ("complete", True, [])
+    assert len(read_captures(tmp_path / "more")) == 5
+
+
+@pytest.mark.usefixtures("few_candidates")
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--count", "0"], "--count: '0' is not a whole number from 1"),
+        (["--count", "2", "--bench", "virtual:demoo"], "did you mean 'demo'"),
+        (["--count", "2", "--bench", "virtual:demo"], "the panel is (rows, columns)"),
+        (["--count", "2", "--planes", "near"], "--planes: 'near' is not a number"),
+    ],
+)
+def test_what_cannot_be_done_gets_a_sentence_and_leaves_nothing(
+    words: list[str],
+    message: str,
+    captures: CaptureSet,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    line = ["next", str(captures.folder), *words, "--out", str(tmp_path / "out"), "--workers", "1", "--json"]
+    assert main(line) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1
+    assert message in err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_the_study_of_captures_needed_finds_half(tmp_path: Path) -> None:
+    """The bench of these tests: two further captures where twelve usual ones do not decide."""
+    from tests.campaigns.captures_needed import measure
+
+    with open_pool(1) as pool:
+        found = measure(0, tmp_path, pool)
+    assert found.usual is None and found.chosen is not None and found.chosen <= 8
+    assert found.errors_as_small is not None and found.errors_as_small <= 8
+    assert json.dumps(found.hidden)

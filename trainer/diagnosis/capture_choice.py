@@ -1,0 +1,273 @@
+"""The captures that say most of what is in doubt: chosen one after the other by what each adds to those before it."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from firmware_iface.errors import InputError
+from runtime.program.progress import Progress, no_progress
+from trainer.captures.capture_set import CaptureSet
+from trainer.captures.patterns import Gray
+from trainer.captures.possible_captures import PossibleCapture
+from trainer.diagnosis.doubts import Doubts
+from trainer.diagnosis.expected_information import (
+    MOST_SATURATED,
+    ExpectedInformation,
+    information_of_captures,
+    information_of_possible,
+    prior,
+)
+from trainer.fitting.jacobian import keys_of
+from trainer.fitting.pool import Pool
+from trainer.formatting import number
+
+Scene = tuple[str, float]
+JUDGED = 2  # patterns of a colour and plane from which on one of them is held out
+
+
+@dataclass(frozen=True)
+class NextCapture:
+    """A capture to take.
+
+    Attributes
+    ----------
+    channel : str
+    plane_mm : float, mm
+    kind : str
+        The family of the pattern.
+    gray : uint8 array [H, W]
+    exposure_ms : float, ms
+    why : str
+        What it says, in words.
+    expected_gain : float, nats
+        Information that it adds to the captures before it.
+    """
+
+    channel: str
+    plane_mm: float
+    kind: str
+    gray: Gray
+    exposure_ms: float
+    why: str
+    expected_gain: float
+
+    def as_json(self, name: str, phase: str) -> dict[str, Any]:
+        """A row of the key `captures` of `next --json`.
+
+        Parameters
+        ----------
+        name : str
+            Id of the capture, and of its pattern.
+        phase : str
+            Path of the pattern in the folder.
+        """
+        return {
+            "capture": name,
+            "channel": self.channel,
+            "plane_mm": self.plane_mm,
+            "pattern": name,
+            "phase": phase,
+            "exposure_ms": self.exposure_ms,
+            "kind": self.kind,
+            "why": self.why,
+            "expected_gain": self.expected_gain,
+        }
+
+
+@dataclass(frozen=True)
+class NextCaptures:
+    """The captures to take, and what there is to decide.
+
+    Attributes
+    ----------
+    chosen : tuple of NextCapture
+        Best first, each given those before it.
+    parameter_excess : float
+        Excess that the errors of the model's numbers may make in a picture, in the worst of all possible captures
+        with the usual exposure in the colours of the set.
+    """
+
+    chosen: tuple[NextCapture, ...]
+    parameter_excess: float
+
+
+def settled(doubts: Doubts, parameter_excess: float) -> bool:
+    """Whether further captures have nothing to decide.
+
+    The captures say what is missing or that nothing is, no other effect does as well, and the errors of the numbers
+    make less than an effect must remove to be worth adding.
+    """
+    limit = doubts.diagnosis.thresholds.least(doubts.diagnosis.ideal_excess)
+    return doubts.decided and parameter_excess < limit
+
+
+def next_captures(
+    captures: CaptureSet,
+    doubts: Doubts,
+    possible: Sequence[PossibleCapture],
+    count: int,
+    pool: Pool,
+    progress: Progress | None = None,
+) -> NextCaptures:
+    """Choose captures by the information that they are expected to add.
+
+    Of the information on the model's numbers half the logarithm of the determinant counts (D-optimality), of that on
+    each rival's share half its logarithm. A colour and plane that has a single pattern gets a second one next,
+    because the first is fitted, and without a second nothing judges there.
+
+    Parameters
+    ----------
+    possible : sequence of PossibleCapture
+        What to choose from.
+    count : int
+        How many to choose.
+    progress : callable, optional
+        Called with the share that is done and what is being done.
+
+    Raises
+    ------
+    InputError
+        Where none of them can be predicted.
+    """
+    report = progress or no_progress
+    rivals = tuple(r.model for r in doubts.rivals)
+    shared = (doubts.model, rivals, doubts.unexplained)
+    report(0.0, "what the captures say")
+    tasks = [(captures.folder, (c.capture,), *shared) for c in doubts.fitted]
+    there = [i for found in pool.map(information_of_captures, tasks) for i in found]
+    asked = [(captures.folder, p, *shared) for p in possible]
+    what = f"predicting {len(asked)} possible captures"
+    predicted = pool.map(information_of_possible, asked, lambda n: report(n / len(asked), what))
+    if not any(predicted):
+        planes = ", ".join(f"{z:g}" for z in sorted({p.plane_mm for p in possible}))
+        raise InputError(f"the model does not reach the planes {planes} mm: give nearer --planes")
+    state = _Information.of(doubts, there)
+    patterns: dict[Scene, set[str]] = defaultdict(set)
+    for c in captures.captures:
+        patterns[c.channel, c.plane_mm].add(c.pattern)
+    counts = {scene: len(names) for scene, names in patterns.items()}
+    error = _parameter_excess(captures, state, possible, predicted)
+    return NextCaptures(tuple(_greedy(state, possible, predicted, counts, count)), error)
+
+
+@dataclass
+class _Information:
+    """Information gathered so far: of the model's numbers, and of each rival's numbers and share."""
+
+    doubts: Doubts
+    numbers: np.ndarray
+    rivals: list[np.ndarray]
+
+    @classmethod
+    def of(cls, doubts: Doubts, there: Sequence[ExpectedInformation]) -> _Information:
+        """What a set's captures say."""
+        rivals = []
+        for rival in doubts.rivals:
+            first = prior(rival.model)
+            rivals.append(np.pad(first, (0, 1)))
+            rivals[-1][-1, -1] = 1.0  # the share is somewhere from 0 to 1
+        state = cls(doubts, prior(doubts.model), rivals)
+        for one in there:
+            state.add(one)
+        return state
+
+    def add(self, one: ExpectedInformation) -> None:
+        self.numbers = self.numbers + one.numbers
+        self.rivals = [a + b for a, b in zip(self.rivals, one.rivals, strict=True)]
+
+    def gains(self, one: ExpectedInformation) -> tuple[float, list[float]]:
+        """Nats that a capture adds: on the numbers, and on each rival's share."""
+        numbers = 0.5 * (_log_det(self.numbers + one.numbers) - _log_det(self.numbers))
+        shares = [
+            0.5 * math.log(_of_share(a + b) / _of_share(a))
+            for a, b in zip(self.rivals, one.rivals, strict=True)
+        ]
+        return numbers, shares
+
+    def gain(self, one: ExpectedInformation) -> float:
+        """Nats that a capture adds."""
+        numbers, shares = self.gains(one)
+        return numbers + sum(shares)
+
+    def why(self, one: ExpectedInformation) -> str:
+        """What a capture says most of, in words."""
+        numbers, shares = self.gains(one)
+        if shares and max(shares) >= min(numbers, 0.5):
+            k = int(np.argmax(shares))
+            words = f"tells {self.doubts.rivals[k]}: there they differ by {100 * one.difference[k] ** 0.5:.2g} % of "
+            return words + "the signal's rms"
+        keys = keys_of(self.doubts.model, self.doubts.model.names)
+        if not keys:
+            return "sharpens the brightness of the model"
+        before = np.sqrt(np.diag(np.linalg.inv(self.numbers)))[: len(keys)]
+        after = np.sqrt(np.diag(np.linalg.inv(self.numbers + one.numbers)))[: len(keys)]
+        k = int(np.argmin(after / before))
+        effect, name, _ = keys[k]
+        parameter = self.doubts.model.instance(effect).effect.parameter(name)
+        unit = "" if parameter.unit in ("", "1") else f" {parameter.unit}"
+        errors = [number(parameter.scale * float(e[k]), 2) for e in (before, after)]
+        return f"sharpens {effect}: the error of {name.replace('_', ' ')} falls from {errors[0]} to {errors[1]}{unit}"
+
+
+def _greedy(
+    state: _Information,
+    possible: Sequence[PossibleCapture],
+    predicted: Sequence[Sequence[ExpectedInformation]],
+    patterns: dict[Scene, int],
+    count: int,
+) -> list[NextCapture]:
+    left = [k for k, one in enumerate(predicted) if one]
+    found: list[NextCapture] = []
+    patterns = dict(patterns)
+    last: Scene | None = None
+    while left and len(found) < count:
+        unjudged = [k for k in left if possible[k].scene == last and patterns.get(last, 0) < JUDGED]
+        options = [
+            (state.gain(one), k, e)
+            for k in unjudged or left
+            for e, one in enumerate(predicted[k])
+            if one.saturated <= MOST_SATURATED or e == 0
+        ]
+        gain, k, e = max(options)
+        one, information = possible[k], predicted[k][e]
+        why = state.why(information) + ("; a second pattern there, to judge by" if unjudged else "")
+        found.append(
+            NextCapture(one.channel, one.plane_mm, one.kind, one.gray, one.exposures_ms[e], why, float(gain))
+        )
+        state.add(information)
+        last = one.scene
+        patterns[last] = patterns.get(last, 0) + 1
+        left.remove(k)
+    return found
+
+
+def _parameter_excess(
+    captures: CaptureSet,
+    state: _Information,
+    possible: Sequence[PossibleCapture],
+    predicted: Sequence[Sequence[ExpectedInformation]],
+) -> float:
+    """Excess that the errors of the numbers may make in a picture, at worst."""
+    covariance = np.linalg.inv(state.numbers)
+    excess = [
+        float((covariance * one[p.usual].excess).sum())
+        for p, one in zip(possible, predicted, strict=True)
+        if one and p.channel in captures.channels
+    ]
+    return max(excess, default=0.0)
+
+
+def _log_det(matrix: np.ndarray) -> float:
+    return float(np.linalg.slogdet(matrix)[1])
+
+
+def _of_share(matrix: np.ndarray) -> float:
+    """Information on the last number, the others left free."""
+    along = np.linalg.solve(matrix[:-1, :-1], matrix[:-1, -1])
+    return float(max(matrix[-1, -1] - matrix[:-1, -1] @ along, 1e-12))
