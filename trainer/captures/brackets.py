@@ -15,6 +15,7 @@ import numpy as np
 from trainer.captures.bench_file import Camera
 from trainer.captures.camera_noise import SURE, noise_variance
 from trainer.captures.capture_table import Capture, RowFault
+from trainer.captures.equal_patterns import same_gray_levels
 
 NEAR_TOP = 0.9  # of full scale, up to which two frames' brightness is compared: saturation must not choose the pixels
 
@@ -65,7 +66,7 @@ def bracket_faults(rows: Sequence[Capture]) -> list[RowFault]:
     Parameters
     ----------
     rows : sequence of Capture
-        In the order of the table, those with the same gray levels under one pattern name.
+        In the order of the table.
     """
     places: dict[str, list[int]] = {}
     for number, row in enumerate(rows):
@@ -89,7 +90,7 @@ def _faults(rows: Sequence[Capture], at: list[int]) -> list[RowFault]:
         wrong = ""
         if (row.channel, row.plane_mm) != (first.channel, first.plane_mm):
             wrong = f"captures {first.capture} and {row.capture} are of different channels or planes"
-        elif row.pattern != first.pattern:
+        elif not same_gray_levels(first, row):
             wrong = f"captures {first.capture} and {row.capture} show different gray levels"
         elif row.exposure_ms in exposures:
             same = exposures[row.exposure_ms]

@@ -206,12 +206,10 @@ def read_captures(folder: Path | str) -> CaptureSet:
         raise InputError(f"{folder} is not a folder: name a capture set, with bench.toml and captures.csv")
     bench = read_bench(folder / "bench.toml")
     rows, faults = scan_rows(folder, bench)
-    if not faults:
-        rows = one_name_each(rows)
-        faults = bracket_faults(rows)
+    faults = faults or bracket_faults(rows)
     if faults:
         raise InputError(faults[0].message)
-    return CaptureSet(folder, bench, tuple(one_capture_each(rows)))
+    return CaptureSet(folder, bench, tuple(one_capture_each(one_name_each(rows))))
 
 
 @lru_cache(maxsize=8)

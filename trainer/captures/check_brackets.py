@@ -10,7 +10,6 @@ from firmware_iface.errors import InputError
 from trainer.captures.bench_file import Camera
 from trainer.captures.brackets import bracket_faults, frame_scales, one_capture_each
 from trainer.captures.capture_table import Capture
-from trainer.captures.equal_patterns import one_name_each
 from trainer.captures.problems import Problem
 
 OFF = (
@@ -39,7 +38,6 @@ def bracket_problems(
     """
     if not any(row.bracket for row in rows):
         return []
-    rows = one_name_each(rows)
     faults = bracket_faults(rows)
     problems = [Problem("error", f.kind, f.capture, f.message) for f in faults]
     captures = [c for c in one_capture_each(rows) if c.frames]
