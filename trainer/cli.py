@@ -22,6 +22,7 @@ from trainer.commands import (
     loop,
     new_effect,
     register,
+    response,
     studio,
     train,
 )
@@ -58,6 +59,7 @@ IN_ORDER_OF_USE = (
     studio,
     initialiser,
     register,
+    response,
 )
 
 PROGRAM = Program(

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from firmware_iface.errors import InputError
 from firmware_iface.virtual.bench_description import BenchDescription, read_bench
+from firmware_iface.virtual.measured_field import MeasuredField
 from firmware_iface.virtual.named_benches import named_bench
 
 
@@ -44,7 +46,12 @@ def load_bench(spec: str) -> BenchDescription:
             "Give the headset's configuration (hololoop-runtime serve --help; capture takes this file as --known), or "
             "virtual:NAME; to simulate this bench, add the line [simulation] to a copy."
         )
-    return read_bench(tables, path.name)
+    bench = read_bench(tables, path.name)
+    files = [
+        replace(d, file=str(path.parent / d.file)) if isinstance(d, MeasuredField) and d.file else d
+        for d in bench.defects
+    ]
+    return replace(bench, defects=tuple(files))
 
 
 def _is_data_sheet(tables: dict[str, Any]) -> bool:

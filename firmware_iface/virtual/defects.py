@@ -1,7 +1,7 @@
 """Hidden defects of a simulated bench: one frozen dataclass for each kind, parameters in physical units.
 
 The first eighteen kinds carry the names of the catalogue of effects, and `further_defects` has ten more. `specks`,
-`fringes`, `stripes` are outside both, and `convention` is a bench described the wrong way. Lateral parameters that
+`fringes`, `stripes` are outside both, `measured_field` is a real panel's, and `convention` is a bench described the wrong way. Lateral parameters that
 scale with the panel are shares of its half width or half height (suffix `_share`); `_px` is panel pixels.
 """
 
@@ -26,6 +26,7 @@ from firmware_iface.virtual.further_defects import (
     SourceLines,
     Vibration,
 )
+from firmware_iface.virtual.measured_field import MeasuredField
 
 
 @dataclass(frozen=True)
@@ -342,7 +343,7 @@ _GROWN: tuple[type[Defect], ...] = (
     FixedPattern,
 )
 GROWN_KINDS: tuple[str, ...] = tuple(c.kind for c in _GROWN)
-_OUTSIDE: tuple[type[Defect], ...] = (Specks, Fringes, Stripes, Convention)
+_OUTSIDE: tuple[type[Defect], ...] = (Specks, Fringes, Stripes, MeasuredField, Convention)
 DEFECT_KINDS: dict[str, type[Defect]] = {c.kind: c for c in _CATALOGUE + _GROWN + _OUTSIDE}
 
 
