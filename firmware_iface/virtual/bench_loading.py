@@ -9,7 +9,8 @@ from typing import Any
 
 from firmware_iface.errors import InputError
 from firmware_iface.virtual.bench_description import BenchDescription, read_bench
-from firmware_iface.virtual.measured_field import MeasuredField
+from firmware_iface.virtual.defect_kind import Defect
+from firmware_iface.virtual.measured_field import MeasuredField, measured_field
 from firmware_iface.virtual.named_benches import named_bench
 
 
@@ -47,11 +48,17 @@ def load_bench(spec: str) -> BenchDescription:
             "virtual:NAME; to simulate this bench, add the line [simulation] to a copy."
         )
     bench = read_bench(tables, path.name)
-    files = [
-        replace(d, file=str(path.parent / d.file)) if isinstance(d, MeasuredField) and d.file else d
-        for d in bench.defects
-    ]
-    return replace(bench, defects=tuple(files))
+    return replace(bench, defects=tuple(_with_file(d, bench, path.parent) for d in bench.defects))
+
+
+def _with_file(defect: Defect, bench: BenchDescription, folder: Path) -> Defect:
+    """A defect whose file is found from any folder, and can be used with the bench's channels."""
+    if not isinstance(defect, MeasuredField) or not defect.file:
+        return defect
+    found = replace(defect, file=str(folder / defect.file))
+    for channel in bench.channels:
+        measured_field(found, channel.wavelength_nm, 2, 2)
+    return found
 
 
 def _is_data_sheet(tables: dict[str, Any]) -> bool:

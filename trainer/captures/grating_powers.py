@@ -1,8 +1,8 @@
 """A panel's phase response from the power of gratings: gray 0 on one half of the lines, gray g on the other.
 
 The first order's power is o + e(g) (1 - cos phase(g)) / 2: the offset o is light that the grating does not steer, and
-the envelope e falls where a real panel's contrast does. Phase and envelope are smooth curves, fitted together; the errors
-come from what the fit leaves, and allow for neighbours that err alike.
+the envelope e falls where a real panel's contrast does. Phase and envelope are smooth curves, fitted together. The
+errors come from what the fit leaves, and allow for neighbours that err alike.
 """
 
 from __future__ import annotations
