@@ -1,9 +1,9 @@
 """Hidden defects of a simulated bench: one frozen dataclass for each kind, parameters in physical units.
 
 The first eighteen kinds carry the names of the catalogue of effects, and `further_defects` has ten more. `specks`,
-`fringes`, `stripes` are outside both, `measured_field` is a real panel's, and `convention` is a bench described the wrong
-way. Lateral parameters that scale with the panel are shares of its half width or half height (suffix `_share`); `_px`
-is panel pixels.
+`fringes`, `stripes` are outside both, `measured_field` is a real panel's, and `convention` is a bench described the
+wrong way. Lateral parameters that scale with the panel are shares of its half width or half height (suffix `_share`);
+`_px` is panel pixels.
 """
 
 from __future__ import annotations
