@@ -24,6 +24,7 @@ from trainer.commands import (
     next_captures,
     propose,
     register,
+    response,
     studio,
     train,
 )
@@ -63,6 +64,7 @@ IN_ORDER_OF_USE = (
     studio,
     initialiser,
     register,
+    response,
 )
 
 PROGRAM = Program(

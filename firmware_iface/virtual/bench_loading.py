@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from firmware_iface.errors import InputError
 from firmware_iface.virtual.bench_description import BenchDescription, read_bench
+from firmware_iface.virtual.defect_kind import Defect
+from firmware_iface.virtual.measured_field import MeasuredField, measured_field
 from firmware_iface.virtual.named_benches import named_bench
 
 
@@ -44,7 +47,18 @@ def load_bench(spec: str) -> BenchDescription:
             "Give the headset's configuration (hololoop-runtime serve --help; capture takes this file as --known), or "
             "virtual:NAME; to simulate this bench, add the line [simulation] to a copy."
         )
-    return read_bench(tables, path.name)
+    bench = read_bench(tables, path.name)
+    return replace(bench, defects=tuple(_with_file(d, bench, path.parent) for d in bench.defects))
+
+
+def _with_file(defect: Defect, bench: BenchDescription, folder: Path) -> Defect:
+    """A defect whose file is found from any folder, and can be used with the bench's channels."""
+    if not isinstance(defect, MeasuredField) or not defect.file:
+        return defect
+    found = replace(defect, file=str(folder / defect.file))
+    for channel in bench.channels:
+        measured_field(found, channel.wavelength_nm, 2, 2)
+    return found
 
 
 def _is_data_sheet(tables: dict[str, Any]) -> bool:

@@ -1,8 +1,9 @@
 """Hidden defects of a simulated bench: one frozen dataclass for each kind, parameters in physical units.
 
 All kinds carry the names of the catalogue of effects (ten of them are in `further_defects`), except `specks`, `fringes`
-and `stripes`, which are outside it, and `convention`, a bench described the wrong way. Lateral parameters that scale
-with the panel are shares of its half width or half height (suffix `_share`); `_px` is panel pixels.
+and `stripes`, which are outside it, `measured_field`, which is a real panel's, and `convention`, a bench described the
+wrong way. Lateral parameters that scale with the panel are shares of its half width or half height (suffix `_share`);
+`_px` is panel pixels.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from firmware_iface.virtual.further_defects import (
     SourceLines,
     Vibration,
 )
+from firmware_iface.virtual.measured_field import MeasuredField
 
 
 @dataclass(frozen=True)
@@ -339,7 +341,7 @@ _CATALOGUE: tuple[type[Defect], ...] = (
     FixedPattern,
 )
 CATALOGUE_KINDS: tuple[str, ...] = tuple(c.kind for c in _CATALOGUE)
-_OUTSIDE: tuple[type[Defect], ...] = (Specks, Fringes, Stripes, Convention)
+_OUTSIDE: tuple[type[Defect], ...] = (Specks, Fringes, Stripes, MeasuredField, Convention)
 DEFECT_KINDS: dict[str, type[Defect]] = {c.kind: c for c in _CATALOGUE + _OUTSIDE}
 
 

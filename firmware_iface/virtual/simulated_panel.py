@@ -16,6 +16,7 @@ from firmware_iface.virtual.defects import (
     Stripes,
     ZeroOrder,
 )
+from firmware_iface.virtual.measured_field import MeasuredField, measured_field
 from firmware_iface.virtual.rough_surface import rough_surface
 
 Array = NDArray[np.float64]
@@ -48,13 +49,15 @@ class Surface:
     def __init__(self, bench: BenchDescription, wavelength_nm: float) -> None:
         h, w, q = bench.panel.height, bench.panel.width, bench.simulation.subpixels
         leak = bench.defect(ZeroOrder)
-        beam = beam_amplitude(bench.defect(Illumination), h * q, w * q)
+        measured, turn = measured_field(bench.defect(MeasuredField), wavelength_nm, h * q, w * q)
+        beam = beam_amplitude(bench.defect(Illumination), h * q, w * q) * measured
         fill = leak.fill_factor if leak else bench.panel.fill_factor
         active = active_area(fill, q)
         covered = np.tile(active, (h, w))
         amplitude = beam * _stripes(bench.defect(Stripes), w, q)
         path = panel_path_nm(bench.defect(PanelWavefront), h * q, w * q, w / h)
-        surface = amplitude * np.exp(2j * np.pi * path / wavelength_nm) * _dust(bench.defect(Specks), h, w, q)
+        surface = amplitude * turn * np.exp(2j * np.pi * path / wavelength_nm)
+        surface = surface * _dust(bench.defect(Specks), h, w, q)
         self.lit: Complex = (surface * covered).astype(np.complex64)
         self.dark = leak is None
         self.unlit: Complex = np.zeros((1, 1), np.complex64)

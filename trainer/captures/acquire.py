@@ -1,12 +1,12 @@
 """Takes a capture set from a bench: chooses patterns, sets the exposure, shows and captures.
 
 The exposure of each colour is set once, from pictures of all of its patterns, and then stays the same. So only the
-laser's power changes the gain.
+laser's power changes the gain. A bracket's exposures are BRACKET_STEP apart about it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,6 +29,9 @@ SATURATED = 0.002  # of all pixels of a colour
 SATURATED_IN_ONE = 0.01  # of the pixels of one capture
 AIM = 0.93  # of full scale, for the brightest pixels that count
 EXPOSURES_MS = (0.02, 2000.0)
+# From one exposure of a bracket to the next. Each pixel is then above a quarter of full scale in one frame, where shot
+# noise is at most twice that of a full pixel. Smaller steps need more frames for the same range; larger ones lose more.
+BRACKET_STEP = 4.0
 
 
 class Lasers(Protocol):
@@ -71,11 +74,15 @@ class CaptureSummary:
     ----------
     folder : Path
     captures : int
-        How many.
+        How many; a bracket is one.
     exposure_ms : dict of str to float, ms
-        By channel.
+        By channel; of a bracket, the one that a single picture would have.
     saturated : float
-        Share of the pixels.
+        Share of the pixels; of a bracket, those that every frame saturates.
+    simulated : bool
+        Whether the devices are.
+    bracket : tuple of float
+        Each frame's exposure over `exposure_ms`.
     """
 
     folder: Path
@@ -83,15 +90,17 @@ class CaptureSummary:
     exposure_ms: dict[str, float]
     saturated: float
     simulated: bool = False
+    bracket: tuple[float, ...] = (1.0,)
 
     def as_json(self) -> dict[str, Any]:
-        """Keys `folder`, `captures`, `exposure_ms` and `saturated_share` of `capture --json`."""
+        """The object of `capture --json`."""
         return {
             "folder": str(self.folder),
             "captures": self.captures,
             "exposure_ms": self.exposure_ms,
             "saturated_share": self.saturated,
             "simulated": self.simulated,
+            "bracket": list(self.bracket),
         }
 
 
@@ -104,6 +113,7 @@ def acquire_from(
     seed: int = 0,
     progress: Progress | None = None,
     known: Path | None = None,
+    frames: int = 1,
 ) -> CaptureSummary:
     """Open a bench by name and take a capture set from it.
 
@@ -117,6 +127,8 @@ def acquire_from(
         As from `acquire_captures`.
     known : Path, optional
         bench.toml of a real headset.
+    frames : int
+        As for `acquire_captures`.
 
     Returns
     -------
@@ -137,7 +149,7 @@ def acquire_from(
     with open_bench(spec, seed, read_bench(known) if known else None) as opened:
         planes = tuple(planes_mm) if planes_mm else opened.planes_mm
         return acquire_captures(
-            opened.headset, opened.bench, folder, patterns, planes, channels, seed, progress
+            opened.headset, opened.bench, folder, patterns, planes, channels, seed, progress, frames=frames
         )
 
 
@@ -151,6 +163,7 @@ def acquire_captures(
     seed: int = 0,
     progress: Progress | None = None,
     choose: PatternChooser | None = None,
+    frames: int = 1,
 ) -> CaptureSummary:
     """Show patterns on a bench, capture them, and write the set.
 
@@ -172,6 +185,8 @@ def acquire_captures(
         Called with the share done, 0 to 1, and what is done now.
     choose : callable, optional
         Gives the patterns of a channel and plane, in place of `choose_patterns`.
+    frames : int
+        Exposures of each pattern: 3 are a quarter, one and four times the exposure that a single picture would have.
 
     Returns
     -------
@@ -195,7 +210,8 @@ def acquire_captures(
         choose = partial(choose_patterns, bench, count=count, seed=seed)
     else:
         count = len(choose(chosen[0], planes[0]))
-    steps = len(chosen) * len(planes) * (2 * count + 1)
+    steps = len(chosen) * len(planes) * (count + (count + 1) * frames)
+    bracket = tuple(BRACKET_STEP ** (k - (frames - 1) // 2) for k in range(frames))
     done = 0
 
     def report(what: str) -> None:
@@ -215,37 +231,53 @@ def acquire_captures(
             headset.lasers.off()
             headset.lasers.set_power(channel, 1.0)
             try:
-                exposures[channel] = _expose(headset, bench.camera, shown, channel, report)
+                exposures[channel] = _expose(headset, bench.camera, shown, channel, bracket[-1], report)
                 for plane, several in shown:
                     headset.move_to_plane(plane)
                     for number, pattern in _with_repeat(several):
-                        report(f"{channel}, {plane:g} mm")
-                        started = headset.time_s if started is None else started
-                        time = headset.time_s - started
-                        counts = _capture(headset, pattern)
-                        saturated.append(float((counts >= bench.camera.saturation).mean()))
-                        writer.add(
-                            pattern.gray,
-                            counts,
-                            channel,
-                            plane_mm=plane,
-                            pattern=f"{channel}-{plane:g}-{number:03d}",
-                            exposure_ms=exposures[channel],
-                            time_s=round(time, 6),
-                            kind=pattern.kind,
-                            simulated="yes" if headset.simulated else "no",
-                        )
+                        extra = {"kind": pattern.kind, "simulated": "yes" if headset.simulated else "no"}
+                        if frames > 1:
+                            extra["bracket"] = f"{channel}-{plane:g}-{len(saturated):04d}"
+                        shares = []
+                        planned = [exposures[channel] * factor for factor in bracket]
+                        for exposure, time, counts in _frames(headset, pattern, planned):
+                            report(f"{channel}, {plane:g} mm")
+                            started = time if started is None else started
+                            shares.append(float((counts >= bench.camera.saturation).mean()))
+                            writer.add(
+                                pattern.gray,
+                                counts,
+                                channel,
+                                plane_mm=plane,
+                                pattern=f"{channel}-{plane:g}-{number:03d}",
+                                exposure_ms=exposure,
+                                time_s=round(time - started, 6),
+                                **extra,
+                            )
+                        saturated.append(min(shares))
             finally:
                 headset.lasers.off()
     if progress:
         progress(1.0, "done")
     return CaptureSummary(
-        Path(folder), len(saturated), exposures, float(np.mean(saturated)), headset.simulated
+        Path(folder), len(saturated), exposures, float(np.mean(saturated)), headset.simulated, bracket
     )
 
 
 def _with_repeat(patterns: list[Pattern]) -> list[tuple[int, Pattern]]:
     return [(0, patterns[0]), *enumerate(patterns)]
+
+
+def _frames(
+    headset: Headset, pattern: Pattern, exposures_ms: Sequence[float]
+) -> Iterator[tuple[float, float, NDArray[np.uint16]]]:
+    """Exposure, ms, as the camera set it, time, s, and counts of each picture of a pattern, which is shown once."""
+    headset.panel.show(pattern.gray)
+    for exposure in exposures_ms:
+        if len(exposures_ms) > 1:
+            headset.camera.exposure_ms = exposure
+        time = headset.time_s
+        yield float(headset.camera.exposure_ms), time, headset.camera.capture()
 
 
 def _capture(headset: Headset, pattern: Pattern) -> NDArray[np.uint16]:
@@ -259,9 +291,10 @@ def _expose(
     camera: Camera,
     shown: list[tuple[float, list[Pattern]]],
     channel: str,
+    longer: float,
     report: Callable[[str], None],
 ) -> float:
-    """Set and return the exposure, ms, at which few pixels of these patterns saturate."""
+    """Set and return the exposure, ms, at which few pixels of these patterns saturate; the camera has one `longer`."""
     exposure = 10.0
     headset.camera.exposure_ms = exposure
     pictures: list[NDArray[np.uint16]] = []
@@ -285,7 +318,7 @@ def _expose(
             "and try again"
         )
     factor = AIM * camera.full_scale / bright
-    longest = min(EXPOSURES_MS[1], headset.camera.longest_exposure_ms)
+    longest = min(EXPOSURES_MS[1], headset.camera.longest_exposure_ms / longer)
     needed = min(max(exposure * factor, EXPOSURES_MS[0]), longest)
     exposure = float(f"{needed:.3g}")
     headset.camera.exposure_ms = exposure

@@ -113,28 +113,31 @@ def in_view(bench: Bench) -> np.ndarray | None:
 def load_batch(captures: CaptureSet, chosen: list[Capture], dtype: torch.dtype = torch.float32) -> Batch:
     """Captures of one colour and plane as a batch."""
     view = in_view(captures.bench)
-    signals, weights, grays = [], [], []
+    signals, weights, variances, grays = [], [], [], []
     for c in chosen:
-        signal, valid = captures.signal(c)
-        signals.append(signal)
-        weights.append(valid if view is None else valid & view)
+        measured = captures.measured(c)
+        signals.append(measured.signal)
+        weights.append(measured.valid if view is None else measured.valid & view)
+        variances.append(measured.variance)
         grays.append(captures.gray(c).astype(np.int32))
-    signal = np.stack(signals)
     return Batch(
         chosen[0].channel,
         chosen[0].plane_mm,
         tuple(c.capture for c in chosen),
         torch.as_tensor(np.stack(grays)),
-        torch.as_tensor(signal, dtype=dtype),
+        torch.as_tensor(np.stack(signals), dtype=dtype),
         torch.as_tensor(np.stack(weights), dtype=dtype),
-        torch.as_tensor(captures.noise_variance(signal), dtype=dtype),
+        torch.as_tensor(np.stack(variances), dtype=dtype),
         torch.tensor([c.exposure_ms for c in chosen], dtype=dtype),
         cache(lambda: _shown_before(captures, chosen)),
     )
 
 
 def _shown_before(captures: CaptureSet, chosen: list[Capture]) -> Tensor:
-    """Patterns before each capture, in the order in which they were taken; the first one's own before it."""
+    """Patterns before each capture, in the order in which they were taken; the first one's own before it.
+
+    A bracket is one capture, so the pattern before it is that of the capture or bracket before.
+    """
     order = {c.capture: k for k, c in enumerate(captures.captures)}
     earlier = []
     for c in chosen:

@@ -54,9 +54,12 @@ class PhotonTransfer:
 
 
 def repeated_pairs(captures: Iterable[Capture]) -> list[tuple[Capture, Capture]]:
-    """Captures of one pattern, colour, plane and exposure that follow each other, MOST_PAIRS at most."""
+    """Captures of one pattern, colour, plane and exposure that follow each other, MOST_PAIRS at most.
+
+    Brackets are paired frame by frame.
+    """
     groups: dict[tuple[str, float, str, float], list[Capture]] = {}
-    for c in captures:
+    for c in (row for capture in captures for row in capture.rows):
         groups.setdefault((c.channel, c.plane_mm, c.pattern, c.exposure_ms), []).append(c)
     return [pair for group in groups.values() for pair in pairwise(group)][:MOST_PAIRS]
 

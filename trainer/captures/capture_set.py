@@ -1,6 +1,6 @@
 """Capture sets: a folder of patterns and camera pictures.
 
-A set holds ``bench.toml`` (what is known before anything is measured), ``captures.csv`` (one row for each capture),
+A set holds ``bench.toml`` (what is known before anything is measured), ``captures.csv`` (one row for each picture),
 8-bit panel patterns and 16-bit raw camera pictures. Arrays are [row, column]; counts are raw camera counts.
 Pictures are read only when needed, so a set may be larger than memory. Anything wrong with a set is an
 `InputError` of one sentence.
@@ -21,6 +21,7 @@ import numpy as np
 
 from firmware_iface.errors import InputError
 from trainer.captures.bench_file import Bench, Camera, read_bench
+from trainer.captures.brackets import Measured, bracket_faults, merged, one_capture_each
 from trainer.captures.camera_noise import compare_repeats, noise_variance
 from trainer.captures.camera_numbers import MEASURED_PAIRS, camera_by_repeats, repeated_pairs
 from trainer.captures.capture_table import Capture, scan_rows
@@ -73,7 +74,7 @@ class CaptureSet:
         return read_picture(capture.phase, self.bench.panel.shape, 8, what)
 
     def counts(self, capture: Capture) -> np.ndarray:
-        """Raw camera counts.
+        """Raw camera counts; of a bracket, those of its shortest exposure.
 
         Returns
         -------
@@ -96,8 +97,25 @@ class CaptureSet:
             )
         return counts
 
+    def measured(self, capture: Capture) -> Measured:
+        """Counts above black, where they can be used, and the variance of their noise.
+
+        The frames of a bracket are merged.
+
+        Raises
+        ------
+        InputError
+            As `counts` does.
+        """
+        pictures = [self.counts(row) for row in capture.rows]
+        if capture.frames:
+            return merged(pictures, [row.exposure_ms for row in capture.rows], self.noise_camera())
+        camera, counts = self.bench.camera, pictures[0]
+        signal = counts.astype(np.float32) - np.float32(camera.black_level)
+        return Measured(signal, counts < camera.saturation, self.noise_variance(signal))
+
     def signal(self, capture: Capture) -> tuple[np.ndarray, np.ndarray]:
-        """Counts above black, and where they can be used.
+        """Counts above black, and where they can be used, as from `measured`.
 
         Returns
         -------
@@ -110,10 +128,8 @@ class CaptureSet:
         InputError
             As `counts` does.
         """
-        counts = self.counts(capture)
-        return counts.astype(np.float32) - np.float32(
-            self.bench.camera.black_level
-        ), counts < self.bench.camera.saturation
+        measured = self.measured(capture)
+        return measured.signal, measured.valid
 
     def noise_camera(self) -> Camera:
         """The bench's camera with the full well and read noise that count.
@@ -152,7 +168,7 @@ class CaptureSet:
         """
         digest = hashlib.sha256()
         files = [self.folder / "bench.toml", self.folder / "captures.csv"]
-        files += [p for c in self.captures for p in (c.phase, c.image)]
+        files += [p for c in self.captures for row in c.rows for p in (row.phase, row.image)]
         digest.update("\n".join(c.capture for c in self.captures).encode())
         for path in dict.fromkeys(files):
             try:
@@ -169,7 +185,8 @@ class CaptureSet:
 def read_captures(folder: Path | str) -> CaptureSet:
     """The capture set in a folder; its pictures must exist but are not decoded.
 
-    Captures of one channel that show the same gray levels are of one pattern, whatever captures.csv calls them.
+    Captures of one channel that show the same gray levels are of one pattern, whatever captures.csv calls them. Rows of
+    one exposure bracket are one capture.
 
     Parameters
     ----------
@@ -188,10 +205,11 @@ def read_captures(folder: Path | str) -> CaptureSet:
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder: name a capture set, with bench.toml and captures.csv")
     bench = read_bench(folder / "bench.toml")
-    captures, faults = scan_rows(folder, bench)
+    rows, faults = scan_rows(folder, bench)
+    faults = faults or bracket_faults(rows)
     if faults:
         raise InputError(faults[0].message)
-    return CaptureSet(folder, bench, tuple(one_name_each(captures)))
+    return CaptureSet(folder, bench, tuple(one_capture_each(one_name_each(rows))))
 
 
 @lru_cache(maxsize=8)

@@ -14,12 +14,12 @@ from trainer.captures.bench_file import Bench
 from trainer.captures.png_reader import reason
 
 REQUIRED = ("capture", "channel", "phase", "image")
-KNOWN = (*REQUIRED, "plane_mm", "pattern", "exposure_ms", "time_s")
+KNOWN = (*REQUIRED, "plane_mm", "pattern", "exposure_ms", "time_s", "bracket")
 
 
 @dataclass(frozen=True)
 class Capture:
-    """One row of captures.csv.
+    """One row of captures.csv, or the rows of one exposure bracket.
 
     Attributes
     ----------
@@ -38,6 +38,10 @@ class Capture:
         From the first capture; the row's number where the set does not give it.
     extra : dict
         The columns that this reader does not know, as text.
+    bracket : str
+        Rows with the same text are one exposure bracket; "" for a row by itself.
+    frames : tuple of Capture
+        The rows of a bracket, the shortest exposure first; empty for a row by itself.
     """
 
     capture: str
@@ -49,6 +53,13 @@ class Capture:
     exposure_ms: float = 1.0
     time_s: float = 0.0
     extra: dict[str, str] = field(default_factory=dict)
+    bracket: str = ""
+    frames: tuple[Capture, ...] = ()
+
+    @property
+    def rows(self) -> tuple[Capture, ...]:
+        """The rows of captures.csv that this is: itself, or a bracket's frames, the shortest exposure first."""
+        return self.frames or (self,)
 
 
 @dataclass(frozen=True)
@@ -257,5 +268,14 @@ def _row(
         return None, faults
     extra = {column: text for column, text in cells.items() if column not in KNOWN}
     return Capture(
-        name, cells["channel"], plane, cells.get("pattern") or name, files[0], files[1], exposure, time, extra
+        name,
+        cells["channel"],
+        plane,
+        cells.get("pattern") or name,
+        files[0],
+        files[1],
+        exposure,
+        time,
+        extra,
+        cells.get("bracket", ""),
     ), faults

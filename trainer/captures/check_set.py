@@ -19,6 +19,7 @@ from trainer.captures.bench_file import Bench, read_bench
 from trainer.captures.camera_noise import RepeatNoise, compare_repeats
 from trainer.captures.camera_numbers import MEASURED_PAIRS, MOST_PAIRS, camera_by_repeats, numbers_text
 from trainer.captures.capture_table import Capture, scan_rows
+from trainer.captures.check_brackets import bracket_problems, excused
 from trainer.captures.check_counts import check_bits, check_black_level, check_brightness, check_top
 from trainer.captures.conventions import Predict, Sample, compare_conventions
 from trainer.captures.mismatches import mismatched
@@ -84,10 +85,13 @@ def check_captures(folder: Path | str, predict: Predict, progress: Progress | No
     rows, faults = scan_rows(folder, bench)
     problems = [Problem("error", f.kind, f.capture, f.message) for f in faults]
     statistics = _SetStatistics()
+    made_good = excused(rows)
     for number, capture in enumerate(rows):
-        problems += _one(bench, capture, statistics)
+        found = _one(bench, capture, statistics)
+        problems += [p for p in found if p.kind not in made_good.get(capture.capture, ())]
         if progress:
             progress((number + 1) / len(rows))
+    problems += bracket_problems(rows, bench.camera, lambda row: _load(row, bench, statistics)[1])
     problems += _patterns(bench, statistics)
     problems += _camera(bench, statistics)
     problems += _convention(bench, statistics, predict)

@@ -24,6 +24,13 @@ def one_name_each(captures: Sequence[Capture]) -> list[Capture]:
     return [replace(c, pattern=first.setdefault((c.channel, contents[c.phase]), c.pattern)) for c in captures]
 
 
+def same_gray_levels(one: Capture, other: Capture) -> bool:
+    """Whether two captures show the same gray levels; True where a file cannot be read, which its reader reports."""
+    contents = {path: _content(path) for path in (one.phase, other.phase)}
+    unread = any(content == str(path) for path, content in contents.items())
+    return unread or len(set(contents.values())) == 1
+
+
 def _content(path: Path) -> str:
     """A text that is the same for files of the same gray levels, and for no others."""
     try:

@@ -24,7 +24,7 @@ class Problem:
     kind : str
         missing_file, wrong_size, saturated, left_justified, black_level, duplicate, too_few, unknown_channel,
         unreadable, bit_depth, not_a_number, noise, pattern, dark, no_signal, camera_numbers, convention,
-        mismatched, shifted, distance or no_correlation.
+        mismatched, shifted, distance, no_correlation or bracket.
     capture : str
         The capture's id; "" for the whole set.
     message : str

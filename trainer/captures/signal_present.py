@@ -80,12 +80,16 @@ def with_signal(captures: CaptureSet) -> tuple[list[Capture], dict[str, str]]:
 
 
 def _fault(capture: Capture, camera: Camera) -> str:
-    """As `fault_of`; "" for a picture that cannot be read: whoever uses it reports that."""
+    """As `fault_of`; of a bracket, "" where one frame can be used, and else the shortest's.
+
+    Also "" for a picture that cannot be read: whoever uses it reports that.
+    """
     try:
-        about = capture.image.stat()
-        return _fault_in(capture.image, about.st_mtime_ns, about.st_size, camera)
+        files = [(row.image, row.image.stat()) for row in capture.rows]
+        faults = [_fault_in(path, about.st_mtime_ns, about.st_size, camera) for path, about in files]
     except (OSError, InputError):
         return ""
+    return "" if "" in faults else faults[0]
 
 
 @lru_cache(maxsize=100_000)

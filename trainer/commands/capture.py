@@ -46,6 +46,14 @@ def options(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--channels", metavar="NAME,NAME", type=comma_list, default=None, help="(default: all)"
     )
+    parser.add_argument(
+        "--bracket",
+        metavar="N",
+        type=whole(2, 5),
+        default=1,
+        help="take each pattern at N exposures, each 4 times the one before, which count as one capture: 3 are a "
+        "quarter, one and four times a single picture's, for dark surroundings beside bright spots (default: one)",
+    )
     seed_option(parser, "fixes the patterns, and a virtual bench's noise")
 
 
@@ -56,7 +64,15 @@ def run(args: Namespace, screen: Screen) -> Result:
 
     def capture(folder: Path) -> Result:
         taken = acquire_from(
-            args.bench, folder, args.patterns, args.planes, args.channels, args.seed, progress, args.known
+            args.bench,
+            folder,
+            args.patterns,
+            args.planes,
+            args.channels,
+            args.seed,
+            progress,
+            args.known,
+            args.bracket,
         )
         return taken.as_json()
 
@@ -74,7 +90,11 @@ def outputs(args: Namespace) -> list[Output]:
 
 def show(result: Result, args: Namespace, screen: Screen) -> None:
     """What was taken."""
-    exposures = ", ".join(f"{name} {ms:g} ms" for name, ms in result["exposure_ms"].items())
+    factors = result["bracket"]
+    exposures = ", ".join(
+        f"{name} {' and '.join(f'{ms * factor:.3g}' for factor in factors)} ms"
+        for name, ms in result["exposure_ms"].items()
+    )
     simulated = "simulated " if result["simulated"] else ""
     screen.say(
         f"{result['captures']} {simulated}captures in {result['folder']}; exposure {exposures}; "

@@ -17,6 +17,7 @@ MOST_SHOWN = 100  # problems in the table, the errors first
 
 def run(args: Namespace, screen: Screen) -> Result:
     """Everything that is wrong with a capture set."""
+    from trainer.captures.brackets import one_capture_each
     from trainer.captures.capture_set import read_bench, scan_rows
     from trainer.captures.check_set import check_captures
     from trainer.model.model_stages import ideal_irradiance
@@ -31,7 +32,7 @@ def run(args: Namespace, screen: Screen) -> Result:
         rows, _ = scan_rows(folder, read_bench(folder / "bench.toml"))
     except InputError:
         rows = []
-    return {"captures": len(rows), "problems": [dict(vars(p)) for p in problems]}
+    return {"captures": len(one_capture_each(rows)), "problems": [dict(vars(p)) for p in problems]}
 
 
 def show(result: Result, args: Namespace, screen: Screen) -> None:

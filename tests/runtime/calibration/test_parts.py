@@ -29,7 +29,7 @@ from runtime.excess import PredictionErrors, is_complete
 from runtime.lightpath.light_path import irradiance, panel_phase, pixel_irradiance
 from tests.runtime.benches import PITCH, ideal_path, random_path
 from tests.runtime.calibration.drifting import WAVELENGTH_NM, base, devices, drifted_bench, headset
-from tests.runtime.calibration.power_sweep import phase_of_power
+from trainer.captures.grating_powers import phase_of_power
 
 SMALL = (40, 52)
 
