@@ -1,6 +1,6 @@
 """How many captures a verdict and a parameter's error need, with `next` and with the usual set of `capture`.
 
-    python -m tests.campaigns.captures_needed                    # twenty small simulated benches: an hour and a half
+    python -m tests.campaigns.captures_needed                    # twenty small simulated benches: about half an hour
     python -m tests.campaigns.captures_needed --benches 0,3 --json
 
 Each bench hides one or two effects. Candidates are the hidden effects, those that look like them, and three others.
