@@ -15,7 +15,7 @@ from trainer.captures.capture_set import read_captures
 from trainer.cli import main
 from trainer.diagnosis.probes import ProbeResult
 from trainer.diagnosis.proposals.blob_shape import blobs_in, blobs_of_their_own, more_blobs_in
-from trainer.diagnosis.proposals.candidates import candidates_of
+from trainer.diagnosis.proposals.shapes_tried import candidates_of
 from trainer.diagnosis.proposals.effect_file import write_effect
 from trainer.diagnosis.proposals.gray_shape import steps_in_gray
 from trainer.diagnosis.proposals.probe_maps import (

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import ModuleType
 
 from firmware_iface.errors import InputError
-from trainer.effects import camera, drive, modulation, panel, pupil, sensor
+from trainer.effects import camera_in_time, drive, modulation, panel, pupil, sensor
 from trainer.effects.definition import Effect
 from trainer.effects.own_effect import line_in_file
 
@@ -46,9 +46,9 @@ BUILT_IN: tuple[Effect, ...] = (
     sensor.sensor_response,
     sensor.laser_drift,
     sensor.ghost,
-    camera.vibration,
-    camera.frame_motion,
-    camera.fixed_pattern,
+    camera_in_time.vibration,
+    camera_in_time.frame_motion,
+    camera_in_time.fixed_pattern,
 )
 
 FORMER_MODULES = {
