@@ -9,6 +9,7 @@ from pathlib import Path
 from runtime.program.command import Command, Result
 from runtime.program.outputs import Output, files_written
 from runtime.program.screen import Screen
+from trainer.commands.command_line import command_line
 from trainer.commands.outputs import out_option
 
 
@@ -71,6 +72,9 @@ def show(result: Result, args: Namespace, screen: Screen) -> None:
         f"The response leaves {100 * result['left_of_range']:.2g} % of the range of power unexplained. It is in "
         f"{result['response']}."
     )
+    screen.next(
+        command_line("check", "captures/"), "Captures tell a bent phase from light that no grating steers"
+    )
 
 
 COMMAND = Command(
@@ -81,4 +85,5 @@ COMMAND = Command(
     show=show,
     outputs=outputs,
     examples=("response powers.csv --out response.csv",),
+    after="Captures tell a bent phase from light that no grating steers: check captures/",
 )
