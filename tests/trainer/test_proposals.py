@@ -15,7 +15,6 @@ from trainer.captures.capture_set import read_captures
 from trainer.cli import main
 from trainer.diagnosis.probes import ProbeResult
 from trainer.diagnosis.proposals.blob_shape import blobs_in, blobs_of_their_own, more_blobs_in
-from trainer.diagnosis.proposals.shapes_tried import candidates_of
 from trainer.diagnosis.proposals.effect_file import write_effect
 from trainer.diagnosis.proposals.gray_shape import steps_in_gray
 from trainer.diagnosis.proposals.probe_maps import (
@@ -34,6 +33,7 @@ from trainer.diagnosis.proposals.probe_maps import (
 from trainer.diagnosis.proposals.proposing import Proposals, propose
 from trainer.diagnosis.proposals.reading import Reading
 from trainer.diagnosis.proposals.row_column_shape import rows_and_columns_in
+from trainer.diagnosis.proposals.shapes_tried import candidates_of
 from trainer.diagnosis.proposals.surface_shape import radial_in, smooth_in, times_surface
 from trainer.diagnosis.proposals.wave_shape import waves_in, waves_in_gray
 from trainer.effects import testing

@@ -16,8 +16,8 @@ from trainer.captures.batches import load
 from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.candidate_fits import CandidateFit, try_effect
 from trainer.diagnosis.probes import ProbeResult, probe
-from trainer.diagnosis.proposals.shapes_tried import Candidate, candidates_of, more_of
 from trainer.diagnosis.proposals.effect_file import write_effect
+from trainer.diagnosis.proposals.shapes_tried import Candidate, candidates_of, more_of
 from trainer.diagnosis.ranking import rank
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import Catalogue, load_effects
