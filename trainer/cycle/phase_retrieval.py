@@ -26,7 +26,7 @@ from runtime.solver import DriveRange, solve
 from trainer.cycle.target_pictures import TargetVolume
 from trainer.effects.effect_catalogue import BUILT_IN
 from trainer.model.bundle_export import acting_on_display, baked_path
-from trainer.model.model import Model, absent
+from trainer.model.model import Model, instance_with
 from trainer.model.model_stages import scene_for, stages_of
 from trainer.networks.approximator import Approximator, penalty
 from trainer.prediction.predict import light_path
@@ -51,9 +51,7 @@ def beside_zero_order(model: Model) -> Model:
     Patterns then carry a phase ramp, which takes the picture's band into the iris; undiffracted light stays out.
     """
     iris = next(effect for effect in BUILT_IN if effect.name == "iris")
-    values = {"half_width": OPENING, "centre_y": CARRIER, "centre_x": 0.0}
-    start = absent(iris, model.bench)
-    return model.having(start.with_values({n: np.full_like(v, values[n]) for n, v in start.values.items()}))
+    return model.having(instance_with(iris, model.bench, {"half_width": OPENING, "centre_y": CARRIER}))
 
 
 def retrieve(

@@ -54,7 +54,7 @@ from trainer.prediction.stages import Sensor
         ),
     ],
     formula=(
-        r"\hat{I}' = \hat{I}\,\bigl[\,s\,J_0(\sqrt2\,w) + (1-s)\,e^{-w^2/2}\bigr], \qquad s = -\kappa/1.5, \quad"
+        r"\hat{I}' = \hat{I}\,\bigl[\,s\,J_0(\sqrt{2}\,w) + (1-s)\,e^{-w^2/2}\bigr], \qquad s = -\kappa/1.5, \quad"
         r" w = 2\pi\sigma\,(f_x \cos\theta + f_y \sin\theta)"
     ),
 )

@@ -216,8 +216,8 @@ def crosstalk(
         ),
     ],
     formula=(
-        r"\varphi' = (1 + a_x + a_y)\,\varphi + o_x + o_y, \qquad o_x = \sum_{p=2}^{4}\,c_p \cos\tfrac{2\pi x}{p}"
-        r" + s_p \sin\tfrac{2\pi x}{p}"
+        r"\varphi' = (1 + a_x + a_y)\,\varphi + o_x + o_y, \qquad o_x = \sum_{p=2}^{4}\,c_p \cos\frac{2\pi x}{p}"
+        r" + s_p \sin\frac{2\pi x}{p}"
     ),
 )
 def drivers(

@@ -39,7 +39,7 @@ SELDOM = 1e-3
             terms=bent_curve_terms,
         )
     ],
-    formula=r"u' = u\,\Bigl[1 + \sum_{n \ge 1}\,a_n P_n(2t-1)\Bigr], \qquad t = g/256",
+    formula=r"u' = u\,\Bigl[1 + \sum_{n \geq 1}\,a_n P_n(2t-1)\Bigr], \qquad t = g/256",
 )
 def amplitude_modulation(drive: Drive, amplitude: Tensor) -> Drive:
     """The panel's amplitude depends on the gray level.

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from runtime.solver import solve
 from runtime.solver.targets import TEST_PICTURE, read_target
+from trainer.captures.batches import EARLIER
 from trainer.captures.bench_file import Bench, Camera, Channel, Iris, Panel
 from trainer.effects.definition import Effect, Parameter
 from trainer.effects.own_effect import parameters_of
@@ -107,7 +108,11 @@ class EffectNumber:
         """Name with term and unit, for people."""
         name = self.parameter.replace("_", " ")
         if self.term:
-            name = f"{name} {self.term}" if self.term.startswith("P") or self.term.isdecimal() else self.term
+            name = (
+                f"{name} {self.term}"
+                if self.term.startswith(("P", "every")) or self.term.isdecimal()
+                else self.term
+            )
         return name if self.unit in ("", "1") else f"{name} ({self.unit})"
 
     @property
@@ -154,6 +159,8 @@ def numbers_of(effect: Effect, order: int) -> tuple[EffectNumber, ...]:
     at_absent = absent(effect, bench, order)
     found = []
     for k, p in enumerate(effect.parameters):
+        if p.per_pixel:
+            continue
         count = at_absent.values[p.name].size
         single = at_absent.values[p.name].shape[-1:] in ((), (1,)) and not p.count
         terms = ("",) * count if single else _term_names(p, order, count)
@@ -181,9 +188,9 @@ def orders_of(effect: Effect) -> tuple[int, ...]:
 
 
 def differs_by_capture(effect: Effect) -> bool:
-    """Whether the effect gives each capture a gain of its own."""
-    stages = _stages(instance_with(effect, demonstration_bench(), _examples(effect)))[1]
-    return stages.sensor.free_capture_gain
+    """Whether the effect gives each capture a gain or a place of its own."""
+    sensor = _stages(instance_with(effect, demonstration_bench(), _examples(effect)))[1].sensor
+    return sensor.free_capture_gain or sensor.free_capture_shift
 
 
 def demonstrate(
@@ -225,13 +232,18 @@ def demonstrate(
         before, ideal = _ideal(scene)
         if by_eye and effect.acts_on == "camera":
             return EffectPicture(ideal, ideal)
-        image = trace(scene, stages, _pattern(), effect.stage, before).image
+        if stages.sensor.free_capture_shift:
+            dy, dx = (torch.full((ROWS, COLUMNS), float(d)) for d in _of_capture(instance, "pixels", capture))
+            stages = replace(stages, sensor=stages.sensor.displaced(dy, dx))
+        earlier = None if stages.drive.persistence is None else _patterns_before()
+        image = trace(scene, stages, _pattern(), effect.stage, before, earlier).image
         if by_eye:
             bare = bare_stages(scene).sensor
             stages = replace(stages, sensor=replace(bare, irradiance_filter=stages.sensor.irradiance_filter))
         picture = counts(scene, stages, light_on_camera(scene, stages, image), _gain(), None)[0].numpy()
     if stages.sensor.free_capture_gain:
-        picture = picture * np.float32(_capture_gain(instance, capture))
+        percent = _of_capture(instance, "%", capture)[0]
+        picture = picture * np.float32(max(1 + percent / 100, 0.0))
     return EffectPicture(ideal, picture)
 
 
@@ -269,9 +281,15 @@ def _values(effect: Effect, numbers: Sequence[float], order: int) -> Values:
     shapes = {name: v.shape for name, v in absent(effect, demonstration_bench(), order).values.items()}
     values, start = {}, 0
     for name, shape in shapes.items():
+        if effect.parameter(name).per_pixel:
+            continue
         count = math.prod(shape)
         values[name] = np.asarray(numbers[start : start + count], float).reshape(shape)
         start += count
+    for p in effect.parameters:
+        if p.per_pixel:  # drawn, with the spread that a parameter beside it states
+            spread = values[f"{p.name}_rms"] * (0.01 if effect.parameter(f"{p.name}_rms").unit == "%" else 1)
+            values[p.name] = spread * np.random.default_rng(5).standard_normal(shapes[p.name])
     if start != len(numbers):
         raise ValueError(f"effect '{effect.name}' has {start} numbers, not {len(numbers)}")
     return values
@@ -288,6 +306,11 @@ def _stages(instance: EffectInstance) -> tuple[Scene, Stages]:
 @lru_cache(maxsize=1)
 def _pattern() -> Tensor:
     return torch.as_tensor(demonstration_pattern().astype(np.int64))[None]
+
+
+def _patterns_before() -> Tensor:
+    """What a slow panel showed before the pattern: the same picture upside down, [1, EARLIER, H, W]."""
+    return _pattern().flip(-2)[:, None].expand(-1, EARLIER, -1, -1)
 
 
 @lru_cache(maxsize=1)
@@ -311,13 +334,14 @@ def _ideal(scene: Scene) -> tuple[Trace, Picture]:
     return point, picture
 
 
-def _capture_gain(instance: EffectInstance, capture: int) -> float:
-    """The gain of one capture of a series whose gains have the effect's spread, in %, about 1."""
-    percent = next((p.name for p in instance.effect.parameters if p.unit == "%"), None)
-    spread = 0.0 if percent is None else float(np.ravel(instance.values[percent])[0])
-    series = np.random.default_rng(4).standard_normal(CAPTURES)
-    series = (series - series.mean()) / series.std()
-    return max(1 + spread / 100 * float(series[capture % CAPTURES]), 0.0)
+def _of_capture(instance: EffectInstance, unit: str, capture: int) -> NDArray[np.float64]:
+    """Two numbers of one capture of a series, about 0, with the spread that the effect states in this unit."""
+    name = next((p.name for p in instance.effect.parameters if p.unit == unit), None)
+    spread = 0.0 if name is None else float(np.ravel(instance.values[name])[0])
+    series = np.random.default_rng(4).standard_normal((2, CAPTURES))
+    series = (series - series.mean(1, keepdims=True)) / series.std(1, keepdims=True)
+    numbers: NDArray[np.float64] = spread * series[:, capture % CAPTURES]
+    return numbers
 
 
 @contextmanager
