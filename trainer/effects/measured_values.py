@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import uniform_filter
 from scipy.special import j0
 
 from trainer.effects.evidence import Evidence
@@ -15,6 +14,7 @@ from trainer.effects.starts import displacements
 LIKELY_GAIN, LIKELY_OFFSET = 0.05, 20.0  # where the estimate of their spreads begins: share, counts
 LIKELY_VARIANCES = tuple(0.06 * 1.6**n for n in range(-1, 10))  # of a blur, pixels^2, from 0.04 to 4
 ROUNDS = 6  # of that estimate
+REACH = 2  # pixels each way: the neighbours that a pixel's number is predicted from
 
 
 def shift_spread(evidence: Sequence[Evidence]) -> dict[str, Any]:
@@ -55,10 +55,10 @@ def _blur_variance(sharp: np.ndarray, blurred: np.ndarray, weight: np.ndarray) -
 
 
 def pixel_pattern(evidence: Sequence[Evidence]) -> dict[str, Any]:
-    """Gain and offset of each camera pixel about its neighbours', as all captures together show them.
+    """Gain and offset of each camera pixel beyond what its neighbours tell, as all captures together show them.
 
     The most probable values where both are drawn from normal distributions, whose spreads are estimated from the
-    captures, too. What neighbours share is left to other effects.
+    captures, too. What can be told from a pixel's neighbours, such as shading and fringes, is left to other effects.
     """
     sums = np.zeros((5, *evidence[0].batch.signal.shape[-2:]))
     for one in evidence:
@@ -73,7 +73,7 @@ def pixel_pattern(evidence: Sequence[Evidence]) -> dict[str, Any]:
         determinant = a * c - b**2
         gain = (c * sums[3] - b * sums[4]) / determinant
         offset = (a * sums[4] - b * sums[3]) / determinant
-        gain, offset = (m - uniform_filter(m, 3, mode="nearest") for m in (gain, offset))
+        gain, offset = (_own(m) for m in (gain, offset))
         gain_spread = max(float(np.sqrt(np.mean(gain**2 + c / determinant))), 1e-5)
         offset_spread = max(float(np.sqrt(np.mean(offset**2 + a / determinant))), 1e-3)
     return {
@@ -82,3 +82,15 @@ def pixel_pattern(evidence: Sequence[Evidence]) -> dict[str, Any]:
         "gain_rms": max(100 * gain_spread, 0.01),
         "offset_rms": max(offset_spread, 0.01),
     }
+
+
+def _own(numbers: np.ndarray) -> np.ndarray:
+    """Each pixel's number less the best prediction from its neighbours: linear, with the same weights everywhere."""
+    height, width = numbers.shape
+    padded = np.pad(numbers, REACH, mode="reflect")
+    span = range(2 * REACH + 1)
+    places = [(i, j) for i in span for j in span if (i, j) != (REACH, REACH)]
+    near = np.stack([padded[i : i + height, j : j + width].ravel() for i, j in places])
+    normal = near @ near.T
+    normal += (1e-9 * np.trace(normal) / len(normal) + 1e-30) * np.eye(len(normal))
+    return numbers - (np.linalg.solve(normal, near @ numbers.ravel()) @ near).reshape(height, width)

@@ -178,7 +178,7 @@ def pupil_aberration(pupil: Pupil, zernike: Tensor, *, order: int) -> Pupil:
         ),
     ],
     formula=(
-        r"A(u,v) = \mathrm{clip}\bigl[\tfrac12 - d\bigl(R_\theta(\mathbf{u} - \mathbf{c});\, w(1 \pm s),"
+        r"A(u,v) = \mathrm{clip}\bigl[\frac{1}{2} - d\bigl(R_\theta(\mathbf{u} - \mathbf{c});\, w(1 \pm s),"
         r"\, \rho\bigr) / e\bigr]"
     ),
 )
@@ -276,7 +276,7 @@ def temporal_coherence(pupil: Pupil, line_width: Tensor) -> Pupil:
             "1",
             scale=0.03,
             low=-0.2,
-            high=0.95,
+            high=0.5,
             count=lambda order: order,
             about="of the light in each further line",
             typical=(0, 0.5),
