@@ -20,7 +20,6 @@ from runtime.camera.sampling import (
     registered_samples,
     sample_places,
     spline_filter,
-    spline_samples,
 )
 from runtime.lightpath.fft import rfft2
 from runtime.lightpath.grid import FINE
@@ -33,6 +32,7 @@ from runtime.lightpath.propagation import (
 )
 from trainer.prediction.capture_motion import blurred_spectrum, displaced_spectrum
 from trainer.prediction.panel_gradient import has_panel_gradient, image_with_panel_gradient
+from trainer.prediction.samples_at import samples_at
 from trainer.prediction.scene import Scene, Stages, bare_stages
 from trainer.prediction.stages import Drive, Pupil, Sensor
 
@@ -329,7 +329,7 @@ def light_on_camera(
             return registered_samples(grid, spectrum)
         finer = spectrum / spline_filter(sensor.iy, sensor.ix, FINER)
         fine = finer_picture(finer, grid.image_shape, FINER)
-        return spline_samples(fine, *sample_places(grid, *places, FINER))
+        return samples_at(fine, *sample_places(grid, *places, FINER))
 
     spectrum = rfft2(image) * transfer
     if sensor.free_capture_shift and measured is not None:
