@@ -274,7 +274,14 @@ def stand_ins(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[Any]]:
             return Found(DIAGNOSIS)
 
         def explain(
-            captures: Any, model: Any, known: Any, pool: Any, thresholds: Any, save: Any, progress: Any
+            captures: Any,
+            model: Any,
+            known: Any,
+            pool: Any,
+            thresholds: Any,
+            save: Any,
+            progress: Any,
+            learn: bool,
         ) -> Any:
             return functions["explain"](model, known, save)
 
@@ -297,7 +304,7 @@ def test_diagnose_says_what_to_do_next(
     assert "0.2031 ± 0.0012 mm" in out
     assert "another plane" in out
     assert seen[1].workers == 1
-    assert (seen[2].level, seen[2].excess, seen[2].share) == (0.01, 0.001, 0.02)
+    assert (seen[2].level, seen[2].excess, seen[2].share) == (0.01, 0.001, 0.0)
 
 
 def test_json_is_alone_on_stdout_and_has_no_nan(

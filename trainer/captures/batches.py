@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 
 import numpy as np
@@ -17,6 +18,7 @@ from trainer.captures.bench_file import Bench
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.capture_table import Capture
 from trainer.captures.held_out import scenes
+from trainer.captures.smoothing import smoothed
 
 # Panel pixels beyond the panel's border that are compared. The splines' reach beyond them is computed too.
 PAST_BORDER = MARGIN - 8
@@ -44,6 +46,10 @@ class Batch:
     shown_before : callable
         Gives the patterns shown before each capture, the last one first: int Tensor [B, EARLIER, H, W]. They are read
         when first asked for.
+    smoothing_px : float
+        Standard deviation of the Gaussian that `signal` was smoothed with, and predictions must be; 0 for none.
+    seen : Tensor [B, h, w] or None
+        The mask before smoothing.
     """
 
     channel: str
@@ -55,6 +61,29 @@ class Batch:
     noise: Tensor
     exposure: Tensor
     shown_before: Callable[[], Tensor]
+    smoothing_px: float = 0.0
+    seen: Tensor | None = None
+
+    def smoothed(self, sigma_px: float) -> Batch:
+        """The batch with smoothed pictures: what is left of speckle that is a pixel off are spots, edges, brightness.
+
+        Parameters
+        ----------
+        sigma_px : float, camera pixels
+            Standard deviation of the Gaussian; pixels that cannot be used count as dark in picture and prediction.
+        """
+        return replace(
+            self,
+            signal=smoothed(self.mask * self.signal, sigma_px),
+            mask=torch.ones_like(self.mask),
+            noise=smoothed(self.mask * self.noise, sigma_px) / max(1.0, 4 * math.pi * sigma_px**2),
+            smoothing_px=sigma_px,
+            seen=self.mask,
+        )
+
+    def as_compared(self, counts: Tensor) -> Tensor:
+        """Predicted counts [B, h, w] as `signal` is: smoothed where it is smoothed."""
+        return counts if self.seen is None else smoothed(self.seen * counts, self.smoothing_px)
 
     def errors(self, prediction: Tensor) -> PredictionErrors:
         """Errors of predicted counts above black, Tensor [B, h, w]."""

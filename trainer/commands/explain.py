@@ -47,6 +47,11 @@ def options(parser: ArgumentParser) -> None:
     report_option(parser)
     worker_options(parser)
     threshold_options(parser)
+    parser.add_argument(
+        "--learn",
+        action="store_true",
+        help="learn what nothing named explains, at the stages that the probes name, and keep it in the model",
+    )
 
 
 def run(args: Namespace, screen: Screen) -> Result:
@@ -84,7 +89,7 @@ def run(args: Namespace, screen: Screen) -> Result:
             note_what_is_used(captures, screen)
             refuse_misread(args.captures, screen)
             with screen.progress("explaining") as progress:
-                found = explain(captures, model, known, pool, thresholds, save, progress)
+                found = explain(captures, model, known, pool, thresholds, save, progress, args.learn)
         save(found.model, is_last=True)
         if args.report:
             from trainer.diagnosis.comparison import compare
@@ -155,6 +160,11 @@ def show(result: Result, args: Namespace, screen: Screen) -> None:
         also = ", ".join(step["indistinguishable_from"]) or ""
         rows.append((what, step["nrmse"], step["excess"], also))
     screen.table(("added", "nrmse", "excess", "not told apart from"), rows)
+    learned = result.get("learned")
+    if learned:
+        for step in learned["steps"]:
+            screen.table(("learned at", "nrmse", "excess"), [(step["stage"], step["nrmse"], step["excess"])])
+        screen.say(f"\n{learned['sentence']}")
     screen.say(f"\nThe camera's noise alone: nrmse {result['noise_nrmse']:.4g}.")
     say_suggested(result, screen)
     screen.say(f"\nThe model is {args.out}." + (f" The report is {args.report}." if args.report else ""))

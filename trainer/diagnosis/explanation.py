@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +11,19 @@ from runtime.excess import PredictionErrors, removed_excess
 from runtime.program.progress import Progress, no_progress, part_of
 from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet
-from trainer.captures.held_out import FIT_CAPTURES, CaptureRoles, capture_roles, split, with_stopping
+from trainer.captures.capture_table import Capture
+from trainer.captures.held_out import FIT_CAPTURES, CaptureRoles, capture_roles, scenes, split, with_stopping
 from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors
+from trainer.diagnosis.learned_rest import LearnedRest, learn_rest
 from trainer.diagnosis.screen import ScreenResult, screen_batches
+from trainer.diagnosis.together import explain_together
+from trainer.diagnosis.unnecessary import without_one
 from trainer.diagnosis.verdict import Thresholds, below_the_noise
 from trainer.effects.definition import Effect
 from trainer.effects.effect_catalogue import Catalogue
 from trainer.fitting.free_form_effects import can_go_on, refined, with_free_form
 from trainer.fitting.gains import with_gains
-from trainer.fitting.gauss_newton import fit, with_measured_values
+from trainer.fitting.gauss_newton import with_measured_values
 from trainer.fitting.pool import Pool
 from trainer.fitting.predictor import evaluate_captures
 from trainer.fitting.refit import fit_from, least_for_order, raise_order, settled
@@ -116,12 +120,15 @@ class Explanation:
         Of the last model.
     diagnoses : tuple of Diagnosis
         One before each step, the last included.
+    learned : LearnedRest or None
+        What was learned after the last step, where that was asked for and something was left.
     """
 
     steps: tuple[ExplanationStep, ...]
     model: Model
     diagnosis: Diagnosis
     diagnoses: tuple[Diagnosis, ...] = field(default=())
+    learned: LearnedRest | None = None
 
     def as_json(self, model_path: Path) -> dict[str, Any]:
         """The object that `explain --json` prints.
@@ -141,6 +148,7 @@ class Explanation:
                 dict.fromkeys(s for d in self.diagnoses for s in d.suggested_captures)
             ),
             "equal_facts": [f.as_json() for f in self.diagnosis.equal_facts.facts],
+            **({} if self.learned is None else {"learned": self.learned.as_json()}),
         }
 
 
@@ -212,13 +220,27 @@ def gone_on(
         return None
     if thresholds.complete(errors.excess, errors.excess):
         return None
-    first, last = with_stopping(roles.probed, FIT_CAPTURES)
+    first, last = with_stopping(_worst_first(roles, model), FIT_CAPTURES)
     further = with_free_form(model, name, load(roles.captures, first), load(roles.captures, last))
     if further is None:
         return None
     after = evaluate_captures(roles.captures, roles.held_out, further)
     worth = thresholds.worth_adding(removed_excess(errors, after), errors.excess, 1)
     return (further, after) if worth else None
+
+
+def _worst_first(roles: CaptureRoles, model: Model) -> list[Capture]:
+    """The probed captures, worst predicted ones first; the second worst of each colour and plane stands at the end.
+
+    A spot or a grating may say nothing of a map: what a map is fitted to, and what says when to stop, must.
+    """
+    ordered = []
+    for scene in scenes(roles.probed):
+        rows = [c for c in roles.probed if (c.channel, c.plane_mm) == scene]
+        excess = {c.capture: evaluate_captures(roles.captures, [c], model).excess for c in rows}
+        rows.sort(key=lambda c: -excess[c.capture])
+        ordered += rows[:1] + rows[2:] + rows[1:2]
+    return ordered
 
 
 def explain(
@@ -229,6 +251,7 @@ def explain(
     thresholds: Thresholds | None = None,
     save: Callable[[Model], None] | None = None,
     progress: Progress | None = None,
+    learn: bool = False,
 ) -> Explanation:
     """Diagnose and add, again and again, until nothing more is worth adding.
 
@@ -240,6 +263,8 @@ def explain(
         Called with every model that is better than the one before.
     progress : callable, optional
         Called with the share that is done and what is being done.
+    learn : bool
+        Learn what nothing named explains, at the stages that the probes name.
     """
     thresholds = thresholds or Thresholds()
     report = progress or no_progress
@@ -259,7 +284,7 @@ def explain(
         """The model without those of the named effects that it does as well without, each a step."""
         limits = diagnoses[-1].thresholds
         while True:
-            smaller = _without_one(roles, model, errors, names, limits, ideal.excess)
+            smaller = without_one(roles, model, errors, names, limits, ideal.excess)
             if smaller is None:
                 return model, errors
             dropped, model, errors = smaller
@@ -268,6 +293,16 @@ def explain(
             steps.append(ExplanationStep(None, errors, removed=dropped))
             if save:
                 save(model)
+
+    together = explain_together(roles, model, errors, known, pool, thresholds, part_of(report, 0, 0.4))
+    if together is not None:
+        history = model
+        for name, errors in together.ladder:
+            history = recorded(history, name, errors)
+            steps.append(ExplanationStep(name, errors))
+        model = replace(together.model, history=history.history)
+        if save:
+            save(model)
 
     while True:
         done = len(steps) - 1
@@ -311,8 +346,12 @@ def explain(
         if model.names != kept:
             found = diagnose(captures, model, known, pool, thresholds, None, ideal, with_probes=False)
             diagnoses.append(found)
+    rest = None
+    if learn and diagnoses[-1].verdict == "outside_catalogue" and not below_the_noise(errors):
+        rest = learn_rest(roles, model, diagnoses[-1], pool, part_of(report, 0.8, 1.0))
+        model = rest.model
     report(1.0, "done")
-    return Explanation(tuple(steps), model, diagnoses[-1], tuple(diagnoses))
+    return Explanation(tuple(steps), model, diagnoses[-1], tuple(diagnoses), rest)
 
 
 def _any_gone_on(
@@ -333,27 +372,7 @@ def _with_maps_again(
     """The model with the maps that it has fitted again, next to a new effect: they give back what was not theirs."""
     if all(p.nodes is None for p in model.present):
         return model, errors
-    first, last = with_stopping(roles.probed, FIT_CAPTURES)
+    first, last = with_stopping(_worst_first(roles, model), FIT_CAPTURES)
     again = refined(model, load(roles.captures, first), load(roles.captures, last))
     after = evaluate_captures(roles.captures, roles.held_out, again)
     return (again, after) if after.excess < errors.excess else (model, errors)
-
-
-def _without_one(
-    roles: CaptureRoles,
-    model: Model,
-    errors: PredictionErrors,
-    names: Sequence[str],
-    thresholds: Thresholds,
-    ideal_excess: float,
-) -> tuple[str, Model, PredictionErrors] | None:
-    """The model without one of the named effects, if there is one that it does as well without."""
-    for name in names:
-        rest = model.without(name)
-        batches = load(roles.captures, roles.fitted)
-        unexplained = not thresholds.complete(errors.excess, ideal_excess)
-        fitted = (settled(rest, batches) if unexplained else fit(rest, rest.names, batches)).model
-        without = evaluate_captures(roles.captures, roles.held_out, fitted)
-        if not thresholds.worth_adding(removed_excess(without, errors), ideal_excess, 1):
-            return name, fitted, without
-    return None

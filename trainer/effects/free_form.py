@@ -12,9 +12,8 @@ import torch
 from torch import Tensor
 
 from runtime.lightpath.spline_maps import node_weights, weights_at
+from trainer.prediction.free_stages import PUPIL_EXTENT
 from trainer.prediction.stages import Pupil
-
-PUPIL_EXTENT = 1.3  # of the panel's band, each way: as far as a map over the pupil reaches
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,11 @@ from runtime.lightpath.spline_maps import nodes_over, on_other_nodes
 from runtime.program.progress import Progress, no_progress
 from trainer.captures.batches import Batch
 from trainer.effects.free_form import FreeForm, grid_of, surface_over
-from trainer.fitting.free_form_maps import FreeFormBatch, FreeFormStage, Tensors, descend
+from trainer.fitting.free_form_maps import FreeFormBatch, descend
 from trainer.fitting.gauss_newton import fit
 from trainer.fitting.predictor import Predictor
 from trainer.model.model import Model
+from trainer.prediction.free_stages import FreeFormStage, Tensors
 from trainer.prediction.scene import Stages
 
 PARTS = (18, 36, 72)  # of the grid's shorter side between nodes, coarse to fine

@@ -7,11 +7,9 @@ captures share.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,43 +17,11 @@ from runtime.program.progress import Progress
 from trainer.captures.batches import Batch
 from trainer.fitting.predictor import Predictor
 from trainer.model.model import Model
+from trainer.prediction.free_stages import FreeFormStage, Tensors
 from trainer.prediction.predict import Trace, counts, light_on_camera, trace
-from trainer.prediction.scene import Scene, Stages
-
-MapPicture = tuple[str, np.ndarray, str]  # title, values, unit
-Tensors = dict[str, Tensor]
 
 HISTORY = 10  # steps that L-BFGS keeps
 PATIENCE = 3  # rounds without progress on the captures that say when to stop
-
-
-@dataclass(frozen=True)
-class FreeFormStage:
-    """The maps that are free at a stage.
-
-    Attributes
-    ----------
-    stage : str
-        The first stage that the maps change.
-    shapes : dict
-        {name: (shape, physical units a unit of the optimiser's variable)}.
-    apply : callable
-        `(stages, maps) -> stages`.
-    pictures : callable
-        `maps -> [(title, array, unit)]`.
-    prior : mapping
-        {name: expected standard deviation, physical units}, where squared errors are in units of their variance.
-    irradiance : callable, optional
-        `(scene, stages, gray [1, H, W], maps) -> irradiance`, where the stages alone do not determine the light; the
-        light path's own otherwise.
-    """
-
-    stage: str
-    shapes: dict[str, tuple[tuple[int, ...], float]]
-    apply: Callable[[Stages, Tensors], Stages]
-    pictures: Callable[[Tensors], list[MapPicture]]
-    prior: Mapping[str, float] = field(default_factory=dict)
-    irradiance: Callable[[Scene, Stages, Tensor, Tensors], Tensor] | None = None
 
 
 class FreeFormBatch:

@@ -20,12 +20,13 @@ from trainer.captures.batches import Batch, load
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.capture_table import Capture
 from trainer.captures.held_out import FIT_CAPTURES, sample, split
-from trainer.fitting.free_form_maps import FreeFormBatch, FreeFormStage, Tensors, descend
+from trainer.fitting.free_form_maps import FreeFormBatch, descend
 from trainer.fitting.gains import with_gains
 from trainer.fitting.gauss_newton import fit
 from trainer.fitting.predictor import evaluate_captures
 from trainer.model.history import recorded
 from trainer.model.model import Model
+from trainer.prediction.free_stages import FreeFormStage, Tensors
 from trainer.prediction.panel_field import NAME, UNITS, combined, with_field
 from trainer.prediction.scene import Stages
 

@@ -28,9 +28,8 @@ def with_gain(model: Model, predictors: Sequence[Predictor], points: Sequence[Tr
         linear = replace(stages.sensor, offset=None, response=None, free_capture_gain=False)
         point = predictor.trace(unit) if points is None else points[k]
         light = predictor.light(unit, point)
-        one = counts(
-            predictor.scene, replace(stages, sensor=linear), light, batch.exposure[:, None, None], None
-        )
+        exposed = batch.exposure[:, None, None]
+        one = batch.as_compared(counts(predictor.scene, replace(stages, sensor=linear), light, exposed, None))
         light_counts = batch.signal if stages.sensor.offset is None else batch.signal - stages.sensor.offset
         total = sums.setdefault(batch.channel, [0.0, 0.0])
         total[0] += float((batch.mask * light_counts * one).sum(dtype=torch.float64))

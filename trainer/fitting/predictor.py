@@ -61,7 +61,7 @@ class Predictor:
         """Counts above black [B, h, w], from the irradiance on the camera [B, h, w]."""
         gain = model.gain[self.batch.channel] * self.batch.exposure[:, None, None]
         measured = (self.batch.signal, self.batch.mask)
-        return counts(self.scene, self.stages(model), light, gain, measured)
+        return self.batch.as_compared(counts(self.scene, self.stages(model), light, gain, measured))
 
     def predict(self, model: Model, start: str = "drive", before: Trace | None = None) -> Tensor:
         """Counts above black [B, h, w], from stage `start` on."""

@@ -52,8 +52,8 @@ def export_bundle(
     Returns
     -------
     dict
-        Keys `bundle`, `channels`, `planes_mm`, `effects`, `effects_left_out`, `panel_field`, `heldout`, `arrays`,
-        `network` and `megabytes`, for `export --json`.
+        Keys `bundle`, `channels`, `planes_mm`, `effects`, `effects_left_out`, `panel_field`, `learned`, `heldout`,
+        `arrays`, `network` and `megabytes`, for `export --json`.
 
     Raises
     ------
@@ -105,6 +105,7 @@ def export_bundle(
         ],
         "effects_left_out": [_named(e) for e in left_out],
         "panel_field": exported.panel_field is not None,
+        "learned": list(exported.learned),
     }
     files: dict[str, bytes] = {}
     if network is not None:
@@ -119,6 +120,7 @@ def export_bundle(
         "effects": list(exported.names),
         "effects_left_out": [e.name for e in left_out],
         "panel_field": exported.panel_field is not None,
+        "learned": list(exported.learned),
         "heldout": provenance["heldout"],
         "arrays": len(arrays),
         "network": None if network is None else str(network),
@@ -154,8 +156,12 @@ def _network_files(path: Path, model: Model, channels: list[str]) -> tuple[dict[
 
 
 def acting_on_display(model: Model) -> Model:
-    """The model with only the effects that act on the display, which the eye sees too."""
-    return replace(model, present=tuple(p for p in model.present if p.effect.acts_on == "display"))
+    """The model with only what acts on the display, which the eye sees too."""
+    return replace(
+        model,
+        present=tuple(p for p in model.present if p.effect.acts_on == "display"),
+        learned={stage: maps for stage, maps in model.learned.items() if stage != "sensor"},
+    )
 
 
 def baked_path(model: Model, channel: str, plane_mm: float) -> LightPath:

@@ -63,6 +63,8 @@ class Model:
         One record a step: what was added, and the held-out errors after it.
     panel_field : mapping or None
         Maps of the panel's learned field by name, float32 [m, n]; None where nothing was learned.
+    learned : mapping
+        What was learned at other stages, by stage and name (`trainer.prediction.free_stages`); float32 arrays.
     """
 
     bench: Bench
@@ -71,6 +73,7 @@ class Model:
     method: str = "angular_spectrum"
     history: tuple[dict[str, Any], ...] = ()
     panel_field: Mapping[str, np.ndarray] | None = None
+    learned: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -79,8 +82,9 @@ class Model:
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """Names of all that a network learns beyond: the effects, and the learned field."""
-        return self.names if self.panel_field is None else (*self.names, NAME)
+        """Names of all that a network learns beyond: the effects, the learned field, what was learned at stages."""
+        field_name = () if self.panel_field is None else (NAME,)
+        return (*self.names, *field_name, *(f"learned_{stage}" for stage in self.learned))
 
     def instance(self, name: str) -> EffectInstance:
         """The effect of that name, as it is in the model."""

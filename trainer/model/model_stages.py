@@ -1,4 +1,4 @@
-"""The scenes of a model, and its stages: the bench's own with the model's effects and its learned field applied."""
+"""The scenes of a model, and its stages: the bench's own with the model's effects and what was learned."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from trainer.captures.bench_file import Bench
 from trainer.effects.free_form import surface_over
 from trainer.effects.own_effect import applied
 from trainer.model.model import EffectInstance, Model
+from trainer.prediction.free_stages import with_learned
 from trainer.prediction.panel_field import with_field
 from trainer.prediction.predict import bare_irradiance
 from trainer.prediction.scene import Scene, Stages, bare_stages, scene_at
@@ -79,7 +80,7 @@ def stages_for(scene: Scene, present: tuple[EffectInstance, ...], tensors: Any =
 
 
 def stages_of(scene: Scene, model: Model, tensors: Any = None) -> Stages:
-    """The scene's stages under a model: its effects, and the field learned at the panel after them.
+    """The scene's stages under a model: its effects, and what was learned at the panel and other stages after them.
 
     Parameters
     ----------
@@ -87,10 +88,14 @@ def stages_of(scene: Scene, model: Model, tensors: Any = None) -> Stages:
         As in `stages_for`.
     """
     stages = stages_for(scene, model.present, tensors)
-    if model.panel_field is None:
-        return stages
-    maps = {name: torch.as_tensor(surface, dtype=scene.dtype) for name, surface in model.panel_field.items()}
-    return replace(stages, panel=with_field(stages.panel, maps))
+    if model.panel_field is not None:
+        maps = {
+            name: torch.as_tensor(surface, dtype=scene.dtype) for name, surface in model.panel_field.items()
+        }
+        stages = replace(stages, panel=with_field(stages.panel, maps))
+    for stage, learned in model.learned.items():
+        stages = with_learned(stages, model.bench, stage, learned)
+    return stages
 
 
 def ideal_irradiance(bench: Bench, gray: np.ndarray, channel: str, plane_mm: float) -> np.ndarray:

@@ -16,10 +16,11 @@ from trainer.effects.definition import Effect, Parameter
 from trainer.effects.effect_catalogue import Catalogue, find_effect
 from trainer.model.model import EffectInstance, Model
 from trainer.model.model_text import MAP, allowed
+from trainer.prediction.free_stages import LEARNED, LEARNED_STAGES, learned_stage
 from trainer.prediction.panel_field import NAME, UNITS
 
 SCHEMA = 1
-_TOP = ("schema", "about", "arrays", "bench", "propagation", "gain", "effect", NAME, "history")
+_TOP = ("schema", "about", "arrays", "bench", "propagation", "gain", "effect", NAME, LEARNED, "history")
 
 Arrays = Mapping[str, np.ndarray]
 
@@ -60,7 +61,8 @@ def model_of(tables: Mapping[str, Any], known: Catalogue, read_arrays: Callable[
         history.append(dict(row))
     learned = _panel_field(tables[NAME], bench, arrays) if NAME in tables else None
     gain = _gain(tables.get("gain", {}), bench)
-    return Model(bench, tuple(present), gain, _method(tables), tuple(history), learned)
+    others = _learned(tables.get(LEARNED, {}), bench, arrays)
+    return Model(bench, tuple(present), gain, _method(tables), tuple(history), learned, others)
 
 
 def _panel_field(given: Any, bench: Bench, arrays: Arrays) -> dict[str, np.ndarray]:
@@ -82,6 +84,27 @@ def _panel_field(given: Any, bench: Bench, arrays: Arrays) -> dict[str, np.ndarr
             )
         maps[name] = array.astype(np.float32)
     return maps
+
+
+def _learned(given: Any, bench: Bench, arrays: Arrays) -> dict[str, dict[str, np.ndarray]]:
+    """What was learned at stages: arrays of the names and shapes that each stage has."""
+    table = table_at(given, LEARNED)
+    only_keys(table, LEARNED_STAGES, f"{LEARNED}.")
+    found: dict[str, dict[str, np.ndarray]] = {}
+    for stage, rows in table.items():
+        where = f"{LEARNED}.{stage}"
+        shapes = learned_stage(bench, stage).shapes
+        only_keys(table_at(rows, where), shapes, f"{where}.")
+        found[stage] = {}
+        for name, (shape, _) in shapes.items():
+            array = _array(rows.get(name), f"{where}.{name}", arrays)
+            if array is None or array.shape != shape or not np.isfinite(array).all():
+                raise InputError(
+                    f"{where}.{name} is not an array of {' x '.join(map(str, shape))} finite numbers: take [{where}] "
+                    "out, or learn it again with: hololoop-trainer explain CAPTURES --model MODEL --learn --out NEW"
+                )
+            found[stage][name] = array.astype(np.float32)
+    return found
 
 
 def _array(given: Any, where: str, arrays: Arrays) -> np.ndarray | None:

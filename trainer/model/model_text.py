@@ -20,6 +20,7 @@ from trainer.captures.bench_file import Bench, bench_tables
 from trainer.effects.definition import Effect, Parameter
 from trainer.effects.effect_catalogue import BUILT_IN
 from trainer.model.model import EffectInstance, Model
+from trainer.prediction.free_stages import LEARNED
 from trainer.prediction.panel_field import NAME
 
 LONGEST = 128  # numbers of an array that stay in the text: every built-in map and curve does
@@ -54,6 +55,7 @@ def model_text(model: Model, about: Mapping[str, Any] | None, store: Store) -> s
     parts += [_effect(p, model.bench, store) for p in model.present]
     if model.panel_field is not None:
         parts.append(_panel_field(model, store))
+    parts += [_learned(stage, maps, store) for stage, maps in model.learned.items()]
     parts += [table_text("[[history]]", record) for record in model.history]
     return "\n\n".join(parts) + "\n"
 
@@ -187,6 +189,12 @@ def _panel_field(model: Model, store: Store) -> str:
     assert model.panel_field is not None
     named = {name: {"array": store(f"{NAME}.{name}", surface)} for name, surface in model.panel_field.items()}
     return "\n".join([*comment(about + "out to be without it."), table_text(f"[{NAME}]", named)])
+
+
+def _learned(stage: str, maps: Mapping[str, np.ndarray], store: Store) -> str:
+    named = {name: {"array": store(f"{LEARNED}.{stage}.{name}", array)} for name, array in maps.items()}
+    about = f"Learned at the {stage}, without a name, after the effects. Take the table out to be without it."
+    return "\n".join([*comment(about), table_text(f"[{LEARNED}.{stage}]", named)])
 
 
 def _parameter(present: EffectInstance, parameter: Parameter, bench: Bench, store: Store) -> list[str]:

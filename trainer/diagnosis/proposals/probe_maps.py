@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from trainer.diagnosis.probes import PUPIL_EXTENT, ProbeResult
+from trainer.diagnosis.probes import ProbeResult
+from trainer.prediction.free_stages import PUPIL_EXTENT
 
 PANEL_PLACES = (
     "    rows, columns = {stage}.y.shape",

@@ -1,0 +1,97 @@
+"""Several strong effects that hide one another, explained together where no single one gets anywhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from runtime.excess import PredictionErrors
+from runtime.program.progress import Progress, no_progress, part_of
+from trainer.captures.batches import load
+from trainer.captures.held_out import CaptureRoles
+from trainer.diagnosis.diagnosis import screen_all, tells
+from trainer.diagnosis.unnecessary import without_one
+from trainer.diagnosis.verdict import Thresholds
+from trainer.effects.effect_catalogue import Catalogue
+from trainer.fitting.gains import with_gains
+from trainer.fitting.joint_start import joint_start
+from trainer.fitting.pool import Pool
+from trainer.fitting.predictor import evaluate_captures
+from trainer.fitting.refit import settled
+from trainer.model.model import Model
+
+FAR = 0.3  # held-out excess from which several strong effects may hide one another
+HELPS = 0.5  # share of the excess that one effect leaves at most if it gets anywhere alone
+
+
+@dataclass(frozen=True)
+class JointExplanation:
+    """Effects that were found together.
+
+    Attributes
+    ----------
+    model : Model
+        With all of them.
+    ladder : tuple of (str, PredictionErrors)
+        Effect by effect, held-out errors of the model with those so far: from the one that does most without the rest.
+    """
+
+    model: Model
+    ladder: tuple[tuple[str, PredictionErrors], ...]
+
+
+def explain_together(
+    roles: CaptureRoles,
+    model: Model,
+    errors: PredictionErrors,
+    known: Catalogue,
+    pool: Pool,
+    thresholds: Thresholds,
+    progress: Progress | None = None,
+) -> JointExplanation | None:
+    """The effects that most benches have, fitted together from coarse to fine, less those that are not needed.
+
+    Parameters
+    ----------
+    model : Model
+        Without effects, with fitted gains.
+    errors : PredictionErrors
+        Of `model` on the held-out captures.
+
+    Returns
+    -------
+    JointExplanation or None
+        None where little is missing, where the screen expects that one effect alone removes half of it, and where all
+        together do not.
+    """
+    report = progress or no_progress
+    if model.present or errors.excess < FAR or not roles.is_held_out:
+        return None
+    candidates = [e for e in known.values() if tells(e, roles.captures)]
+    screened = screen_all(roles, model, candidates, pool, report)
+    if min(s.after for s in screened) < HELPS * errors.excess:
+        return None
+    batches = load(roles.captures, roles.fitted)
+    joint = settled(joint_start(model, known, batches, part_of(report, 0.3, 0.7)).model, batches).model
+    after = evaluate_captures(roles.captures, roles.held_out, joint)
+    if after.excess > HELPS * errors.excess:
+        return None
+    report(0.8, "leaving out effects that are not needed")
+    names = joint.names
+    while smaller := without_one(roles, joint, after, names, thresholds, errors.excess, thorough=False):
+        dropped, joint, after = smaller
+        names = names[names.index(dropped) + 1 :]
+    return JointExplanation(joint, _ladder(roles, joint, after))
+
+
+def _ladder(
+    roles: CaptureRoles, model: Model, errors: PredictionErrors
+) -> tuple[tuple[str, PredictionErrors], ...]:
+    """From the whole model down, each time without the effect that is missed least."""
+    steps = []
+    while model.names:
+        rest = [with_gains(roles.captures, model.without(name), roles.fitted) for name in model.names]
+        without = [evaluate_captures(roles.captures, roles.held_out, one) for one in rest]
+        least = min(range(len(rest)), key=lambda k: without[k].excess)
+        steps.append((model.names[least], errors))
+        model, errors = rest[least], without[least]
+    return tuple(reversed(steps))

@@ -1,0 +1,80 @@
+"""A start from far away: where several strong effects hide one another, they are fitted together, coarse to fine.
+
+Speckle that is a pixel off says nothing, and no effect helps alone. What survives smoothing says where the picture is,
+how bright it is from place to place, and where it is bent: so registration, beam, distance, wavefront and response are
+fitted together to pictures that are smoothed less and less.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from runtime.program.progress import Progress, no_progress
+from trainer.captures.batches import Batch
+from trainer.effects.effect_catalogue import Catalogue
+from trainer.effects.evidence import Evidence
+from trainer.effects.own_effect import starts_of
+from trainer.fitting.gauss_newton import FitResult, fit
+from trainer.fitting.least_squares_gain import with_gain
+from trainer.fitting.predictor import Predictor
+from trainer.fitting.start_points import start_cost
+from trainer.model.model import Model, absent, instance_with
+
+TOGETHER = ("misregistration", "illumination", "panel_wavefront", "distance", "phase_response", "zero_order")
+SMOOTHING_PX = (8.0, 4.0, 2.0, 1.0)
+ITERATIONS = 6
+
+
+def joint_start(
+    model: Model, known: Catalogue, batches: Sequence[Batch], progress: Progress | None = None
+) -> FitResult:
+    """The model with the effects that most benches have, fitted together from coarse to fine.
+
+    Parameters
+    ----------
+    known : Catalogue
+        Effects of TOGETHER that it lacks are left out.
+    progress : callable, optional
+        Called with the share that is done and what is being done.
+
+    Returns
+    -------
+    FitResult
+        On `batches` as they are.
+    """
+    report = progress or no_progress
+    names = [n for n in TOGETHER if n in known and n not in model.names]
+    for name in names:
+        model = model.having(absent(known[name], model.bench))
+    for k, sigma in enumerate(SMOOTHING_PX):
+        report(
+            k / (len(SMOOTHING_PX) + 1),
+            f"fitting {len(names)} effects together, smoothed by {sigma:g} pixels",
+        )
+        coarse = [b.smoothed(sigma) for b in batches]
+        if k == 0:
+            for name in names:
+                model = _best_start(model, name, coarse)
+        model = fit(model, model.names, coarse, ITERATIONS, tolerance=1e-2).model
+    report(len(SMOOTHING_PX) / (len(SMOOTHING_PX) + 1), f"fitting {len(names)} effects together")
+    return fit(model, model.names, batches)
+
+
+@torch.no_grad()
+def _best_start(model: Model, name: str, batches: Sequence[Batch]) -> Model:
+    """The model with an absent effect at the best of the starts that its own look at the captures gives."""
+    effect = model.instance(name).effect
+    if effect.starts is None:
+        return model
+    predictors = [Predictor(model, b) for b in batches]
+    points = [p.trace(model) for p in predictors]
+    model = with_gain(model, predictors, points)
+    evidence = [
+        Evidence(p.scene, p.batch, p.counts(model, p.light(model, t)))
+        for p, t in zip(predictors, points, strict=True)
+    ]
+    starts = [model.instance(name)]
+    starts += [instance_with(effect, model.bench, values) for values in starts_of(effect, evidence)]
+    return model.having(min(starts, key=lambda s: start_cost(model, predictors, points, s)))
