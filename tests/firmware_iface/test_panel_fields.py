@@ -111,8 +111,8 @@ def test_fields_are_shown_in_turn_each_with_its_own_light() -> None:
     patterns = [(crc(field.gray), (crc(field.gray), 1 << k)) for k, field in enumerate(frame)]
     assert seen == [*patterns, *patterns, patterns[0]]
     assert model.outputs == 0b111
-    period_s, shown = model.lit()
-    assert period_s == pytest.approx(0.006)
+    frame_s, since_s, shown = model.lit()
+    assert (frame_s, since_s) == (pytest.approx(0.006), pytest.approx(0, abs=1e-9))
     assert [(p.outputs, round(p.begins_s, 6), p.width_s) for p in shown] == [
         (1, 0.0005, 0.001),
         (2, 0.0025, 0.001),
@@ -261,7 +261,7 @@ def test_while_the_fault_lasts_only_what_is_whole_is_lit(kind: str) -> None:
     now[0] += 0.006
     # a panel that takes nothing more goes on showing the field that it had: that one is whole when it is due
     assert model.outputs == (0 if kind == "swapped_gate" else 0b100)
-    assert {p.outputs for p in model.lit()[1]} <= {0, model.outputs}
+    assert {p.outputs for p in model.lit()[2]} <= {0, model.outputs}
     assert lit(model) <= allowed(picture(0))
 
 

@@ -31,6 +31,8 @@ class FieldSequence:
     ----------
     front : list of ReceivedField
         The frame on display; empty before the first.
+    began : int
+        Period in which the front frame was shown for the first time.
     lit : bool
         Whether the board's mode allows light.
     number : int
@@ -54,7 +56,7 @@ class FieldSequence:
         self.displayed = self.kept_dark = self.reason = 0
         self.opened: deque[tuple[int, int]] = deque(maxlen=REMEMBERED)
         self._passed: dict[int, tuple[bytes, int]] = {}  # as each field of the front frame was shown last
-        self._slot = self._first = 0
+        self._slot = self.began = 0
 
     def advance(self, slot: int, pending: list[ReceivedField] | None = None, due: int = 0) -> bool:
         """Show the fields of all periods up to `slot`; whether the pending frame was swapped in."""
@@ -62,12 +64,12 @@ class FieldSequence:
         self._slot = max(self._slot, slot - LONGEST)
         while self._slot < slot:
             self._slot += 1
-            at_start = not self.front or (self._slot - self._first) % len(self.front) == 0
+            at_start = not self.front or (self._slot - self.began) % len(self.front) == 0
             if pending is not None and not swapped and self._slot >= due and at_start:
-                self.front, self._first, swapped = pending, self._slot, True
+                self.front, self.began, swapped = pending, self._slot, True
                 self._passed.clear()
             if self.front:
-                self._show((self._slot - self._first) % len(self.front))
+                self._show((self._slot - self.began) % len(self.front))
         return swapped
 
     def shown(self) -> list[tuple[ReceivedField, bytes, int]]:

@@ -139,24 +139,26 @@ class BoardModel(UsbModel):
             self._run()
             return EVERY_OUTPUT if self._version == 1 else self.sequence.outputs
 
-    def lit(self) -> tuple[float, list[LitPattern]]:
-        """The time of a frame, s, and the patterns that are lit in it."""
-        gray = self.gray
+    def lit(self) -> tuple[float, float, list[LitPattern]]:
+        """The time of a frame, the time since the one on display began, both s, and the patterns that are lit in it."""
+        gray, outputs = self.gray, self.outputs
         with self._lock:
             period_s = self._period_us * 1e-6
             if self._version == 1:
-                return period_s, [LitPattern(gray, self.outputs, 0.0, period_s)]
-            shown = self.sequence.shown() if self.outputs else []
+                return period_s, 0.0, [LitPattern(gray, outputs, 0.0, period_s)]
+            shown = self.sequence.shown() if outputs else []
             patterns = [
                 LitPattern(
                     self._picture(pixels),
-                    outputs,
+                    open_,
                     k * period_s + field.delay_us * 1e-6,
                     field.width_us * 1e-6,
                 )
-                for k, (field, pixels, outputs) in enumerate(shown)
+                for k, (field, pixels, open_) in enumerate(shown)
             ]
-            return max(1, len(shown)) * period_s, patterns
+            frame_s = max(1, len(shown)) * period_s
+            since_s = self._clock() - self._epoch - self.sequence.began * period_s
+            return frame_s, since_s % frame_s, patterns
 
     def _picture(self, pixels: bytes) -> NDArray[np.uint8]:
         return np.frombuffer(pixels, np.uint8).reshape(self.shape).copy()
