@@ -44,7 +44,7 @@ MOST_PICTURES = 24  # one bit each of an image of 24 bits
 class PatternUpload:
     """Frames as one-bit patterns over USB: up to 24 pictures in turn; a single one stays until the next."""
 
-    most_fields = MOST_PICTURES
+    most_fields, every_laser = MOST_PICTURES, EVERY_COLOUR
 
     def __init__(self, control: Dlpc900Control, modulator: Modulator = P47) -> None:
         self.shape = modulator.shape
@@ -187,6 +187,6 @@ def open_dlpc900(
     if display is None:
         control = Dlpc900Control(link, exposure_us=exposure_us, colours=fields > 1)
         frames = PatternUpload(control, modulator)
-        return FieldPanel(control, frames) if fields > 1 else Panel(control, frames)
+        return FieldPanel(control, frames, fields) if fields > 1 else Panel(control, frames)
     screen = MirroredDisplay(display, modulator.shape, draw=partial(video_pattern, modulator=modulator))
     return Panel(Dlpc900Control(link, receiver, exposure_us), screen)

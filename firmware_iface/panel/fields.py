@@ -13,6 +13,7 @@ from firmware_iface.errors import InputError
 from firmware_iface.panel.panel import Control, Frames, Gray, Panel, checked_gray
 
 SETTLE_SHARE, LIGHT_SHARE = 0.25, 0.5  # of a field's time: until the panel has settled, and of light at most
+SHORTEST_LIGHT_US = 20  # that a photodiode can hold; less is dark
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,10 @@ class FieldFrames(Frames, Protocol):
     most_fields: int
 
     @property
+    def every_laser(self) -> int:
+        """Mask of the lasers that it gates."""
+
+    @property
     def field_us(self) -> int:
         """Time of one field, µs."""
 
@@ -50,21 +55,37 @@ class FieldFrames(Frames, Protocol):
 class FieldPanel(Panel):
     """A phase panel that shows frames of several fields and gates the lasers to them.
 
+    Parameters
+    ----------
+    control : Control
+    frames : FieldFrames
+    fields : int
+        Fields of a usual frame.
+
     Attributes
     ----------
-    most_fields : int
-        Of a frame.
+    fields : int
     """
 
-    def __init__(self, control: Control, frames: FieldFrames) -> None:
+    def __init__(self, control: Control, frames: FieldFrames, fields: int) -> None:
         super().__init__(control, frames)
         self._fields = frames
-        self.most_fields = frames.most_fields
+        self.fields = fields
 
     @property
     def field_us(self) -> int:
         """Time of one field, µs."""
         return self._fields.field_us
+
+    def show(self, gray: NDArray[np.generic]) -> None:
+        """Show one pattern in all fields of a usual frame; every laser may shine on the first.
+
+        So no laser shines for more of the time than in a picture of all colours. Raises as `show_fields`.
+        """
+        delay_us, width_us = light_times_us(self.field_us)
+        every = self._fields.every_laser
+        one = checked_gray(gray, self.shape)
+        self.show_fields([Field(one, 0 if k else every, delay_us, width_us) for k in range(self.fields)])
 
     def show_fields(self, fields: Sequence[Field]) -> None:
         """Show a frame of fields, in turn and again, and return when it is displayed.
@@ -82,7 +103,7 @@ class FieldPanel(Panel):
         DeviceError
             Where the panel does not show them.
         """
-        checked = checked_fields(fields, self.shape, self.field_us, self.most_fields)
+        checked = checked_fields(fields, self.shape, self.field_us, self._fields.most_fields)
         self.frames.wait(self._fields.send_fields(checked))
 
 
@@ -109,6 +130,11 @@ def checked_fields(
     return list(fields)
 
 
+def light_times_us(field_us: int) -> tuple[int, int]:
+    """From the start of a field until the panel has settled, and the longest light after that, µs."""
+    return round(SETTLE_SHARE * field_us), int(LIGHT_SHARE * field_us)
+
+
 def colours_in_turn(
     grays: NDArray[np.uint8], lasers: Sequence[int], brightness: Sequence[float], field_us: int
 ) -> list[Field]:
@@ -131,9 +157,10 @@ def colours_in_turn(
     -------
     list of Field
     """
-    delay_us, most_us = round(SETTLE_SHARE * field_us), int(LIGHT_SHARE * field_us)
+    delay_us, most_us = light_times_us(field_us)
     frame = []
     for gray, laser, share in zip(grays, lasers, brightness, strict=True):
         width_us = round(min(1.0, max(0.0, share)) * most_us)
+        width_us = width_us if width_us >= SHORTEST_LIGHT_US else 0
         frame.append(Field(gray, 1 << laser if width_us else 0, delay_us, width_us))
     return frame

@@ -271,12 +271,11 @@ class FieldsOverBulk(BulkFrames):
         """Time of one field, µs."""
         return self._control.timing.period_us
 
-    def send(self, gray: Gray) -> int:
-        """A frame of one field: every laser may shine on it, at the time that the timing gives."""
-        timing, versions = self._control.timing, self._control.versions
-        assert versions is not None
-        every = (1 << versions.light_outputs) - 1
-        return self.send_fields([Field(gray, every, timing.light_delay_us, timing.light_width_us)])
+    @property
+    def every_laser(self) -> int:
+        """Mask of the board's light outputs."""
+        assert self._control.versions is not None
+        return (1 << self._control.versions.light_outputs) - 1
 
     def send_fields(self, fields: Sequence[Field]) -> int:
         """Write a frame to the back buffer and commit it; displayed after the last field of the frame before."""
@@ -323,5 +322,5 @@ def open_board(
     link = UsbLink(VENDOR, PRODUCT, "the panel board", serial=serial, backend=backend, timeout_s=timeout_s)
     control = BoardControl(link, timing, fields)
     if fields > 1:
-        return FieldPanel(control, FieldsOverBulk(link, control, fields))
+        return FieldPanel(control, FieldsOverBulk(link, control, fields), fields)
     return Panel(control, BulkFrames(link, control))

@@ -261,7 +261,7 @@ def test_the_bytes_of_colours_in_turn() -> None:
     """LED enables to the sequencer; lines of the table with their colours, darkness and trigger output 2."""
     bus = Transcript(Dlpc900Model((2, 4)), longest=64)
     panel = open_dlpc900(modulator=Modulator((1, 2), P47.electrodes), backend=bus, exposure_us=4000, fields=3)
-    assert isinstance(panel, FieldPanel) and panel.field_us == 4000 and panel.most_fields == 24
+    assert isinstance(panel, FieldPanel) and panel.field_us == 4000 and panel.fields == 3
 
     def sent() -> list[bytes]:
         return [bytes.fromhex(line[5:])[2:] for line in bus.lines if line.startswith("01 >")]

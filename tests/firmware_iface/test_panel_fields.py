@@ -101,7 +101,7 @@ def test_fields_are_shown_in_turn_each_with_its_own_light() -> None:
     model = BoardModel(SHAPE, clock=lambda: now[0])
     panel = opened(model)
     frame = picture(0)
-    assert panel.most_fields == 3 and panel.field_us == 2000
+    assert panel.fields == 3 and panel.field_us == 2000
     assert model.outputs == 0, "nothing is lit without a frame"
     panel._fields.send_fields(frame)
     seen = []
@@ -138,15 +138,16 @@ def test_a_frame_is_swapped_in_after_the_last_field_of_the_one_before() -> None:
     assert [sequence for sequence, _ in model.shown] == [1, 1, 1, 2, 2, 2]
 
 
-def test_one_pattern_alone_is_a_frame_of_one_field_on_which_every_laser_may_shine() -> None:
+def test_one_pattern_alone_is_lit_by_every_laser_and_for_no_more_of_the_time() -> None:
     model = BoardModel(SHAPE)
     panel = opened(model)
     gray = picture(3)[0].gray
     panel.show(gray)
     np.testing.assert_array_equal(model.gray, gray)
     assert model.outputs == 0b111
+    assert [p.outputs for p in model.lit()[2]] == [0b111, 0, 0]
     status = panel.status()
-    assert status["fields"] == 1 and status["fields_kept_dark"] == 0 and status["kept_dark_because"] == ""
+    assert status["fields"] == 3 and status["fields_kept_dark"] == 0 and status["kept_dark_because"] == ""
 
 
 def wrong_frames() -> dict[str, tuple[bytes, int]]:

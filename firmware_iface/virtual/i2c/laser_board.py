@@ -99,6 +99,7 @@ class LaserBoard:
     ) -> None:
         self._clock, self._emission, self.gates = clock, emission, gates
         self._held_v = [0.0] * 3
+        self._open = 0  # the panel's light outputs, as of the last time that everything was settled
         self.bus = I2cBus(self.settle, faults)
         self._key = self._interlock = False
         self._celsius = 25.0
@@ -133,6 +134,7 @@ class LaserBoard:
         with self.bus.lock:
             if self.bus.faults.standing("unplug"):
                 self._power_on()
+            self._open = self.gates()
             self.thermometer.settle()
             self.controller.settle()
             self.converter.settle()  # after the limiter has come this far
@@ -151,7 +153,7 @@ class LaserBoard:
 
     def power_uw(self, laser: int) -> float:
         """Light of one laser, 0 to 2, µW."""
-        return self._driven_uw(laser) if self.gates() >> laser & 1 else 0.0
+        return self._driven_uw(laser) if self._open >> laser & 1 else 0.0
 
     def _driven_uw(self, laser: int) -> float:
         """Light that a laser makes where the panel's light output lets it, µW."""
@@ -213,7 +215,7 @@ class LaserBoard:
         if self._photodiode_broken[laser]:
             return 0.0
         driven_uw = self._driven_uw(laser)
-        if driven_uw == 0 or self.gates() >> laser & 1:
+        if driven_uw == 0 or self._open >> laser & 1:
             self._held_v[laser] = driven_uw * self.diodes[laser].photodiode_v_per_uw
         return self._held_v[laser]
 

@@ -56,7 +56,7 @@ class FieldSequence:
         self.displayed = self.kept_dark = self.reason = 0
         self.opened: deque[tuple[int, int]] = deque(maxlen=REMEMBERED)
         self._passed: dict[int, tuple[bytes, int]] = {}  # as each field of the front frame was shown last
-        self._slot = self.began = 0
+        self._slot = self.began = self._outputs = 0
 
     def advance(self, slot: int, pending: list[ReceivedField] | None = None, due: int = 0) -> bool:
         """Show the fields of all periods up to `slot`; whether the pending frame was swapped in."""
@@ -79,10 +79,7 @@ class FieldSequence:
     @property
     def outputs(self) -> int:
         """Mask of the light outputs that open in some field of the front frame."""
-        mask = 0
-        for field, _, outputs in self.shown():
-            mask |= outputs if field.width_us else 0
-        return mask if self.lit else 0
+        return self._outputs if self.lit else 0
 
     def proven(self, record: ReceivedField, number: int, crc: int) -> int:
         """0 where the field may be lit, else why not."""
@@ -108,3 +105,6 @@ class FieldSequence:
             self.kept_dark, self.reason = self.kept_dark + 1, refused
         self.opened.append((crc, outputs))
         self._passed[number] = taken, 0 if refused else record.outputs
+        self._outputs = 0
+        for shown, _, opened in self.shown():
+            self._outputs |= opened if shown.width_us else 0
