@@ -26,7 +26,7 @@ CONFIG is one TOML file:
 
   [panel]
   kind = "board"                         # or dlpc900, mirrored, "my_lab:panel"
-  fields = 3                             # colours in turn, all of the bundle's; without it, one
+  # fields = 3                           # colours in turn, all of the bundle's; without it, one
   [lasers]
   bus = "/dev/i2c-1"
   power = { green = 0.5 }                # fraction of full while something is shown

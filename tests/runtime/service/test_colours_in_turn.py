@@ -13,6 +13,7 @@ import pytest
 
 from firmware_iface.errors import InputError
 from firmware_iface.virtual.remote_hardware import RemoteHardware
+from runtime.headset.device_findings import headset_findings
 from runtime.service.client import Client, RefusedError
 from runtime.service.configuration import read_configuration
 from runtime.service.frame_solver import open_solver
@@ -132,6 +133,17 @@ def test_no_light_in_a_wrong_field_while_the_panels_link_fails(tmp_path: Path) -
         assert lane.lit_fields() > 10 and lane.wrongly_lit() == 0 and lane.torn() == 0
     finally:
         lane.close()
+
+
+def test_its_devices_answer_and_a_laser_without_power_is_named(tmp_path: Path) -> None:
+    file = write_configuration(tmp_path, colours=True)
+    with hardware(tmp_path):
+        found = {one.part: one for one in headset_findings(read_configuration(file))}
+        assert not any(one.problems for one in found.values()), found
+        assert found["panel"].status["fields"] == found["panel"].status["fields_kept_dark"] == 0
+        file.write_text(file.read_text().replace(", blue = 0.5", ""))
+        (problem,) = {one.part: one for one in headset_findings(read_configuration(file))}["lasers"].problems
+    assert "shows blue and its laser gets no power" in problem
 
 
 def test_patterns_of_three_colours_by_a_deadline(tmp_path: Path) -> None:
