@@ -119,6 +119,23 @@ def test_light_is_in_proportion_to_a_colours_brightness(headset: Headset) -> Non
     assert 0.3 < half / full < 0.7
 
 
+def test_a_refinement_says_that_it_is_of_one_colour(headset: Headset) -> None:
+    client = headset.client
+    client.dark()
+    until(lambda: refined(client))
+    show(client, colours(client, 1.0, 1.0, 1.0))
+    until(lambda: list(client.outcomes()) is not None and client.refined is not None)
+    assert client.refined is not None and "several are shown in turn" in client.refined.text
+
+
+def refined(client: Client) -> bool:
+    """Whether a refinement was begun: it needs a picture of the camera in darkness."""
+    with suppress(RefusedError):
+        client.refine(4)
+        return True
+    return False
+
+
 def test_no_light_in_a_wrong_field_while_the_panels_link_fails(tmp_path: Path) -> None:
     lane = Lane(tmp_path, 0, colours=True)
     try:
