@@ -5,7 +5,9 @@ kind = "board"                or "dlpc900", TI's phase light modulator, or "mirr
                               "MODULE:FUNCTION", a function of yours that opens one (firmware_iface.own_device)
 bus = "virtual:SOCKET"        emulated hardware (firmware_iface.virtual.served); without it, the host's USB
 serial = "HL0001"             where several are attached
-refresh_hz = 60.0             of the panel itself
+refresh_hz = 60.0             of the panel itself; with fields, of a field
+fields = 3                    board, dlpc900: colours in turn, a field each, with lasers gated to them; without it, one
+                              colour (version 1 of the board's protocol)
 modulator = "p47"             dlpc900: or "p67"
 display = 1                   mirrored, and dlpc900 unless frames are uploaded over USB: N of /dev/fbN
 height = 1080                 mirrored: its pixels
@@ -40,12 +42,14 @@ from typing import Any
 
 from firmware_iface.errors import InputError, nearest
 from firmware_iface.lasers import VIRTUAL_CHANNELS, LaserChannel
-from firmware_iface.lasers.eye_safety import exposure
+from firmware_iface.lasers.eye_safety import GatedLight, exposure
 from firmware_iface.own_device import check_kind, open_own
+from firmware_iface.panel.fields import light_times_us
 from firmware_iface.toml_tables import parameter, read_table
 
 Table = Mapping[str, Any]
 
+WITH_FIELDS = ("board", "dlpc900")
 KINDS = {"panel": ("board", "dlpc900", "mirrored"), "camera": ("oak", "virtual")}
 
 
@@ -57,6 +61,7 @@ class PanelTable:
     bus: str = parameter("usb", "usb, or virtual:SOCKET")
     serial: str = parameter("", "serial number, where several are attached")
     refresh_hz: float = parameter(60.0, "of the panel", 10, 1000)
+    fields: int = parameter(1, "of a frame: colours in turn", 1, 8)
     timeout_ms: float = parameter(80.0, "longest wait for one transfer", 5, 10000)
     modulator: str = parameter("p47", "of a DLPC900", choices=("p47", "p67"))
     display: int = parameter(-1, "N of /dev/fbN; -1: none", -1, 63)
@@ -100,6 +105,7 @@ def open_panel(table: Table) -> Any:
     from firmware_iface.panel.phase_light_modulator import P47, P67
 
     settings = _panel_table(table)
+    period_us = round(1e6 / settings.refresh_hz)
     if settings.kind not in KINDS["panel"]:
         return open_own(settings.kind, "panel")
     if settings.kind == "mirrored":
@@ -110,8 +116,9 @@ def open_panel(table: Table) -> Any:
             modulator={"p47": P47, "p67": P67}[settings.modulator],
             serial=settings.serial or None,
             timeout_s=settings.timeout_ms / 1000,
+            exposure_us=period_us if settings.fields > 1 else 16000,
+            fields=settings.fields,
         )
-    period_us = round(1e6 / settings.refresh_hz)
     timing = Timing(period_us, light_delay_us=period_us // 4, light_width_us=period_us // 2)
     backend = None
     if settings.bus.startswith("virtual:"):
@@ -119,12 +126,32 @@ def open_panel(table: Table) -> Any:
 
         backend = usb_backend(settings.bus)
     return open_board(
-        settings.serial or None, backend=backend, timing=timing, timeout_s=settings.timeout_ms / 1000
+        settings.serial or None,
+        backend=backend,
+        timing=timing,
+        timeout_s=settings.timeout_ms / 1000,
+        fields=settings.fields,
     )
 
 
-def open_lasers(table: Table) -> Any:
-    """The lasers of a configuration's [lasers], dark.
+def panel_fields(table: Table) -> int:
+    """How many fields a frame has on the panel of a configuration's [panel]; 1: it shows one colour."""
+    return _panel_table(table).fields
+
+
+def gated_light(table: Table) -> GatedLight | None:
+    """How the panel of a configuration's [panel] gates the lasers, at most; None where it shows one colour."""
+    settings = _panel_table(table)
+    if settings.fields == 1:
+        return None
+    field_us = round(1e6 / settings.refresh_hz)
+    _, light_us = light_times_us(field_us)
+    frame_us = settings.fields * field_us
+    return GatedLight(light_us / frame_us, 1e-6 * light_us, 1e-6 * frame_us)
+
+
+def open_lasers(table: Table, gated: GatedLight | None = None) -> Any:
+    """The lasers of a configuration's [lasers], dark; gated as `gated_light` says.
 
     Raises
     ------
@@ -138,7 +165,7 @@ def open_lasers(table: Table) -> Any:
 
     settings = _lasers_table(table)
     bus = i2c_bus(settings.bus) if settings.bus.startswith("virtual:") else settings.bus
-    return open_board(bus, laser_channels(table))
+    return open_board(bus, laser_channels(table), gated)
 
 
 def open_camera(table: Table) -> Any:
@@ -190,12 +217,17 @@ def check_tables(tables: Mapping[str, Table]) -> None:
     if "camera" in tables:
         _camera_table(tables["camera"])
     _lasers_table(tables["lasers"])
-    _check_budget(tables["lasers"])
+    _check_budget(tables["lasers"], gated_light(tables["panel"]) if "panel" in tables else None)
 
 
 def _panel_table(table: Table) -> PanelTable:
     settings = read_table(PanelTable, table, "[panel]")
     check_kind(settings.kind, "panel", KINDS["panel"])
+    if settings.fields > 1 and settings.kind not in WITH_FIELDS:
+        raise InputError(
+            f"a panel of kind '{settings.kind}' in [panel] shows one colour; leave fields out, or use one of "
+            f"{', '.join(WITH_FIELDS)}"
+        )
     return settings
 
 
@@ -209,14 +241,15 @@ def _camera_table(table: Table) -> CameraTable:
     return settings
 
 
-def _check_budget(table: Table) -> None:
-    """Check the power: without a prediction, all light counts as one spot."""
+def _check_budget(table: Table, gated: GatedLight | None) -> None:
+    """Check the power, summed over the fields of a frame: without a prediction, all light counts as one spot."""
     power, lasers = laser_power(table), {laser.name: laser for laser in laser_channels(table)}
     if mrad_per_pixel(table):
         return
     used = exposure(
         {name: fraction * lasers[name].full_power_uw for name, fraction in power.items()},
         {name: lasers[name].wavelength_nm for name in power},
+        gated=gated,
     ).worst
     if used > 1:
         raise InputError(
@@ -252,6 +285,21 @@ def laser_channels(table: Table) -> Sequence[LaserChannel]:
                 "remove one"
             )
     return lasers
+
+
+def laser_numbers(table: Table, channels: Sequence[str]) -> list[int]:
+    """The laser of each channel, counted from 0 in the order of the DAC's outputs.
+
+    Raises
+    ------
+    InputError
+        Where a channel has none.
+    """
+    names = [laser.name for laser in laser_channels(table)]
+    for channel in channels:
+        if channel not in names:
+            raise InputError(f"[lasers] has no laser '{channel}'; {nearest(channel, names)}")
+    return [names.index(channel) for channel in channels]
 
 
 def laser_power(table: Table) -> dict[str, float]:

@@ -12,6 +12,11 @@ A hologram can send all its light into one spot, so this is assumed without a pr
 counts with its brightest spots: for squares from 1.5 to 100 mrad, the largest share of the light that any square
 holds, against the limit of a source as large as the next smaller square. Sizes in between are then covered too.
 
+Light that a panel gates to fields comes in pulses, and the standard asks for both: the mean power, summed over the
+fields of a frame, keeps the limits above, and each pulse keeps the limit of a single one, 7e-4 t^-0.25 C6 C5 W for a
+pulse of t seconds. C5 is taken as 1 up to 5 mrad and as 0.2, its lowest value, above; C6 grows up to
+200 t^0.5 mrad, and 5 mrad at least. Pulses of all lasers are taken to come together.
+
 This is arithmetic, not a classification. Software does not make a product Class 1.
 """
 
@@ -27,6 +32,7 @@ from numpy.typing import NDArray
 from firmware_iface.errors import InputError
 
 POINT_MRAD, LARGEST_MRAD = 1.5, 100.0
+SHORTEST_PULSE_S = 5e-6  # shorter ones count as this long
 SIZES_MRAD = tuple(np.geomspace(POINT_MRAD, LARGEST_MRAD, 13).tolist())
 ALL_IN_ONE_SPOT = (1.0,) * len(SIZES_MRAD)
 
@@ -45,6 +51,18 @@ def photochemical_limit_uw(wavelength_nm: float) -> float:
     if wavelength_nm > 600:
         return math.inf
     return 39.0 * 10 ** (0.02 * max(0.0, wavelength_nm - 450))
+
+
+def pulse_limit_uw(source_mrad: float, pulse_s: float) -> float:
+    """Class 1 thermal limit of the power in one pulse of a long train, for a source of this angular size, µW."""
+    lasts_s = max(pulse_s, SHORTEST_PULSE_S)
+    alpha = min(max(source_mrad, POINT_MRAD), largest_pulsed_mrad(lasts_s))
+    return 1e6 * 7e-4 * lasts_s**-0.25 * (alpha / POINT_MRAD) * (1.0 if source_mrad <= 5.0 else 0.2)
+
+
+def largest_pulsed_mrad(pulse_s: float) -> float:
+    """Angular size beyond which a source bears no more light in a pulse, mrad."""
+    return min(LARGEST_MRAD, max(5.0, 200.0 * pulse_s**0.5))
 
 
 def spot_shares(irradiance: NDArray[np.floating], mrad_per_pixel: float) -> tuple[float, ...]:
@@ -89,6 +107,37 @@ def spot_shares(irradiance: NDArray[np.floating], mrad_per_pixel: float) -> tupl
 
 
 @dataclass(frozen=True)
+class GatedLight:
+    """Light that the panel gates: in each frame, every laser shines in its own field alone.
+
+    Attributes
+    ----------
+    duty : float
+        Share of the time in which each laser shines, at most.
+    pulse_s : float, s
+        How long it shines at a time, at most.
+    frame_s : float, s
+        Time of a frame, with all of its fields.
+
+    Raises
+    ------
+    InputError
+        For a value out of range.
+    """
+
+    duty: float
+    pulse_s: float
+    frame_s: float
+
+    def __post_init__(self) -> None:
+        if not (0 < self.duty <= 1 and 0 < self.pulse_s <= self.frame_s < math.inf):
+            raise InputError(
+                f"light for {self.duty:g} of the time, in pulses of {self.pulse_s:g} s of {self.frame_s:g} s, cannot "
+                "be; give a share of 0 to 1 and a pulse within the frame."
+            )
+
+
+@dataclass(frozen=True)
 class Exposure:
     """Shares of the Class 1 limits that are used.
 
@@ -111,23 +160,29 @@ def exposure(
     power_uw: Mapping[str, float],
     wavelength_nm: Mapping[str, float],
     shares: Mapping[str, Sequence[float]] | None = None,
+    gated: GatedLight | None = None,
 ) -> Exposure:
     """Shares of the Class 1 limits that these lasers use.
 
     Parameters
     ----------
     power_uw : mapping of channel to float, µW
-        Through a 7 mm aperture at the exit pupil.
+        Through a 7 mm aperture at the exit pupil, while it shines.
     wavelength_nm : mapping of channel to float, nm
         400 to 700.
     shares : mapping of channel to sequence of float, or None
         From `spot_shares`. A channel that is missing has all its light in
         one spot. The brightest spots of all channels are taken to coincide.
+    gated : GatedLight or None
+        How the panel gates the lasers; None: they shine all the time.
 
     Returns
     -------
     Exposure
     """
+    if gated is not None:
+        mean = exposure({c: gated.duty * p for c, p in power_uw.items()}, wavelength_nm, shares)
+        return Exposure(max(mean.thermal, _pulsed(power_uw, shares, gated.pulse_s)), mean.photochemical)
     photochemical = sum(p / photochemical_limit_uw(wavelength_nm[c]) for c, p in power_uw.items())
     found = {c: (shares or {}).get(c, ALL_IN_ONE_SPOT) for c in power_uw}
     thermal = sum(power_uw.values()) / thermal_limit_uw(LARGEST_MRAD)  # all light, in the largest source
@@ -135,3 +190,18 @@ def exposure(
         limit = thermal_limit_uw(SIZES_MRAD[max(0, k - 1)])
         thermal = max(thermal, sum(p * found[c][k] for c, p in power_uw.items()) / limit)
     return Exposure(thermal, photochemical)
+
+
+def _pulsed(
+    power_uw: Mapping[str, float], shares: Mapping[str, Sequence[float]] | None, pulse_s: float
+) -> float:
+    """The share of the limit of a single pulse that these lasers use together."""
+    found = {c: (shares or {}).get(c, ALL_IN_ONE_SPOT) for c in power_uw}
+    worst = 0.0
+    for k in range(len(SIZES_MRAD)):
+        smaller = SIZES_MRAD[max(0, k - 1)]
+        limit = min(pulse_limit_uw(size, pulse_s) for size in (smaller, SIZES_MRAD[k]))
+        worst = max(worst, sum(p * found[c][k] for c, p in power_uw.items()) / limit)
+        if smaller >= largest_pulsed_mrad(pulse_s):
+            break
+    return worst

@@ -16,6 +16,7 @@ from typing import Any
 
 from firmware_iface.errors import DeviceError, InputError
 from firmware_iface.lasers.channels import LaserChannel
+from firmware_iface.lasers.eye_safety import GatedLight
 from firmware_iface.lasers.guarded_lasers import PACKET, STEP_S, TICK_S
 from firmware_iface.lasers.lasers import Lasers, open_lasers
 
@@ -100,7 +101,10 @@ class Guard:
 
     def _do(self, act: str, given: list[Any]) -> Any:
         if act == "open" and not self._lasers:
-            self._lasers = open_lasers(given[0], [LaserChannel(**channel) for channel in given[1]])
+            bus, channels, gated = given
+            self._lasers = open_lasers(
+                bus, [LaserChannel(**channel) for channel in channels], gated and GatedLight(**gated)
+            )
             return list(self._lasers.channels)
         if not self._lasers:
             raise InputError("the lasers are not open; open them first.")

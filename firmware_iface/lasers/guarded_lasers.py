@@ -27,6 +27,7 @@ from typing import Any
 
 from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
 from firmware_iface.lasers.channels import LaserChannel
+from firmware_iface.lasers.eye_safety import GatedLight
 from firmware_iface.lasers.lasers import RAMP_S, RAMP_STEPS
 
 TICK_S = 0.020
@@ -44,6 +45,8 @@ class GuardedLasers:
         See `i2c_transfers.open_bus`.
     channels : sequence of LaserChannel
         One to three, in the order of the DAC's outputs.
+    gated : GatedLight or None
+        As `Lasers` takes it.
 
     Raises
     ------
@@ -53,7 +56,7 @@ class GuardedLasers:
         From every method, once the guard has ended; the lasers are dark then.
     """
 
-    def __init__(self, bus: str, channels: Sequence[LaserChannel]) -> None:
+    def __init__(self, bus: str, channels: Sequence[LaserChannel], gated: GatedLight | None = None) -> None:
         self._lock = threading.Lock()
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._socket.settimeout(ANSWER_WITHIN_S)
@@ -62,7 +65,8 @@ class GuardedLasers:
             self._process = subprocess.Popen(command, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL)
         try:
             asked = [dataclasses.asdict(channel) for channel in channels]
-            self.channels: tuple[str, ...] = tuple(self._ask("open", bus, asked, within_s=30.0))
+            opened = self._ask("open", bus, asked, gated and dataclasses.asdict(gated), within_s=30.0)
+            self.channels: tuple[str, ...] = tuple(opened)
         except BaseException:
             self.close()
             raise
@@ -179,7 +183,9 @@ class GuardedLasers:
         return answer["result"]
 
 
-def open_guarded_lasers(bus: str, channels: Sequence[LaserChannel]) -> GuardedLasers:
+def open_guarded_lasers(
+    bus: str, channels: Sequence[LaserChannel], gated: GatedLight | None = None
+) -> GuardedLasers:
     """Open the lasers on a bus in a guard process.
 
     Parameters
@@ -187,6 +193,8 @@ def open_guarded_lasers(bus: str, channels: Sequence[LaserChannel]) -> GuardedLa
     bus : str
         See `i2c_transfers.open_bus`.
     channels : sequence of LaserChannel
+    gated : GatedLight or None
+        As `Lasers` takes it.
 
     Returns
     -------
@@ -199,4 +207,4 @@ def open_guarded_lasers(bus: str, channels: Sequence[LaserChannel]) -> GuardedLa
     DeviceError
         Where a part of the board fails.
     """
-    return GuardedLasers(bus, channels)
+    return GuardedLasers(bus, channels, gated)

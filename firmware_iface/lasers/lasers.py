@@ -17,7 +17,7 @@ import atexit
 import math
 import time
 import weakref
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -26,10 +26,12 @@ import numpy as np
 
 from firmware_iface.errors import DeviceError, InputError
 from firmware_iface.lasers.channels import LaserChannel
+from firmware_iface.lasers.eye_safety import GatedLight
 from firmware_iface.lasers.i2c_transfers import open_bus
 from firmware_iface.lasers.laser_board import LaserBoard
 from firmware_iface.lasers.mcp4728 import VOLTS_PER_CODE
 from firmware_iface.lasers.pattern_power import LightBudget
+from firmware_iface.lasers.recent_codes import RecentCodes
 from firmware_iface.lasers.safety_controller import Command, Input, State
 
 if TYPE_CHECKING:
@@ -67,6 +69,9 @@ class Lasers:
         Gives the time, s.
     wait : callable
         Sleeps, s.
+    gated : GatedLight or None
+        How the panel gates the lasers to the fields of a frame; None: it does not. Each photodiode then holds what it
+        saw in its laser's last field.
 
     Raises
     ------
@@ -82,6 +87,7 @@ class Lasers:
         channels: Sequence[LaserChannel],
         clock: Callable[[], float] = time.monotonic,
         wait: Callable[[float], None] = time.sleep,
+        gated: GatedLight | None = None,
     ) -> None:
         if not 1 <= len(channels) <= 3 or len({c.name for c in channels}) != len(channels):
             raise InputError(
@@ -90,10 +96,11 @@ class Lasers:
         self._bus, self._clock, self._wait = bus, clock, wait
         self._lasers = tuple(channels)
         self.channels = tuple(c.name for c in channels)
-        self._budget = LightBudget(channels)
+        self._budget = LightBudget(channels, gated)
+        self._unlit: frozenset[str] = frozenset()
         self.board = LaserBoard(bus)
         self._fractions = [0.0] * len(channels)
-        self._codes = [0] * len(channels)
+        self._codes = RecentCodes(len(channels), 0.0 if gated is None else gated.frame_s)
         self._token = 0
         self._beat_at = self._changed_at = self._selected_at = -math.inf
         self._selected, self._ramping = 0, False
@@ -191,10 +198,15 @@ class Lasers:
         if state is State.OFF:
             raise DeviceError(f"the lasers cannot be armed: {missing}.")
 
-    def heartbeat(self) -> None:
+    def heartbeat(self, unlit: Collection[str] = ()) -> None:
         """Show that the caller is alive, at least every 50 ms; checks one photodiode each time.
 
         No token is written sooner than 6 ms after the last.
+
+        Parameters
+        ----------
+        unlit : collection of str
+            Channels that the frame on the panel keeps dark: their photodiodes hold an older light and are not compared.
 
         Raises
         ------
@@ -202,6 +214,7 @@ class Lasers:
             Where a fault is latched, a photodiode shows what it should not, or a part does not answer (dark
             by then).
         """
+        self._unlit = frozenset(unlit)
         with self._dark_on_failure():
             self._beat()
             self._raise_latched()
@@ -222,7 +235,7 @@ class Lasers:
         ):
             raise InputError(f"power {fraction!r} of laser '{channel}' is not a fraction; give 0 to 1.")
         self._budget.check(self._powers() | {channel: float(fraction)})
-        start, end = self._codes[k], self._lasers[k].code(fraction)
+        start, end = self._codes.now[k], self._lasers[k].code(fraction)
         if end <= start:
             with self._dark_on_failure():
                 self._put(k, end)
@@ -322,13 +335,18 @@ class Lasers:
         if self._clock() - max(self._changed_at, self._selected_at) < RAMP_S / RAMP_STEPS - 1e-6:
             return
         k = self._selected
+        if self.channels[k] in self._unlit:
+            return
         measured_v = self.board.converter.volts()
-        expected_v = self._lasers[k].photodiode_v(self._codes[k] * VOLTS_PER_CODE)
-        if abs(measured_v - expected_v) <= TOLERANCE * expected_v + FLOOR_V:
+        lowest_v, highest_v = (
+            self._lasers[k].photodiode_v(c * VOLTS_PER_CODE) for c in self._codes.bounds(k, self._clock())
+        )
+        lowest_allowed_v = (1 - TOLERANCE) * lowest_v - FLOOR_V
+        if lowest_allowed_v <= measured_v <= (1 + TOLERANCE) * highest_v + FLOOR_V:
             return
         self._raise_latched()
         raise DeviceError(
-            f"laser '{self.channels[k]}' should make {expected_v:.3f} V at its photodiode and makes "
+            f"laser '{self.channels[k]}' should make {highest_v:.3f} V at its photodiode and makes "
             f"{measured_v:.3f} V, so the lasers were switched off; check the photodiode, "
             "the calibration, and that the set point of the laser's controller is 0."
         )
@@ -359,7 +377,7 @@ class Lasers:
         self._beat_at = self._clock()
 
     def _put(self, k: int, code: int) -> None:
-        self._codes[k] = code
+        self._codes.put(k, code, self._clock())
         self.board.dac.set_code(k, code)
         self._changed_at = self._clock()
 
@@ -394,7 +412,8 @@ class Lasers:
 
     def _forget(self) -> None:
         self._fractions = [0.0] * len(self._lasers)
-        self._codes = [0] * len(self._lasers)
+        for k in range(len(self._lasers)):
+            self._codes.put(k, 0, self._clock())
         self._changed_at = self._clock()
 
     def close(self) -> None:
@@ -423,7 +442,7 @@ def _close_all() -> None:
         lasers.close()
 
 
-def open_lasers(bus: str, channels: Sequence[LaserChannel]) -> Lasers:
+def open_lasers(bus: str, channels: Sequence[LaserChannel], gated: GatedLight | None = None) -> Lasers:
     """Open the lasers on a bus.
 
     Parameters
@@ -432,6 +451,8 @@ def open_lasers(bus: str, channels: Sequence[LaserChannel]) -> Lasers:
         See `i2c_transfers.open_bus`.
     channels : sequence of LaserChannel
         One to three, in the order of the DAC's outputs.
+    gated : GatedLight or None
+        As `Lasers` takes it.
 
     Returns
     -------
@@ -451,7 +472,7 @@ def open_lasers(bus: str, channels: Sequence[LaserChannel]) -> Lasers:
             f"the bus {bus} cannot be opened ({error.strerror or error}); give another one."
         ) from error
     try:
-        return Lasers(opened, channels)
+        return Lasers(opened, channels, gated=gated)
     except BaseException:
         opened.close()
         raise

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from firmware_iface.errors import InputError
 from firmware_iface.lasers.channels import LaserChannel
-from firmware_iface.lasers.eye_safety import ALL_IN_ONE_SPOT, Exposure, exposure
+from firmware_iface.lasers.eye_safety import ALL_IN_ONE_SPOT, Exposure, GatedLight, exposure
 
 
 class LightBudget:
@@ -15,9 +15,13 @@ class LightBudget:
     Parameters
     ----------
     channels : sequence of LaserChannel
+    gated : GatedLight or None
+        How the panel gates the lasers to fields; None: they shine all the time. The budget holds for the sum over the
+        fields of a frame.
     """
 
-    def __init__(self, channels: Sequence[LaserChannel]) -> None:
+    def __init__(self, channels: Sequence[LaserChannel], gated: GatedLight | None = None) -> None:
+        self._gated = gated
         self._full_power_uw = {c.name: c.full_power_uw for c in channels}
         self._wavelength_nm = {c.name: c.wavelength_nm for c in channels}
         self._shares: dict[str, tuple[float, ...]] = {}
@@ -51,10 +55,10 @@ class LightBudget:
 
     def exposure(self, fractions: Mapping[str, float]) -> Exposure:
         """Shares of the Class 1 limits at fractions of full power, by channel, with the prediction in force."""
-        return exposure(self._power_uw(fractions), self._wavelength_nm, self._shares)
+        return exposure(self._power_uw(fractions), self._wavelength_nm, self._shares, self._gated)
 
     def exposure_at_full_power(self) -> Exposure:
-        """Shares of the Class 1 limits with all lasers at full power, in one spot."""
+        """Shares of the Class 1 limits with all lasers at full power, in one spot, as if no gate ever closed."""
         return exposure(self._full_power_uw, self._wavelength_nm)
 
     def check(self, fractions: Mapping[str, float]) -> None:

@@ -8,6 +8,7 @@ that `video_pattern` draws. The commands (`dlpc900_commands`) are the same.
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -16,14 +17,18 @@ from numpy.typing import NDArray
 
 from firmware_iface.errors import DeviceError, InputError
 from firmware_iface.panel.dlpc900_commands import (
+    EVERY_COLOUR,
     IMAGE_BEGIN,
     IMAGE_DATA,
     LONGEST_DATA,
     PATTERN,
+    SHORTEST_US,
     START,
     STOP,
     Dlpc900Control,
+    PatternLine,
 )
+from firmware_iface.panel.fields import Field, FieldPanel
 from firmware_iface.panel.mirrored_display import MirroredDisplay
 from firmware_iface.panel.panel import Gray, Panel
 from firmware_iface.panel.phase_light_modulator import P47, Modulator, bit_plane
@@ -33,8 +38,13 @@ from firmware_iface.usb_link import UsbLink
 VENDOR, PRODUCT = 0x0451, 0xC900
 
 
+MOST_PICTURES = 24  # one bit each of an image of 24 bits
+
+
 class PatternUpload:
     """Frames as one-bit patterns over USB: up to 24 pictures in turn; a single one stays until the next."""
+
+    most_fields, every_laser = MOST_PICTURES, EVERY_COLOUR
 
     def __init__(self, control: Dlpc900Control, modulator: Modulator = P47) -> None:
         self.shape = modulator.shape
@@ -46,9 +56,40 @@ class PatternUpload:
         self._sent += 1
         return self._sent
 
-    def upload(self, pictures: list[Gray]) -> None:
-        """Replace what is shown by 1 to 24 pictures, uint8 [H, W], in turn."""
-        if not 1 <= len(pictures) <= 24:
+    @property
+    def field_us(self) -> int:
+        """Time of one field, µs."""
+        return self._control.exposure_us
+
+    def send_fields(self, fields: Sequence[Field]) -> int:
+        """A frame of fields: each is exposed as long as its light lasts, and dark for the rest of its time.
+
+        The mirrors move within microseconds, so the light begins with the field, whatever its delay. Trigger output 2
+        fires with the first field alone, for a camera.
+        """
+        lines = []
+        for number, field in enumerate(fields):
+            if field.lasers > EVERY_COLOUR:
+                raise InputError(
+                    f"{self._control.name} has LED enables for lasers 0 to 2; field {number} asks for others."
+                )
+            lit = bool(field.lasers) and field.width_us >= SHORTEST_US
+            exposure_us = field.width_us if lit else SHORTEST_US
+            lines.append(
+                PatternLine(
+                    exposure_us,
+                    self.field_us - exposure_us,
+                    field.lasers if lit else 0,
+                    trigger=number == 0,
+                )
+            )
+        self.upload([field.gray for field in fields], lines)
+        self._sent += 1
+        return self._sent
+
+    def upload(self, pictures: list[Gray], lines: Sequence[PatternLine] | None = None) -> None:
+        """Replace what is shown by 1 to 24 pictures, uint8 [H, W], in turn; in every colour unless lines are given."""
+        if not 1 <= len(pictures) <= MOST_PICTURES:
             raise InputError(f"{len(pictures)} pictures do not fit one image; give 1 to 24.")
         rows, columns = self._modulator.memory_shape
         image = np.zeros((rows, columns), np.uint32)
@@ -56,7 +97,7 @@ class PatternUpload:
             image |= bit_plane(gray, self._modulator).astype(np.uint32) << position
         control = self._control
         control.command(PATTERN, bytes([STOP]))
-        control.define(len(pictures))
+        control.define(lines or [PatternLine(control.exposure_us)] * len(pictures))
         for index, half in enumerate(np.array_split(image, self._modulator.controllers, axis=1)):
             self._load(index, half)
         control.command(PATTERN, bytes([START]))
@@ -97,6 +138,7 @@ def open_dlpc900(
     backend: Any = None,
     exposure_us: int = 16000,
     timeout_s: float = 1.0,
+    fields: int = 1,
 ) -> Panel:
     """Open a phase light modulator.
 
@@ -116,6 +158,9 @@ def open_dlpc900(
         Exposure of a pattern, less than a frame of the display.
     timeout_s : float, s
         Longest wait for one transfer.
+    fields : int
+        Fields that a frame may need, for colours in turn. More than 1 gives a FieldPanel whose LED enables (laser 0 at
+        red, 1 at green, 2 at blue) follow the pattern table's colours; `exposure_us` is then the time of a field.
 
     Returns
     -------
@@ -130,11 +175,18 @@ def open_dlpc900(
     DeviceError
         Where it does not answer as it should.
     """
+    if fields > 1 and display is not None:
+        raise InputError(
+            "colours in turn over the display link are not supported; leave display out, and fields are uploaded."
+        )
+    if fields > MOST_PICTURES:
+        raise InputError(f"a frame of {fields} fields cannot be uploaded; ask for {MOST_PICTURES} at most.")
     link = UsbLink(
         VENDOR, PRODUCT, "the phase light modulator", serial=serial, backend=backend, timeout_s=timeout_s
     )
     if display is None:
-        control = Dlpc900Control(link, exposure_us=exposure_us)
-        return Panel(control, PatternUpload(control, modulator))
-    frames = MirroredDisplay(display, modulator.shape, draw=partial(video_pattern, modulator=modulator))
-    return Panel(Dlpc900Control(link, receiver, exposure_us), frames)
+        control = Dlpc900Control(link, exposure_us=exposure_us, colours=fields > 1)
+        frames = PatternUpload(control, modulator)
+        return FieldPanel(control, frames, fields) if fields > 1 else Panel(control, frames)
+    screen = MirroredDisplay(display, modulator.shape, draw=partial(video_pattern, modulator=modulator))
+    return Panel(Dlpc900Control(link, receiver, exposure_us), screen)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import struct
 import time
+from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
 
 from firmware_iface.errors import DeviceError, InputError
@@ -16,10 +18,13 @@ LONGEST_DATA = 504  # bytes of an image in one command
 
 POWER, LAST_ERROR, FIRMWARE = 0x0200, 0x0100, 0x0206
 HARDWARE_STATUS, SYSTEM_STATUS, MAIN_STATUS = 0x1A0A, 0x1A0B, 0x1A0C
-RECEIVER, SOURCE = 0x1A01, 0x1A00
+RECEIVER, SOURCE, LED_ENABLES = 0x1A01, 0x1A00, 0x1A07
 DISPLAY_MODE, PATTERN, PATTERN_LUT, PATTERN_ENTRY = 0x1A1B, 0x1A24, 0x1A31, 0x1A34
 IMAGE_BEGIN, IMAGE_DATA = (0x1A2A, 0x1A2C), (0x1A2B, 0x1A2D)  # primary and secondary controller
 STOP, START = 0, 2
+BY_SEQUENCER = 0x08  # LED enables follow the colour bits of the pattern table, and nothing else
+EVERY_COLOUR = 0b111  # bit 0 red, 1 green, 2 blue
+SHORTEST_US = 105  # exposure of a one-bit pattern
 POWERS = ("normal", "standby")
 RECEIVERS = ("off", "hdmi", "displayport")
 MODES = ("video", "pre-stored", "video-pattern", "on-the-fly")
@@ -38,6 +43,38 @@ HARDWARE = {2: "DMD reset controller error", 3: "forced swap", 6: "sequence abor
 _READ, _REPLY, _FAILED = 0x80, 0x40, 0x20
 
 
+@dataclass(frozen=True)
+class PatternLine:
+    """One line of the pattern table, for a one-bit pattern of image 0.
+
+    Attributes
+    ----------
+    exposure_us, dark_us : int, µs
+        How long it is exposed, and the darkness after that.
+    colours : int
+        Which LED enables are active during the exposure: bit 0 red, 1 green, 2 blue.
+    trigger : bool
+        Whether trigger output 2 fires with it.
+    """
+
+    exposure_us: int
+    dark_us: int = 0
+    colours: int = EVERY_COLOUR
+    trigger: bool = True
+
+    def as_bytes(self, position: int) -> bytes:
+        """The 12 bytes of the table's line for the image's bit at `position`, which is also the line's number."""
+        options = self.colours << 4 | 1  # one bit deep; cleared afterwards; does not wait for a trigger
+        return (
+            struct.pack("<H", position)
+            + self.exposure_us.to_bytes(3, "little")
+            + bytes([options])
+            + self.dark_us.to_bytes(3, "little")
+            + bytes([not self.trigger])  # 1 disables trigger output 2
+            + struct.pack("<H", position << 11)
+        )
+
+
 class Dlpc900Control:
     """Commands of the controller: power, mode, status, errors.
 
@@ -48,16 +85,22 @@ class Dlpc900Control:
         "hdmi" or "displayport" for frames that come over that link, "off" for uploaded ones.
     exposure_us : int, µs
         Exposure of each pattern.
+    colours : bool
+        Whether the LED enables, and with them the lasers, follow the colours of the pattern table.
     """
 
-    def __init__(self, link: UsbLink, receiver: str = "off", exposure_us: int = 16667) -> None:
+    def __init__(
+        self, link: UsbLink, receiver: str = "off", exposure_us: int = 16667, colours: bool = False
+    ) -> None:
         if receiver not in RECEIVERS:
             raise InputError(f"there is no receiver '{receiver}'; use one of {', '.join(RECEIVERS)}.")
-        if not 105 <= exposure_us < 1 << 24:
-            raise InputError(f"exposure {exposure_us} µs is out of range; give 105 to {(1 << 24) - 1} µs.")
+        if not SHORTEST_US <= exposure_us < 1 << 24:
+            raise InputError(
+                f"exposure {exposure_us} µs is out of range; give {SHORTEST_US} to {(1 << 24) - 1} µs."
+            )
         self.name = link.name
         self._link = link
-        self._receiver, self._exposure_us = receiver, exposure_us
+        self._receiver, self.exposure_us, self._colours = receiver, exposure_us, colours
         self._sequence = 0
         self._incomplete = False  # whether the last command broke off
         link.opened.append(self._set_up)
@@ -90,14 +133,11 @@ class Dlpc900Control:
                 raise DeviceError(f"{self.name} does not go into mode {mode}; power it off and on.")
             time.sleep(0.05)
 
-    def define(self, count: int) -> None:
-        """Fill the pattern table with the first `count` bits of image 0, in turn and without end."""
-        exposure = self._exposure_us.to_bytes(3, "little")
-        for position in range(count):
-            # one bit, all colours, cleared afterwards; no trigger, no dark time; image 0, this bit position
-            line = struct.pack("<H", position) + exposure + struct.pack("<B3xBH", 0x71, 0, position << 11)
-            self.command(PATTERN_ENTRY, line)
-        self.command(PATTERN_LUT, struct.pack("<HI", count, 0))
+    def define(self, lines: Sequence[PatternLine]) -> None:
+        """Fill the pattern table: line k shows bit k of image 0; all in turn and without end."""
+        for position, line in enumerate(lines):
+            self.command(PATTERN_ENTRY, line.as_bytes(position))
+        self.command(PATTERN_LUT, struct.pack("<HI", len(lines), 0))
 
     def status(self) -> dict[str, Any]:
         hardware, system, main = map(self._byte, (HARDWARE_STATUS, SYSTEM_STATUS, MAIN_STATUS))
@@ -125,6 +165,8 @@ class Dlpc900Control:
 
     def _set_up(self) -> None:
         self.set_power("normal")
+        if self._colours:
+            self.command(LED_ENABLES, bytes([BY_SEQUENCER]))
         if self._receiver == "off":
             self.set_mode("on-the-fly")
             return
@@ -137,7 +179,7 @@ class Dlpc900Control:
                 raise DeviceError(f"{self.name} detects no picture on {self._receiver}; check that cable.")
             time.sleep(0.05)
         self.set_mode("video-pattern")
-        self.define(1)
+        self.define([PatternLine(self.exposure_us)])
         self.command(PATTERN, bytes([START]))
 
     def _byte(self, code: int) -> int:

@@ -4,30 +4,40 @@ from __future__ import annotations
 
 import struct
 import time
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
+from firmware_iface.panel.fields import Field, FieldPanel
 from firmware_iface.panel.panel import Gray, Panel
 from firmware_iface.panel.panel_board_messages import (
+    FIELDS_BYTES,
     IDENTITY_BYTES,
     MODES,
     STATUS_BYTES,
     TIMING_BYTES,
+    VERSIONS_BYTES,
+    FieldsShown,
     Identity,
     Status,
     Timing,
+    Versions,
+    fields_bytes,
     frame_bytes,
+    parse_fields,
     parse_identity,
     parse_status,
     parse_timing,
+    parse_versions,
     timing_bytes,
     with_crc,
 )
 from firmware_iface.usb_link import UsbLink
 
 VENDOR, PRODUCT = 0x1209, 0x0001
-IDENTITY, MODE, TIMING, STATUS, COMMIT, CLEAR = 1, 2, 3, 4, 5, 6
+IDENTITY, MODE, TIMING, STATUS, COMMIT, CLEAR, VERSION, FIELDS = range(1, 9)
 FRAMES_OUT = 0x01
 
 
@@ -39,16 +49,22 @@ class BoardControl:
     link : UsbLink
     timing : Timing or None
         Set each time the board was found, and checked by reading it back.
+    fields : int
+        Fields that a frame may need; more than 1 needs version 2 of the protocol.
 
     Attributes
     ----------
     identity : Identity or None
         Of the board that is attached.
+    versions : Versions or None
+        What it can do, where version 2 is spoken; None in version 1.
     """
 
-    def __init__(self, link: UsbLink, timing: Timing | None = None) -> None:
+    def __init__(self, link: UsbLink, timing: Timing | None = None, fields: int = 1) -> None:
         self._link = link
         self._timing = timing or Timing()
+        self._fields = fields
+        self.versions: Versions | None = None
         self.identity: Identity | None = None
         link.opened.append(self._set_up)
         link.open()
@@ -84,11 +100,23 @@ class BoardControl:
         DeviceError
             Where it does not answer as it should.
         """
-        return self._ask(STATUS, STATUS_BYTES, parse_status)
+        version = 1 if self.versions is None else 2
+        return self._ask(STATUS, STATUS_BYTES, partial(parse_status, version=version))
+
+    def read_fields(self) -> FieldsShown:
+        """The fields on display; version 2 only.
+
+        Raises
+        ------
+        DeviceError
+            Where it does not answer as it should.
+        """
+        return self._ask(FIELDS, FIELDS_BYTES, parse_fields)
 
     def status(self) -> dict[str, Any]:
         status, identity = self.read_status(), self.identity
-        return vars(status) | {"faults": list(status.faults)} | (vars(identity) if identity else {})
+        shown = {} if self.versions is None else vars(self.read_fields())
+        return vars(status) | {"faults": list(status.faults)} | (vars(identity) if identity else {}) | shown
 
     def commit(self, sequence: int, crc: int) -> None:
         """Let the frame in the back buffer be displayed from the next period on."""
@@ -115,8 +143,28 @@ class BoardControl:
                 "attach the one that was there, or start again with this one."
             )
         self.identity = found
+        if self._fields > 1:
+            self._choose_version()
         self._set_timing(self._timing)
         self.set_mode("show")
+
+    def _choose_version(self) -> None:
+        try:
+            found = self._ask(VERSION, VERSIONS_BYTES, parse_versions)
+        except DeviceGoneError:
+            raise
+        except DeviceError as error:
+            raise DeviceError(
+                f"{self._link.name} does not say that it shows several fields ({error}) A board of protocol "
+                "version 1 shows one colour: update its firmware, or show one colour."
+            ) from error
+        if found.highest < 2 or self._fields > found.most_fields:
+            most = found.most_fields if found.highest >= 2 else 1
+            raise InputError(
+                f"{self._link.name} shows {most} fields at most, not {self._fields}; ask for less."
+            )
+        self._link.control_out(VERSION, value=2)
+        self.versions = found
 
     def _shape(self) -> tuple[int, int]:
         assert self.identity is not None
@@ -150,18 +198,30 @@ class BoardControl:
 
 
 class BulkFrames:
-    """Frames over the bulk endpoint, each sent once more if the first try failed."""
+    """Frames over the bulk endpoint, each sent once more if the first try failed.
 
-    def __init__(self, link: UsbLink, control: BoardControl) -> None:
+    Parameters
+    ----------
+    link : UsbLink
+    control : BoardControl
+    most_fields : int
+        Fields of a frame at most: how many periods a frame may take.
+    """
+
+    def __init__(self, link: UsbLink, control: BoardControl, most_fields: int = 1) -> None:
         assert control.identity is not None
         self.shape = control.identity.height, control.identity.width
+        self.most_fields = most_fields
         self._link, self._control = link, control
         self._sequence = 0
 
     def send(self, gray: Gray) -> int:
         """Write a frame to the back buffer and commit it; it is displayed from the next period on."""
+        return self._send(partial(frame_bytes, gray))
+
+    def _send(self, as_bytes: Callable[[int], tuple[bytes, int]]) -> int:
         self._sequence = self._sequence % 0xFFFFFFFF + 1
-        frame, crc = frame_bytes(gray, self._sequence)
+        frame, crc = as_bytes(self._sequence)
         try:
             self._send_and_commit(frame, crc)
         except DeviceGoneError:
@@ -183,7 +243,7 @@ class BulkFrames:
     def wait(self, sequence: int) -> None:
         """Return when the board displays this frame."""
         period_s = self._control.timing.period_us * 1e-6
-        end = time.monotonic() + 3 * period_s + self._link.timeout_s
+        end = time.monotonic() + 3 * self.most_fields * period_s + self._link.timeout_s
         while True:
             status = self._control.read_status()
             if status.displayed_sequence == sequence:
@@ -203,12 +263,32 @@ class BulkFrames:
         self._control.commit(self._sequence, crc)
 
 
+class FieldsOverBulk(BulkFrames):
+    """Frames of several fields over the bulk endpoint, in version 2 of the protocol."""
+
+    @property
+    def field_us(self) -> int:
+        """Time of one field, µs."""
+        return self._control.timing.period_us
+
+    @property
+    def every_laser(self) -> int:
+        """Mask of the board's light outputs."""
+        assert self._control.versions is not None
+        return (1 << self._control.versions.light_outputs) - 1
+
+    def send_fields(self, fields: Sequence[Field]) -> int:
+        """Write a frame to the back buffer and commit it; displayed after the last field of the frame before."""
+        return self._send(partial(fields_bytes, fields))
+
+
 def open_board(
     serial: str | None = None,
     *,
     backend: Any = None,
     timing: Timing | None = None,
     timeout_s: float = 0.5,
+    fields: int = 1,
 ) -> Panel:
     """Open the panel board.
 
@@ -222,6 +302,9 @@ def open_board(
         Of the panel's period; None is 60 Hz.
     timeout_s : float, s
         Longest wait for one transfer.
+    fields : int
+        Fields that a frame may need, for colours in turn. More than 1 needs a board of protocol version 2 and gives a
+        FieldPanel; the timing's period is then a field's.
 
     Returns
     -------
@@ -229,11 +312,15 @@ def open_board(
 
     Raises
     ------
+    InputError
+        Where the board shows fewer fields.
     DeviceGoneError
         Where it is not attached.
     DeviceError
         Where it does not answer as it should.
     """
     link = UsbLink(VENDOR, PRODUCT, "the panel board", serial=serial, backend=backend, timeout_s=timeout_s)
-    control = BoardControl(link, timing)
+    control = BoardControl(link, timing, fields)
+    if fields > 1:
+        return FieldPanel(control, FieldsOverBulk(link, control, fields), fields)
     return Panel(control, BulkFrames(link, control))

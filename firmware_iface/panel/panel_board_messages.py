@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+from firmware_iface.panel.fields import Field
 from firmware_iface.panel.panel import Gray
 
 MODES = ("dark", "show", "test")
@@ -20,13 +22,21 @@ REFUSALS = (
     "to display a frame that it does not hold",
     "a value out of range",
 )
+FIELDS_REFUSAL = "a frame whose fields are not all there, in their order"  # version 2 only
+DARK_REASONS = ("", "its pattern was not on the panel", "its record was not that of the field")
 FAULTS = ("panel supply", "too hot", "panel link")
 
 _IDENTITY = struct.Struct("<4sHHHBxIIIHH")
 _TIMING = struct.Struct("<III")
 _STATUS = struct.Struct("<BBBBIIIIIIIhxx")
 _HEADER = struct.Struct("<4sIHHII")
-IDENTITY_BYTES, TIMING_BYTES, STATUS_BYTES = (s.size + 4 for s in (_IDENTITY, _TIMING, _STATUS))  # with CRC
+_VERSIONS = struct.Struct("<HHBBxx")
+_FIELDS = struct.Struct("<BBBBII")
+_FIELDS_HEADER = struct.Struct("<4sIHHBxxxI")
+_RECORD = struct.Struct("<3sBBxxxIII")
+IDENTITY_BYTES, TIMING_BYTES, STATUS_BYTES, VERSIONS_BYTES, FIELDS_BYTES = (
+    layout.size + 4 for layout in (_IDENTITY, _TIMING, _STATUS, _VERSIONS, _FIELDS)
+)  # with CRC
 
 
 @dataclass(frozen=True)
@@ -68,6 +78,28 @@ class Status:
     temperature_c: float
 
 
+@dataclass(frozen=True)
+class Versions:
+    """The reply to VERSION: what the board can do."""
+
+    lowest: int
+    highest: int
+    most_fields: int
+    light_outputs: int
+
+
+@dataclass(frozen=True)
+class FieldsShown:
+    """The reply to FIELDS: the frame on display; `kept_dark_because` is empty where no field was kept dark."""
+
+    fields: int
+    field: int
+    lasers: int
+    kept_dark_because: str
+    fields_displayed: int
+    fields_kept_dark: int
+
+
 def parse_identity(reply: bytes) -> Identity:
     """Parse a reply to IDENTITY.
 
@@ -95,8 +127,8 @@ def parse_timing(reply: bytes) -> Timing:
     return Timing(*_TIMING.unpack(_checked(reply, _TIMING.size)))
 
 
-def parse_status(reply: bytes) -> Status:
-    """Parse a reply to STATUS.
+def parse_status(reply: bytes, version: int = 1) -> Status:
+    """Parse a reply to STATUS, in a version of the protocol.
 
     Raises
     ------
@@ -104,14 +136,15 @@ def parse_status(reply: bytes) -> Status:
         Where these 40 bytes are not a status.
     """
     mode, buffer, refusal, faults, *counts, temperature = _STATUS.unpack(_checked(reply, _STATUS.size))
-    if mode >= len(MODES) or buffer >= len(BUFFERS) or refusal >= len(REFUSALS) or faults >> len(FAULTS):
+    refusals = REFUSALS if version == 1 else (*REFUSALS, FIELDS_REFUSAL)
+    if mode >= len(MODES) or buffer >= len(BUFFERS) or refusal >= len(refusals) or faults >> len(FAULTS):
         raise ValueError("its status has values that the protocol does not know")
     named = tuple(name for bit, name in enumerate(FAULTS) if faults >> bit & 1)
     received, committed, displayed, shown, rejected, periods, since_us = counts
     return Status(
         MODES[mode],
         BUFFERS[buffer],
-        REFUSALS[refusal],
+        refusals[refusal],
         named,
         received,
         committed,
@@ -122,6 +155,34 @@ def parse_status(reply: bytes) -> Status:
         since_us,
         temperature / 100,
     )
+
+
+def parse_versions(reply: bytes) -> Versions:
+    """Parse a reply to VERSION.
+
+    Raises
+    ------
+    ValueError
+        Where these 12 bytes are not versions.
+    """
+    found = Versions(*_VERSIONS.unpack(_checked(reply, _VERSIONS.size)))
+    if not 1 <= found.lowest <= found.highest or not found.most_fields or not 1 <= found.light_outputs <= 8:
+        raise ValueError("its versions have values that the protocol does not know")
+    return found
+
+
+def parse_fields(reply: bytes) -> FieldsShown:
+    """Parse a reply to FIELDS.
+
+    Raises
+    ------
+    ValueError
+        Where these 16 bytes do not describe a frame.
+    """
+    fields, field, lasers, reason, displayed, kept_dark = _FIELDS.unpack(_checked(reply, _FIELDS.size))
+    if reason >= len(DARK_REASONS) or field >= max(fields, 1):
+        raise ValueError("its fields have values that the protocol does not know")
+    return FieldsShown(fields, field, lasers, DARK_REASONS[reason], displayed, kept_dark)
 
 
 def timing_bytes(timing: Timing) -> bytes:
@@ -140,6 +201,19 @@ def frame_bytes(gray: Gray, sequence: int) -> tuple[bytes, int]:
     crc = zlib.crc32(pixels)
     height, width = gray.shape
     return with_crc(_HEADER.pack(b"HLPF", sequence, width, height, len(pixels), crc)) + pixels, crc
+
+
+def fields_bytes(fields: Sequence[Field], sequence: int) -> tuple[bytes, int]:
+    """One frame of fields as it is sent in version 2, and the CRC-32 of its records."""
+    pixels = [field.gray.tobytes() for field in fields]
+    records = b"".join(
+        with_crc(_RECORD.pack(b"FLD", k, field.lasers, field.delay_us, field.width_us, zlib.crc32(pixels[k])))
+        for k, field in enumerate(fields)
+    )
+    height, width = fields[0].gray.shape
+    crc = zlib.crc32(records)
+    header = with_crc(_FIELDS_HEADER.pack(b"HLPS", sequence, width, height, len(fields), crc))
+    return b"".join((header, records, *pixels)), crc
 
 
 def _checked(reply: bytes, size: int) -> bytes:

@@ -1,7 +1,8 @@
 """A headset's hardware, emulated at the level of its buses' bytes, with a simulated bench between its parts.
 
-The frame on the panel board and the light of the laser board give the camera's picture. `served` runs it in a
-process of its own, so that it continues when the process that drives it dies, as hardware does.
+The frame on the panel board and the light of the laser board give the camera's picture. The panel's light outputs gate
+the lasers, in version 2 of its protocol each one to its own fields. `served` runs it in a process of its own, so that
+it continues when the process that drives it dies, as hardware does.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from firmware_iface.virtual.bench_loading import load_bench
 from firmware_iface.virtual.fault_injection import Faults
 from firmware_iface.virtual.i2c import LaserBoard
 from firmware_iface.virtual.oak import OakModel, expose_bench
-from firmware_iface.virtual.usb.panel_board import BoardModel
+from firmware_iface.virtual.usb.panel_board import BoardModel, LitPattern
+from firmware_iface.virtual.virtual_devices import LitField
 from firmware_iface.virtual.virtual_headset import VirtualHeadset
 
 TICK_S = 0.001
@@ -44,11 +46,15 @@ class EmulatedHardware:
         The panel's.
     lasers : LaserBoard
     faults : dict of str to Faults
-        The script of "panel", "lasers" and "camera".
+        The script of "panel" (its USB), "panel link" (from the board to the panel, asked once a field), "lasers" and
+        "camera".
     light : deque of (float, float)
-        (time s, µW of all lasers) at each change.
+        (time s, µW of all lasers, each in its own field) at each change.
     whole : dict of int to int
         CRC-32 of each pattern that the panel displayed, and how often.
+    lit : dict of (int, int) to int
+        CRC-32 of what was truly on the panel in a field, and the mask of the light outputs that were open then; and
+        how often. Darkness is not in it.
     """
 
     def __init__(self, bench: str, seed: int = 0) -> None:
@@ -56,11 +62,16 @@ class EmulatedHardware:
         self.board = BoardModel(self.headset.panel.shape)
         self.light: deque[tuple[float, float]] = deque([(time.monotonic(), 0.0)], REMEMBERED)
         self.whole: dict[int, int] = {}
-        self.lasers = LaserBoard(emission=lambda at, power: self.light.append((at, sum(power.values()))))
+        self.lit: dict[tuple[int, int], int] = {}
+        self.lasers = LaserBoard(
+            emission=lambda at, power: self.light.append((at, sum(power.values()))),
+            gates=lambda: self.board.outputs,
+        )
         self.lasers.key = self.lasers.interlock = True
         self._full_uw = {d.name: 1 / d.photodiode_v_per_uw for d in self.lasers.diodes}
         self.faults = {
             "panel": self.board.faults,
+            "panel link": self.board.link_faults,
             "lasers": self.lasers.bus.faults,
             "camera": Faults(seed),
         }
@@ -74,6 +85,11 @@ class EmulatedHardware:
             while self.board.shown:
                 _, crc = self.board.shown.popleft()
                 self.whole[crc] = self.whole.get(crc, 0) + 1
+            opened = self.board.sequence.opened
+            while opened:
+                crc, outputs = opened.popleft()
+                if outputs:
+                    self.lit[crc, outputs] = self.lit.get((crc, outputs), 0) + 1
             time.sleep(TICK_S)
 
     def capture(self, exposure_ms: float) -> NDArray[np.uint16]:
@@ -107,12 +123,29 @@ class EmulatedHardware:
         """One picture of the camera without its faults, uint16 counts [h, w]."""
         with self._lock:
             emitted = self.lasers.emitted_uw
-            self.headset.panel.show(self.board.gray)
+            self.headset.panel.fields = self._lit_fields(exposure_ms * 1e-3)
             for channel in self.headset.lasers.channels:
                 share = emitted.get(channel, 0.0) / self._full_uw.get(channel, 1.0)
                 self.headset.lasers.set_power(channel, min(1.0, share))
             self.headset.camera.exposure_ms = exposure_ms
             return self.headset.camera.capture()
+
+    def _lit_fields(self, exposure_s: float) -> tuple[LitField, ...]:
+        """The patterns on the panel, with the share of an exposure that begins now in which each is lit."""
+        frame_s, into_s, patterns = self.board.lit()
+        names = [diode.name for diode in self.lasers.diodes]
+        return tuple(
+            LitField(
+                pattern.gray,
+                sum(
+                    1 << k
+                    for k, channel in enumerate(self.headset.lasers.channels)
+                    if channel in names and pattern.outputs >> names.index(channel) & 1
+                ),
+                _lit_s(pattern, frame_s, into_s, into_s + exposure_s) / exposure_s,
+            )
+            for pattern in patterns
+        )
 
     def set_to(self, name: str, value: Any) -> None:
         """Change the surroundings of the laser board.
@@ -157,3 +190,13 @@ class EmulatedHardware:
         changes = list(self.light)
         first = max((k for k, (at, _) in enumerate(changes) if at <= since_s), default=0)
         return changes[first:]
+
+
+def _lit_s(pattern: LitPattern, frame_s: float, begin_s: float, end_s: float) -> float:
+    """For how long a pattern is lit between two times, both counted from the start of a frame."""
+
+    def until(at_s: float) -> float:
+        frames, into_s = divmod(at_s, frame_s)
+        return frames * pattern.width_s + min(max(into_s - pattern.begins_s, 0.0), pattern.width_s)
+
+    return until(end_s) - until(begin_s)

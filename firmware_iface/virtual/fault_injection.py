@@ -25,6 +25,9 @@ KINDS = {
     "garbage": "the bytes of the transfer arrive as random ones",
     "hang": "nothing is answered or done until it is cleared",
     "late": "what is due comes late, by `late_s`",
+    "torn_field": "a panel takes only a part of a field's pattern; the rest is that of the field before",
+    "swapped_gate": "a field gets the light that belongs to another field of its frame",
+    "missing_field": "a panel does not take a field and goes on showing the field before",
     "die": "the process that owns the device dies at once",
 }
 

@@ -74,7 +74,7 @@ class RemoteHardware:
     # --- for tests
 
     def break_part(self, part: str, kind: str, count: int | None = 1, after: int = 0) -> float:
-        """Arm a fault of "panel", "lasers" or "camera"; the time, monotonic s."""
+        """Arm a fault of "panel", "panel link", "lasers" or "camera"; the time, monotonic s."""
         return self.ask({"do": "break", "part": part, "kind": kind, "count": count, "after": after})[0]
 
     def repair(self, part: str) -> float:
@@ -92,6 +92,10 @@ class RemoteHardware:
     def whole(self) -> set[int]:
         """CRC-32 of every pattern that the panel has displayed."""
         return set(self.ask({"do": "whole"})[0])
+
+    def lit(self) -> set[tuple[int, int]]:
+        """CRC-32 of what was truly on the panel, and the mask of the lasers that it let shine on it, of every field."""
+        return {(crc, outputs) for crc, outputs in self.ask({"do": "lit"})[0]}
 
 
 def _raise(kind: str, arguments: list[Any]) -> None:

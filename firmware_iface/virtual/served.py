@@ -55,6 +55,8 @@ def answer(hardware: EmulatedHardware, request: dict[str, Any], data: bytes) -> 
             return [vars(diode) for diode in hardware.lasers.diodes], b""
         case {"do": "whole"}:
             return list(hardware.whole), b""
+        case {"do": "lit"}:
+            return [[*pair] for pair in list(hardware.lit)], b""
     raise InputError(f"{request!r} is no request to emulated hardware.")
 
 

@@ -2,13 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.errors import InputError
+from firmware_iface.panel.fields import Field, checked_fields
 from firmware_iface.panel.panel import Gray, checked_gray
+
+EVERY_LASER = -1
+MOST_FIELDS = 24
+
+
+@dataclass(frozen=True)
+class LitField:
+    """A pattern on the panel, and its share in a picture.
+
+    Attributes
+    ----------
+    gray : uint8 array [H, W]
+    lasers : int
+        Which lasers shine on it, bit k for channel k; EVERY_LASER: all.
+    share : float
+        For how much of the time.
+    """
+
+    gray: Gray
+    lasers: int = EVERY_LASER
+    share: float = 1.0
 
 
 class VirtualPanel:
@@ -18,16 +41,24 @@ class VirtualPanel:
     ----------
     shape : (int, int)
         (H, W), pixels.
+
+    Attributes
+    ----------
+    fields : tuple of LitField
+        What it shows, in turn and again.
     """
+
+    most_fields = MOST_FIELDS
+    field_us = 5556  # three in a sixtieth of a second
 
     def __init__(self, shape: tuple[int, int]) -> None:
         self.shape = shape
-        self._gray: Gray = np.zeros(shape, np.uint8)
+        self.fields: tuple[LitField, ...] = (LitField(np.zeros(shape, np.uint8)),)
 
     @property
     def gray(self) -> Gray:
-        """The gray levels shown, uint8 [H, W]; a copy."""
-        return self._gray.copy()
+        """The gray levels shown, uint8 [H, W]; a copy. Where several fields are shown, those of the last."""
+        return self.fields[-1].gray.copy()
 
     def show(self, gray: NDArray[np.generic]) -> None:
         """Show gray levels, uint8 [H, W].
@@ -37,7 +68,19 @@ class VirtualPanel:
         InputError
             For another type or size.
         """
-        self._gray = checked_gray(gray, self.shape).copy()
+        self.fields = (LitField(checked_gray(gray, self.shape).copy()),)
+
+    def show_fields(self, fields: Sequence[Field]) -> None:
+        """Show fields in turn, each lit by its own lasers, as `FieldPanel.show_fields`.
+
+        Raises
+        ------
+        InputError
+            As there.
+        """
+        checked = checked_fields(fields, self.shape, self.field_us, self.most_fields)
+        frame_us = len(checked) * self.field_us
+        self.fields = tuple(LitField(f.gray.copy(), f.lasers, f.width_us / frame_us) for f in checked)
 
 
 class VirtualLasers:

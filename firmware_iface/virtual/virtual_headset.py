@@ -4,6 +4,8 @@ headset = open_headset("virtual:demo", seed=1)
 headset.lasers.set_power("green", 1.0)
 headset.panel.show(gray)
 counts = headset.camera.capture()
+
+A panel that shows colours in turn (`panel.show_fields`) lights each field with its own lasers; the camera sees the sum.
 """
 
 from __future__ import annotations
@@ -105,13 +107,13 @@ class VirtualHeadset:
         dose = self.camera.exposure_ms / 10 * self._drift.gain(self.captures)
         motion = camera_motion(self.description, self.seed, self.captures)
         electrons = np.zeros(self.camera.shape)
-        gray = self.panel.gray
-        for channel in self.lasers.channels:
-            power = self.lasers.power(channel)
-            if power > 0:
-                seen = self._camera_irradiance(gray, channel, self.plane_mm, motion, self._turned)
-                electrons = electrons + self._sensor.electrons(seen, dose * power)
-        self._turned = self._optics.turned(gray, self._turned)
+        for field in self.panel.fields:  # the camera integrates over whole frames
+            for k, channel in enumerate(self.lasers.channels):
+                power = self.lasers.power(channel) * field.share * (field.lasers >> k & 1)
+                if power > 0:
+                    seen = self._camera_irradiance(field.gray, channel, self.plane_mm, motion, self._turned)
+                    electrons = electrons + self._sensor.electrons(seen, dose * power)
+            self._turned = self._optics.turned(field.gray, self._turned)
         rng = np.random.default_rng([self.seed, 11, self.captures])
         counts = self._sensor.expose(self._sensor.respond(electrons), rng)
         self.time_s += max(self.description.simulation.capture_interval_s, self.camera.exposure_ms * 1e-3)

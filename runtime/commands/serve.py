@@ -22,10 +22,11 @@ CONFIG is one TOML file:
   stale_limit_ms = 80.0                  # what is older than this is not lit
   metrics_port = 9464                    # http://127.0.0.1:9464/metrics; 0: none
   users = [1000]                         # who may connect, as well as root and the service's own user
-  channel = "green"                      # the colour to show, where the bundle has several
+  channel = "green"                      # the colour to show, where the bundle has several and the panel one field
 
   [panel]
   kind = "board"                         # or dlpc900, mirrored, "my_lab:panel"
+  # fields = 3                           # colours in turn, all of the bundle's; without it, one
   [lasers]
   bus = "/dev/i2c-1"
   power = { green = 0.5 }                # fraction of full while something is shown

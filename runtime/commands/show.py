@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from firmware_iface.errors import InputError
 from runtime.commands.inputs import headset_option
@@ -25,6 +25,11 @@ DESCRIPTION = """Show patterns on a headset, one after the other, and save what 
 PATTERN is an 8-bit gray PNG of the panel's size, as `solve` writes it. Lasers are lit while patterns are shown and
 dark afterwards, whatever happens. Pictures are 16-bit gray PNGs of the camera's counts: NAME-seen.png.
 
+With --in-turn red,green,blue, the patterns are those of pictures in several colours: the first three are shown in turn
+as fields of one picture, each lit by its own laser alone, then the next three, and so on. The panel has to show fields
+(a panel board of protocol version 2, or a DLPC900). The camera sees the sum: give it an exposure of whole frames. What
+it sees is saved under the name of the first of the patterns.
+
 With --emulated, the headset of a virtual bench is emulated down to the bytes of its buses and driven through the real
 pyusb, smbus2 and depthai libraries, as real hardware would be."""
 
@@ -34,7 +39,11 @@ def options(parser: ArgumentParser) -> None:
     parser.add_argument("patterns", metavar="PATTERN", type=Path, nargs="+", help="8-bit gray PNGs")
     headset_option(parser, required=True)
     parser.add_argument("--emulated", action="store_true", help="emulate the virtual bench's buses as well")
-    parser.add_argument("--channel", metavar="C", help="the laser to light (default: the headset's first)")
+    lit = parser.add_mutually_exclusive_group()
+    lit.add_argument("--channel", metavar="C", help="the laser to light (default: the headset's first)")
+    lit.add_argument(
+        "--in-turn", metavar="C,C,C", type=_names, help="show colours in turn, each lit by its own laser"
+    )
     parser.add_argument(
         "--exposure-ms", metavar="T", type=exposure_ms, help="of the camera (default: as it is)"
     )
@@ -54,24 +63,31 @@ def run(args: Namespace, screen: Screen) -> Result:
     from runtime.headset.open_devices import emulated, is_simulated, open_devices
     from runtime.solver.pattern_files import read_pattern
 
-    grays = [read_pattern(path) for path in args.patterns]
+    pictures = _pictures(args)
+    grays = {path: read_pattern(path) for path in args.patterns}
+    fields = len(args.in_turn or [None])
     with ExitStack() as stack:
-        opened = emulated(args.headset) if args.emulated else open_devices(args.headset)
-        devices = stack.enter_context(opened)
-        channel = _laser(args.channel, devices)
+        opening = emulated if args.emulated else open_devices
+        devices = stack.enter_context(opening(args.headset, fields=fields))
+        channels = [_laser(name, devices) for name in args.in_turn or [args.channel]]
         if args.exposure_ms is not None:
             devices.camera.exposure_ms = args.exposure_ms
-        devices.light(channel)
+        if not args.in_turn:
+            devices.light_all(channels)
         top = 2**devices.camera.bit_depth - 1
-        shown = []
-        for path, gray in zip(args.patterns, grays, strict=True):
+        shown: list[dict[str, Any]] = []
+        for paths in pictures:
             begin = time.perf_counter()
-            devices.panel.show(gray)
+            _show([grays[path] for path in paths], channels, devices)
             took_ms = 1000 * (time.perf_counter() - begin)
+            if args.in_turn and not shown:  # where no field is shown yet, no laser may shine
+                devices.light_all(channels)
             counts = devices.camera.capture()
+            path = paths[0]
             shown.append(
                 {
                     "pattern": str(path),
+                    **({"fields": dict(zip(channels, map(str, paths), strict=True))} if args.in_turn else {}),
                     "show_ms": round(took_ms, 3),
                     "seen": None if args.out is None else str(_write_counts(counts, args.out, path)),
                     "mean_counts": round(float(counts.mean()), 2),
@@ -83,7 +99,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     return {
         "headset": args.headset,
         "simulated": args.emulated or is_simulated(args.headset),
-        "channel": channel,
+        "channel": ",".join(channels),
         "exposure_ms": exposure,
         "shown": shown,
     }
@@ -93,7 +109,41 @@ def outputs(args: Namespace) -> list[Output]:
     """What the camera sees of each pattern."""
     if args.out is None:
         return []
-    return [Output(_seen_file(args.out, pattern), makes_folders=True) for pattern in args.patterns]
+    return [Output(_seen_file(args.out, paths[0]), makes_folders=True) for paths in _pictures(args)]
+
+
+def _names(text: str) -> list[str]:
+    """Two names or more, with commas."""
+    names = [name.strip() for name in text.split(",")]
+    if len(names) < 2 or not all(names) or len(set(names)) < len(names):
+        raise ArgumentTypeError(f"'{text}' is not several colours: give their names, as red,green,blue")
+    return names
+
+
+def _pictures(args: Namespace) -> list[list[Path]]:
+    """The patterns of each picture: one, or one a colour."""
+    each = len(args.in_turn or [None])
+    if len(args.patterns) % each:
+        raise InputError(
+            f"--in-turn {','.join(args.in_turn)} needs {each} patterns a picture, and {len(args.patterns)} are given"
+        )
+    return [args.patterns[k : k + each] for k in range(0, len(args.patterns), each)]
+
+
+def _show(grays: list[np.ndarray], channels: list[str], devices: Devices) -> None:
+    """Show one pattern, or one for each channel in turn."""
+    import numpy as np
+
+    from firmware_iface.panel.fields import colours_in_turn
+
+    if len(grays) == 1:
+        devices.panel.show(grays[0])
+        return
+    if len({gray.shape for gray in grays}) > 1:
+        raise InputError("the patterns of a picture have different sizes; give those of one picture together")
+    lasers = [devices.lasers.channels.index(channel) for channel in channels]
+    frame = colours_in_turn(np.stack(grays), lasers, [1.0] * len(grays), devices.panel.field_us)
+    devices.panel.show_fields(frame)
 
 
 def _seen_file(folder: Path, pattern: Path) -> Path:
@@ -144,6 +194,7 @@ COMMAND = Command(
     examples=(
         "show pattern.png --headset headset.toml --out seen/",
         "show pattern.png --headset virtual:demo --emulated",
+        "show p-red.png p-green.png p-blue.png --in-turn red,green,blue --headset virtual:colour",
     ),
     after="Correct what has drifted: calibrate bundle/ --headset headset.toml --report calibration.html",
     description=DESCRIPTION,

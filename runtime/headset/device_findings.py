@@ -15,6 +15,7 @@ from firmware_iface.configured_devices import (
     open_camera,
     open_lasers,
     open_panel,
+    panel_fields,
 )
 from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
 from firmware_iface.laser_board_findings import laser_problems
@@ -223,11 +224,13 @@ def _unlit(configuration: Configuration) -> list[str]:
         channels = bundle_channels(read_bundle(configuration.bundle))
     except InputError:  # reported of the bundle
         return []
-    shown = configuration.timing.channel or channels[0]
-    if shown not in channels or laser_power(configuration.devices["lasers"]).get(shown, 0.0) > 0:
-        return []
+    first = configuration.timing.channel or channels[0]
+    several = panel_fields(configuration.devices["panel"]) > 1
+    power = laser_power(configuration.devices["lasers"])
     return [
         f"the service shows {shown} and its laser gets no power: write power = {{ {shown} = 0.5 }} in [lasers]"
+        for shown in (channels if several else [first])
+        if shown in channels and not power.get(shown, 0.0) > 0
     ]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -15,6 +15,7 @@ from typing import Any
 from firmware_iface.errors import InputError
 
 FULL = 1.0  # power where none is given: the most that the safety controller allows
+FRAMES_HZ = 60.0  # of an emulated panel
 
 
 @dataclass(frozen=True)
@@ -44,12 +45,17 @@ class Devices:
 
     def light(self, channel: str) -> None:
         """Switch one laser on and all others off."""
+        self.light_all([channel])
+
+    def light_all(self, channels: Sequence[str]) -> None:
+        """Switch these lasers on and all others off."""
         self.lasers.off()
-        self.lasers.set_power(channel, self.power.get(channel, FULL))
+        for channel in channels:
+            self.lasers.set_power(channel, self.power.get(channel, FULL))
 
 
 @contextmanager
-def open_devices(spec: str, seed: int = 0) -> Iterator[Devices]:
+def open_devices(spec: str, seed: int = 0, fields: int = 1) -> Iterator[Devices]:
     """The devices of `virtual:NAME`, of a virtual bench's TOML file, or of a service's configuration; dark at the end.
 
     With a configuration, the lasers are armed, in a guard process that switches them off when this process ends in any
@@ -61,6 +67,8 @@ def open_devices(spec: str, seed: int = 0) -> Iterator[Devices]:
         `virtual:NAME`, or the path of a file.
     seed : int
         Of a virtual bench's noise.
+    fields : int
+        Fields of a frame; more than 1 opens a panel that shows them in turn (`show_fields`) and gates the lasers.
 
     Yields
     ------
@@ -83,23 +91,31 @@ def open_devices(spec: str, seed: int = 0) -> Iterator[Devices]:
     for name in ("panel", "lasers", "camera"):
         if name not in tables:
             raise InputError(f"{spec} has no [{name}]: the panel, the lasers and the camera are all needed")
-    with open_tables(tables) as devices:
+    with open_tables(tables, fields) as devices:
         yield devices
 
 
 @contextmanager
-def open_tables(tables: Mapping[str, Any]) -> Iterator[Devices]:
+def open_tables(tables: Mapping[str, Any], fields: int = 1) -> Iterator[Devices]:
     """As `open_devices`, for the tables [panel], [lasers] and [camera] of a configuration."""
-    from firmware_iface.configured_devices import laser_channels, laser_power, open_camera, open_panel
+    from firmware_iface.configured_devices import (
+        gated_light,
+        laser_channels,
+        laser_power,
+        open_camera,
+        open_panel,
+    )
     from firmware_iface.lasers.guarded_lasers import open_guarded_lasers
     from firmware_iface.virtual.remote_hardware import i2c_bus
 
     bus = str(tables["lasers"].get("bus"))
+    panel_table = {**tables["panel"], "fields": fields}
     with ExitStack() as stack:
         camera = stack.enter_context(closing(open_camera(tables["camera"])))
-        panel = stack.enter_context(closing(open_panel(tables["panel"])))
+        panel = stack.enter_context(closing(open_panel(panel_table)))
         bus = i2c_bus(bus) if bus.startswith("virtual:") else bus
-        lasers = stack.enter_context(closing(open_guarded_lasers(bus, laser_channels(tables["lasers"]))))
+        guarded = open_guarded_lasers(bus, laser_channels(tables["lasers"]), gated_light(panel_table))
+        lasers = stack.enter_context(closing(guarded))
         lasers.arm()
         stack.enter_context(lasers.beating())
         stack.callback(lasers.off)
@@ -107,7 +123,7 @@ def open_tables(tables: Mapping[str, Any]) -> Iterator[Devices]:
 
 
 @contextmanager
-def emulated(bench: str, seed: int = 0) -> Iterator[Devices]:
+def emulated(bench: str, seed: int = 0, fields: int = 1) -> Iterator[Devices]:
     """A virtual bench inside hardware emulated down to the bytes of its buses, driven through a real headset's drivers.
 
     The camera is an emulated OAK where depthai is installed, and one without a link of its own elsewhere.
@@ -118,6 +134,8 @@ def emulated(bench: str, seed: int = 0) -> Iterator[Devices]:
         `virtual:NAME`, or the path of a virtual bench's TOML file.
     seed : int
         Of the bench's noise.
+    fields : int
+        As in `open_devices`.
 
     Yields
     ------
@@ -142,7 +160,8 @@ def emulated(bench: str, seed: int = 0) -> Iterator[Devices]:
         )
         with running(socket, bench, seed, address):
             lasers = {"bus": bus, "power": dict.fromkeys(colours, FULL)}
-            with open_tables({"panel": {"bus": bus}, "lasers": lasers, "camera": camera}) as devices:
+            panel = {"bus": bus, "refresh_hz": fields * FRAMES_HZ}
+            with open_tables({"panel": panel, "lasers": lasers, "camera": camera}, fields) as devices:
                 yield devices
 
 

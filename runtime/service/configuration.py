@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from firmware_iface.configured_devices import check_tables
+from firmware_iface.configured_devices import check_tables, gated_light
 from firmware_iface.errors import InputError, nearest
 from firmware_iface.toml_tables import parameter, read_table
 
@@ -37,7 +37,7 @@ class Timing:
         80.0, "a pattern, or a sign of life of panel, solver or camera, older than this is dark", 20, 10000
     )
     metrics_port: int = parameter(0, "of http://127.0.0.1/metrics; 0: none", 0, 65535)
-    channel: str = parameter("", "colour to show, where the bundle has several")
+    channel: str = parameter("", "colour to show, where the bundle has several and the panel shows one")
     socket: str = parameter("/run/hololoop/service.sock", "path of the Unix socket")
 
 
@@ -113,4 +113,10 @@ def read_configuration(file: str | os.PathLike[str]) -> Configuration:
         if name not in devices:
             raise InputError(f"{file} has no [{name}]: add it, the service cannot show anything without")
     check_tables(devices)
+    gated = gated_light(devices["panel"])
+    if gated is not None and timing.refresh_hz * gated.frame_s > 1.02:
+        raise InputError(
+            f"refresh_hz = {timing.refresh_hz:g} in [service] of {file} is more pictures than the panel shows, "
+            f"{1 / gated.frame_s:.1f} a second: refresh_hz in [panel] is of a field; raise that one, or lower this"
+        )
     return Configuration(path, path.parent / bundle, timing, frozenset({0, os.getuid(), *users}), devices)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -17,6 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
+from firmware_iface.panel.fields import colours_in_turn
 
 AGAIN_S = 0.02  # between attempts to open the panel
 ASK_S = 0.03  # between requests for the status of an idle panel
@@ -58,6 +59,8 @@ class DisplayPattern:
         The pattern must not be lit.
     refined : bool
         The pattern is one of a refinement's, which the camera has to capture.
+    brightness : tuple of float
+        Light of each colour, 0 to 1; empty for one colour.
     """
 
     job: int
@@ -68,6 +71,7 @@ class DisplayPattern:
     final: bool
     dark: bool = False
     refined: bool = False
+    brightness: tuple[float, ...] = ()
 
 
 class DisplayEvents(Protocol):
@@ -109,6 +113,10 @@ class DisplayThread(threading.Thread):
         When the loop last turned: the thread's own sign of life.
     lit_until_ns : int, ns
         Until when the pattern on the panel may be lit.
+    lasers : sequence of int
+        The laser of each colour, where there are several; set before the thread starts.
+    lit_colours : frozenset of int or None
+        Colours that have light in the frame on the panel; None: it has one colour.
     """
 
     def __init__(
@@ -126,6 +134,8 @@ class DisplayThread(threading.Thread):
         self.answered_ns = 0
         self.turned_ns = time.monotonic_ns()
         self.lit_until_ns = 0
+        self.lasers: Sequence[int] = ()
+        self.lit_colours: frozenset[int] | None = None
 
     @property
     def open(self) -> bool:
@@ -168,8 +178,7 @@ class DisplayThread(threading.Thread):
             if pattern is not None:
                 self.taken_ns = tick
                 began = time.monotonic_ns()
-                for field in pattern.gray:
-                    self._panel.show(field)
+                self._show(pattern)
                 self._shown(pattern, tick, began)
             elif time.monotonic_ns() - self.answered_ns > ASK_S * 1e9:
                 self._panel.status()
@@ -183,6 +192,18 @@ class DisplayThread(threading.Thread):
                 self._panel, self._out = None, True
             if pattern is not None:
                 self._keep(pattern)
+
+    def _show(self, pattern: DisplayPattern) -> None:
+        """Show the pattern of one colour, or the frame of several, swapped in as a whole."""
+        if len(pattern.gray) == 1:
+            self._panel.show(pattern.gray[0])
+            return
+        frame = colours_in_turn(pattern.gray, self.lasers, pattern.brightness, self._panel.field_us)
+        lit = frozenset(k for k, field in enumerate(frame) if field.lasers)
+        if self.lit_colours is not None:
+            self.lit_colours &= lit  # what the frame before had and this has: until it is displayed
+        self._panel.show_fields(frame)
+        self.lit_colours = lit
 
     def _due(self, tick: int) -> DisplayPattern | None:
         """The oldest pattern that is due; drops stale patterns."""

@@ -5,6 +5,7 @@ Every frame that is accepted here ends in one Shown or one Error to its program.
 
 from __future__ import annotations
 
+import struct
 import time
 from collections import deque
 from collections.abc import Callable
@@ -14,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from firmware_iface.configured_devices import open_panel
+from firmware_iface.configured_devices import laser_numbers, open_panel
 from firmware_iface.errors import InputError
 from runtime.service import process_messages, protocol
 from runtime.service.configuration import Configuration
@@ -187,6 +188,7 @@ class FramePipeline:
                 bool(message.flags & process_messages.FINAL),
                 bool(message.flags & process_messages.DARK),
                 bool(message.flags & process_messages.REFINED),
+                struct.unpack_from(f"<{len(gray)}f", message.brightness) if len(gray) > 1 else (),
             )
             self._expect_light(message.shares, partial(self.display.put, pattern))
         if message.flags & process_messages.FINAL:
@@ -236,6 +238,12 @@ class FramePipeline:
         """The panel failed to do something."""
         self._loop.later(partial(self._faults.note, "panel", str(error), ongoing))
 
+    @property
+    def lit_colours(self) -> frozenset[str] | None:
+        """Colours that have light in the frame on the panel; None: it has one colour."""
+        lit = self.display.lit_colours
+        return None if lit is None else frozenset(self.solver.colours[k] for k in lit)
+
     def _open_panel(self) -> Any:
         panel = open_panel(self._configuration.devices["panel"])
         shape = self.solver.shape
@@ -245,6 +253,8 @@ class FramePipeline:
                 f"the panel is {panel.shape} and the bundle is for {shape[1:]}: attach the panel that it "
                 "was calibrated for, or export its own bundle"
             )
+        if len(self.solver.colours) > 1:
+            self.display.lasers = laser_numbers(self._configuration.devices["lasers"], self.solver.colours)
         return panel
 
     def _shown(self, pattern: DisplayPattern, at_ns: int, transfer_s: float) -> None:

@@ -12,7 +12,7 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
@@ -59,6 +59,10 @@ class LaserHeartbeat(threading.Thread):
         Returns until when the pattern on the panel may be lit (CLOCK_MONOTONIC, ns).
     fault : callable
         Called with a kind and a sentence for each fault, in this thread.
+    colours : callable
+        Returns the channels of a pattern's colours, where it has several; else none.
+    lit : callable
+        Returns which of them have light in the frame on the panel; None: the panel does not gate the lasers.
 
     Attributes
     ----------
@@ -79,10 +83,14 @@ class LaserHeartbeat(threading.Thread):
         fresh_until: Callable[[], dict[str, int]],
         lit_until_ns: Callable[[], int],
         fault: Callable[[str, str], None],
+        colours: Callable[[], Sequence[str]] = tuple,
+        lit: Callable[[], frozenset[str] | None] = lambda: None,
     ) -> None:
         super().__init__(name="lasers", daemon=True)
         self._open, self._power, self._fresh_until = open_lasers, power, fresh_until
         self._lit_until_ns, self._fault = lit_until_ns, fault
+        self._colours, self._lit = colours, lit
+        self._raised: frozenset[str] = frozenset()  # channels whose power was raised since the last darkness
         self._lasers: Any = None
         self._ramp: Iterator[None] | None = None
         self._requests: deque[LaserRequest] = deque()
@@ -92,7 +100,7 @@ class LaserHeartbeat(threading.Thread):
         self._cleared_at = -CLEAR_TO_ARM_S
         self._looked_at = 0.0
         self._risen_at = 0.0
-        self._expected: tuple[float, ...] = ()
+        self._expected: dict[str, tuple[float, ...]] = {}
         self.state, self.faults = LaserState.LOST, 0
         self.level = dict.fromkeys(power, 0.0)
         self.turned_ns = time.monotonic_ns()
@@ -113,15 +121,20 @@ class LaserHeartbeat(threading.Thread):
         Parameters
         ----------
         shares : bytes
-            13 float32, from eye_safety.spot_shares: the light that the pattern is predicted to make. Zeros: it is
-            not predicted, and all light counts as one spot.
+            13 float32 a colour, from eye_safety.spot_shares: the light that the pattern is predicted to make. Zeros: it
+            is not predicted, and all light counts as one spot.
         then : callable
             Called when the power is right for the pattern.
         """
         if not any(shares) or not self.armed:
             then()
             return
-        self._expected = struct.unpack("<13f", shares)
+        colours = self._colours()
+        if len(colours) > 1:
+            groups = struct.iter_unpack("<13f", shares[: 52 * len(colours)])
+            self._expected = dict(zip(colours, groups, strict=True))
+        else:
+            self._expected = dict.fromkeys(self._power, struct.unpack_from("<13f", shares))
         self.ask("expect", lambda problem: then())
 
     def stop(self) -> None:
@@ -163,8 +176,12 @@ class LaserHeartbeat(threading.Thread):
             self._lasers.trip()
             self._darkened("silent", f"dark: no sign of life of {', '.join(silent)}")
             return
+        lit = self._lit()
         try:
-            self._lasers.heartbeat()
+            if lit is None:
+                self._lasers.heartbeat()
+            else:
+                self._lasers.heartbeat(self._power.keys() - lit)
             self._light(now < self._lit_until_ns())
         except DeviceError as error:  # the driver has switched everything off before it raised
             self._darkened("lasers", str(error))
@@ -172,12 +189,14 @@ class LaserHeartbeat(threading.Thread):
     def _light(self, on: bool) -> None:
         """Raise the power slowly while a fresh pattern is displayed; switch off at once when none is."""
         if not on:
-            self._ramp = None
+            self._ramp, self._raised = None, frozenset()
             if self.state == LaserState.EMITTING:
                 self._lasers.off()
                 self.state = LaserState.ARMED
         elif self._ramp is None and (self.state == LaserState.ARMED or self._may_rise()):
-            self._ramp = chain.from_iterable(self._lasers.ramp(c, p) for c, p in self._power.items())
+            raised = self._with_light()
+            self._ramp = chain.from_iterable(self._lasers.ramp(c, self._power[c]) for c in raised)
+            self._raised |= frozenset(raised)
             self._risen_at = time.monotonic()
             self.state = LaserState.EMITTING
         try:
@@ -189,16 +208,24 @@ class LaserHeartbeat(threading.Thread):
         self.level = {channel: self._lasers.power(channel) for channel in self._power}
 
     def _may_rise(self) -> bool:
-        """Whether a pattern lowered the power, and enough time has passed to try more for another."""
-        lowered = any(self.level[channel] < power for channel, power in self._power.items())
+        """Whether a colour has light for the first time, or a pattern lowered the power and enough time has passed."""
+        lit = self._with_light()
+        if not self._raised.issuperset(lit):
+            return True
+        lowered = any(self.level[channel] < self._power[channel] for channel in lit)
         return lowered and time.monotonic() - self._risen_at > RISE_AGAIN_S
+
+    def _with_light(self) -> list[str]:
+        """Channels that have light in the frame on the panel."""
+        lit = self._lit()
+        return [channel for channel in self._power if lit is None or channel in lit]
 
     def _do(self, what: str) -> str | None:
         """Do what was asked; returns what is wrong, or None."""
         now = time.monotonic()
         try:
             if what == "expect":
-                self._lasers.expect(dict.fromkeys(self._power, self._expected))
+                self._lasers.expect({c: s for c, s in self._expected.items() if c in self._power})
             elif what == "dark":
                 self._lasers.trip()
                 self._dark()
@@ -232,7 +259,7 @@ class LaserHeartbeat(threading.Thread):
 
     def _dark(self) -> None:
         """The driver has switched everything off; the next turn asks the board for its state."""
-        self._ramp = None
+        self._ramp, self._raised = None, frozenset()
         self.level = dict.fromkeys(self._power, 0.0)
         self._looked_at = 0.0
         if self.armed:

@@ -19,7 +19,8 @@ U32 = Annotated[int, "I"]
 U64 = Annotated[int, "Q"]
 F32 = Annotated[float, "f"]
 Magic = Annotated[bytes, "8s"]
-Shares = Annotated[bytes, "52s"]
+Shares = Annotated[bytes, "156s"]
+Brightness = Annotated[bytes, "12s"]
 Text = Annotated[str, "240s"]
 
 HEADER = struct.Struct("<HHI")

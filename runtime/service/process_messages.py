@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from runtime.service.message_format import F32, U32, U64, Shares, Text, Vocabulary
+from runtime.service.message_format import F32, U32, U64, Brightness, Shares, Text, Vocabulary
 
 
 class Ping(NamedTuple):
@@ -28,6 +28,7 @@ class PatternRing(NamedTuple):
     channels: U32
     height: U32
     width: U32
+    colours: Text  # their names, in this order, with commas
 
 
 class TargetRing(NamedTuple):
@@ -59,7 +60,8 @@ class SolvedPattern(NamedTuple):
     flags: U32
     psnr_db: F32
     solve_us: U32
-    shares: Shares  # of its light in its brightest spots (eye_safety.spot_shares); zeros where it is not predicted
+    shares: Shares  # 13 f32 a colour: of its light in its brightest spots (eye_safety.spot_shares); 0: not predicted
+    brightness: Brightness  # f32 a colour: for how much of its field's light it is lit; 0: dark
 
 
 class FailedJob(NamedTuple):

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from firmware_iface.configured_devices import mrad_per_pixel
+from firmware_iface.configured_devices import mrad_per_pixel, panel_fields
 from firmware_iface.errors import InputError
 from firmware_iface.lasers.eye_safety import spot_shares
 from runtime.bundle.bundle_folder import read_bundle
@@ -137,9 +137,14 @@ def _prepared(configuration: Configuration, target: np.ndarray) -> _PreparedRefi
     Raises
     ------
     InputError
-        Where the bundle has no network or the picture is black.
+        Where several colours are shown, the bundle has no network, or the picture is black.
     """
     bundle = read_bundle(configuration.bundle)
+    if panel_fields(configuration.devices["panel"]) > 1:
+        raise InputError(
+            "a refinement is of one colour, and several are shown in turn: to refine one, write channel in [service] "
+            "and no fields in [panel]"
+        )
     path = load_light_path(bundle, configuration.timing.channel or None)
     approximator = approximator_of(bundle, (1, *path.grid.shape))
     if approximator is None:

@@ -60,6 +60,8 @@ class SolverClient:
         The process itself.
     shape : tuple of int or None
         (C, H, W) of a pattern; None until the solver was ready for the first time.
+    colours : tuple of str
+        Names of the colours of a pattern.
     fresh_until_ns : int, ns
         Until when the solver counts as fresh (CLOCK_MONOTONIC); 0: it was lost.
     busy_until_ns : int, ns
@@ -79,6 +81,7 @@ class SolverClient:
             "runtime.service.solver_process", str(configuration.file), process_messages.SOLVER
         )
         self.shape: tuple[int, int, int] | None = None
+        self.colours: tuple[str, ...] = ()
         self.fresh_until_ns = self.busy_until_ns = 0
         self._loop, self._faults, self._metrics = loop, faults, metrics
         self._stale_ns, self._events = stale_ns, events
@@ -136,9 +139,10 @@ class SolverClient:
             self._lost(f"its process died ({error})")
             return
         match message:
-            case process_messages.PatternRing(slots, channels, height, width) if fd is not None:
+            case process_messages.PatternRing(slots, channels, height, width, colours) if fd is not None:
                 self._patterns = open_ring(fd, slots, (channels, height, width), np.uint8)
                 self.shape = self.shape or (channels, height, width)
+                self.colours = tuple(colours.split(","))
                 self._out = False
                 self._events.solver_ready()
             case process_messages.FailedJob(0, _, text):

@@ -12,7 +12,7 @@ import struct
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -54,9 +54,17 @@ class Worker:
     ----------
     shape : tuple of int
         (C, H, W) of a pattern.
+    colours : sequence of str
+        Their names.
     """
 
-    def __init__(self, link: MessageLink, shape: tuple[int, int, int], configuration: Configuration) -> None:
+    def __init__(
+        self,
+        link: MessageLink,
+        shape: tuple[int, int, int],
+        colours: Sequence[str],
+        configuration: Configuration,
+    ) -> None:
         self.link, self.shape, self.configuration = link, shape, configuration
         self.refinement_request: RefinePicture | None = None  # for the picture of the next job
         self.refinement: RefinementThread | None = None
@@ -64,7 +72,7 @@ class Worker:
         self.free = set(range(SLOTS))
         self.targets: Ring | None = None
         self.jobs: deque[SolveJob] = deque()
-        link.send(PatternRing(SLOTS, *shape), fds=[self.ring.fd])
+        link.send(PatternRing(SLOTS, *shape, ",".join(colours)), fds=[self.ring.fd])
 
     def receive(self, wait: bool) -> None:
         """Receive one message; without `wait`, only if there is one."""
@@ -131,10 +139,18 @@ class Worker:
         self.ring.slots[slot] = pattern.gray
         microseconds = (time.monotonic_ns() - began_ns) // 1000
         flags = FINAL * pattern.final | DARK * pattern.dark | REFINED * refined
-        shares = struct.pack("<13f", *pattern.shares) if pattern.shares else bytes(52)
         took_us = min(microseconds, 2**32 - 1)
         self.link.send(
-            SolvedPattern(job.job, slot, crc32(pattern.gray), flags, pattern.psnr_db, took_us, shares)
+            SolvedPattern(
+                job.job,
+                slot,
+                crc32(pattern.gray),
+                flags,
+                pattern.psnr_db,
+                took_us,
+                struct.pack(f"<{len(pattern.shares)}f", *pattern.shares),
+                struct.pack(f"<{len(pattern.brightness)}f", *pattern.brightness),
+            )
         )
 
     def run(self, solve: Solve) -> None:
@@ -171,7 +187,7 @@ def main(fd: str, configuration: str) -> None:
         return
     for _ in solver.patterns(np.ones(solver.shape, np.float32), time.monotonic_ns()):
         pass  # everything that the first use sets up is ready before the first frame
-    Worker(link, solver.shape, settings).run(solver.patterns)
+    Worker(link, solver.shape, solver.colours, settings).run(solver.patterns)
 
 
 if __name__ == "__main__":

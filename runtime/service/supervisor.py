@@ -13,7 +13,7 @@ import time
 from contextlib import suppress
 from functools import partial
 
-from firmware_iface.configured_devices import laser_power, open_lasers
+from firmware_iface.configured_devices import gated_light, laser_power, open_lasers
 from runtime.service import protocol
 from runtime.service.camera_client import CameraClient
 from runtime.service.configuration import Configuration
@@ -44,11 +44,15 @@ class Supervisor:
         self.faults = FaultLog(self.metrics)
         self.camera = CameraClient(configuration, self.loop, self.faults, self.metrics)
         self.lasers = LaserHeartbeat(
-            partial(open_lasers, configuration.devices["lasers"]),
+            partial(
+                open_lasers, configuration.devices["lasers"], gated_light(configuration.devices["panel"])
+            ),
             laser_power(configuration.devices["lasers"]),
             self._fresh_until,
             lambda: self.pipeline.display.lit_until_ns,
             lambda kind, text: self.loop.later(partial(self.faults.note, kind, text)),
+            lambda: self.pipeline.solver.colours,
+            lambda: self.pipeline.lit_colours,
         )
         self.pipeline = FramePipeline(
             configuration, self.loop, self.faults, self.metrics, self.lasers.expect, self._captures

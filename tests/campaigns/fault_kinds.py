@@ -29,6 +29,8 @@ class FaultKind:
         Light is not allowed after it.
     heal : callable
         Removes the cause.
+    fields : bool
+        It strikes a headset that shows colours in turn alone.
     shows : bool
         Whether the program shows pictures meanwhile; it would wait otherwise.
     """
@@ -39,6 +41,7 @@ class FaultKind:
     dark: bool
     heal: Callable[[Lane], object] = lambda lane: None
     shows: bool = True
+    fields: bool = False
 
 
 def _part(part: str, kind: str, weight: float, dark: bool, count: int | None = 1) -> FaultKind:
@@ -50,6 +53,18 @@ def _part(part: str, kind: str, weight: float, dark: bool, count: int | None = 1
         dark,
         lambda lane: lane.remote.repair(part),
         shows=not (part == "lasers" and lasting),
+    )
+
+
+def _field(kind: str, count: int, weight: float) -> FaultKind:
+    """The link from the panel board to the panel fails for some fields: what is then lit must be right all the same."""
+    return FaultKind(
+        f"panel {kind.replace('_', ' ')}",
+        weight,
+        lambda lane: lane.remote.break_part("panel link", kind, count),
+        False,
+        lambda lane: lane.remote.repair("panel link"),
+        fields=True,
     )
 
 
@@ -152,6 +167,9 @@ KINDS = (
     _part("panel", "late", 3, False),
     _part("panel", "hang", 3, True, None),
     _part("panel", "unplug", 4, True, None),
+    _field("torn_field", 7, 8),
+    _field("swapped_gate", 5, 8),
+    _field("missing_field", 7, 8),
     _part("lasers", "nack", 6, True),
     _part("lasers", "timeout", 6, True),
     _part("lasers", "stall", 6, True),

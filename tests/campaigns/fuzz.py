@@ -29,10 +29,16 @@ _SCRATCH = tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir
 
 def panel_replies() -> Target:
     """Replies of the panel board, as they are and with a right CRC."""
-    from firmware_iface.panel.panel_board_messages import parse_identity, parse_status, parse_timing
+    from firmware_iface.panel.panel_board_messages import (
+        parse_fields,
+        parse_identity,
+        parse_status,
+        parse_timing,
+        parse_versions,
+    )
 
     def one(data: bytes) -> None:
-        for parse in (parse_identity, parse_status, parse_timing):
+        for parse in (parse_identity, parse_status, parse_timing, parse_versions, parse_fields):
             for reply in (data, data + zlib.crc32(data).to_bytes(4, "little")):
                 with suppress(ValueError):
                     parse(reply)

@@ -44,6 +44,8 @@ width = {SHAPE[1]}
 distance_mm = {DISTANCE_MM}
 """
 
+COLOURS = {"red": 638.0, "green": 520.0, "blue": 450.0}  # wavelength, nm; in the order of the board's lasers
+
 CONFIGURATION = """
 schema = 1
 bundle = "bundle"
@@ -55,9 +57,9 @@ stale_limit_ms = {stale_limit_ms}
 [panel]
 bus = "virtual:{folder}/hardware.sock"
 refresh_hz = 1000.0
-[lasers]
+{fields}[lasers]
 bus = "virtual:{folder}/hardware.sock"
-power = {{ green = 0.5 }}
+power = {{ {power} }}
 [camera]
 {camera}
 """
@@ -69,6 +71,7 @@ def write_configuration(
     solve_ms: float = 12.0,
     stale_limit_ms: float = 400.0,
     oak: str | None = None,
+    colours: bool = False,
 ) -> Path:
     """A bundle, a bench and a configuration in `folder`; returns the configuration's path.
 
@@ -81,11 +84,16 @@ def write_configuration(
     solve_ms, stale_limit_ms : float, ms
     oak : str or None
         Loopback address of an emulated OAK camera; None: the camera without a link.
+    colours : bool
+        Whether three colours are shown in turn.
     """
     path = converted(ideal_path(SHAPE, DISTANCE_MM * 1e-3), np.float32)
-    records, arrays = pack_light_paths([("green", DISTANCE_MM, 520.0, path)])
+    shown = COLOURS if colours else {"green": 520.0}
+    records, arrays = pack_light_paths([(name, DISTANCE_MM, nm, path) for name, nm in shown.items()])
     write_bundle(folder / "bundle", arrays, {"paths": records, "distance_mm": DISTANCE_MM}, {})
-    (folder / "bench.toml").write_text(BENCH)
+    channels = [f'[[channel]]\nname = "{name}"\nwavelength_nm = {nm}\n' for name, nm in shown.items()]
+    coarse = "[simulation]\nsubpixels = 2\n" if colours else ""  # three colours take a third of the time each
+    (folder / "bench.toml").write_text(BENCH + "".join(channels) + coarse)
     file = folder / "headset.toml"
     camera = f'kind = "virtual"\nbus = "virtual:{folder}/hardware.sock"'
     if oak:
@@ -97,6 +105,8 @@ def write_configuration(
             solve_ms=solve_ms,
             stale_limit_ms=stale_limit_ms,
             camera=camera,
+            fields=f"fields = {len(shown)}\n" if colours else "",
+            power=", ".join(f"{name} = 0.5" for name in shown),
         )
     )
     return file
@@ -153,10 +163,14 @@ def connected(file: Path, within_s: float = 20.0, slots: int = 3) -> Client:
 
 def picture(client: Client, seed: int = 0) -> np.ndarray:
     """A smooth picture of the client's shape, uint16."""
-    _, height, width = client.shape
+    colours, height, width = client.shape
     y, x = np.mgrid[0:height, 0:width]
     one = 0.5 + 0.4 * np.sin(0.3 * x + 0.2 * y + seed)
-    return np.broadcast_to(65535 * one, client.shape).astype(np.uint16)
+    if colours == 1:
+        return np.broadcast_to(65535 * one, client.shape).astype(np.uint16)
+    lights = np.array([1.0, 0.7, 0.4])
+    lights[(seed // 2) % 3] *= seed % 2  # every second picture lacks a colour
+    return (65535 * one * lights[:, None, None]).astype(np.uint16)
 
 
 def knock(file: Path, messages: list[bytes]) -> None:

@@ -16,10 +16,11 @@ from firmware_iface.virtual.remote_hardware import RemoteHardware, i2c_bus
 from runtime.service.client import Client, LostFrame, RefusedError
 from runtime.service.protocol import LaserState, PartState, Shown
 from tests.campaigns.headset import ENVIRONMENT, connected, hardware, picture, urgent, write_configuration
-from tests.campaigns.service import noted
+from tests.campaigns.service import noted, noted_fields
 
 PICTURES = 16
 REFRESH_HZ, SOLVE_MS, STALE_MS = 100.0, 3.0, 80.0
+COLOURS_HZ, COLOURS_MS = 50.0, 3.0  # of pictures in three colours, and time for their patterns
 RECOVERY_S = 15.0
 LOST_FOR_S = 1.0  # without the safety controller, before a person looks at the laser board
 
@@ -34,6 +35,9 @@ class Lane:
     oak : str or None
         Loopback address of an emulated OAK camera; None: the camera without a link.
     refresh_hz : float, Hz
+        Of pictures in one colour.
+    colours : bool
+        Whether it shows three colours in turn.
 
     Attributes
     ----------
@@ -51,11 +55,18 @@ class Lane:
     """
 
     def __init__(
-        self, folder: Path, seed: int, oak: str | None = None, refresh_hz: float = REFRESH_HZ
+        self,
+        folder: Path,
+        seed: int,
+        oak: str | None = None,
+        refresh_hz: float = REFRESH_HZ,
+        colours: bool = False,
     ) -> None:
         self.folder, self.seed = folder, seed
         solve_ms = min(SOLVE_MS, 300 / refresh_hz)
-        self.file = write_configuration(folder, refresh_hz, solve_ms, STALE_MS, oak)
+        if colours:
+            refresh_hz, solve_ms = COLOURS_HZ, COLOURS_MS
+        self.file = write_configuration(folder, refresh_hz, solve_ms, STALE_MS, oak, colours)
         self.accepted = self.shown = self.lost = 0
         self.outcomes: list[Shown | LostFrame] = []
         self.latest = self.stored = 0
@@ -183,6 +194,15 @@ class Lane:
         """How many different images the panel has displayed that are no pattern of the solver's."""
         blank = np.zeros(self.client.shape[1:], np.uint8)
         return len(self.remote.whole() - noted(self.folder) - {_crc(blank)})
+
+    def lit_fields(self) -> int:
+        """How many different fields the panel has displayed with light."""
+        return len(self.remote.lit())
+
+    def wrongly_lit(self) -> int:
+        """How many different fields had light that was not their own, or were no pattern of the solver's."""
+        lit = self.remote.lit()
+        return len(lit - noted_fields(self.folder)) if lit else 0
 
 
 def _words(pid: str) -> str:

@@ -1,6 +1,7 @@
 """The service, unchanged, with a solver that also records its patterns: `python -m tests.campaigns.service CONFIG`.
 
-The panel's frames are compared with this record: CRC-32 by CRC-32, written before the service gets the pattern.
+The panel's frames are compared with this record: CRC-32 by CRC-32, written before the service gets the pattern. So are
+its fields and the light that each of them had, where colours are shown in turn.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from runtime.service.frame_solver import Pattern
 from runtime.service.shared_memory import crc32
 from runtime.service.supervisor import Supervisor
 
-NOTES = "patterns.crc"
+NOTES, FIELDS = "patterns.crc", "fields.crc"
 
 
 def noted(folder: Path) -> set[int]:
@@ -26,14 +27,26 @@ def noted(folder: Path) -> set[int]:
     return {int.from_bytes(data[k : k + 4], "little") for k in range(0, len(data), 4)}
 
 
+def noted_fields(folder: Path) -> set[tuple[int, int]]:
+    """(CRC-32, mask of the lasers that may shine on it) of every pattern of a picture in several colours."""
+    data = (folder / FIELDS).read_bytes()
+    return {(int.from_bytes(data[k : k + 4], "little"), data[k + 4]) for k in range(0, len(data), 5)}
+
+
 def solve(fd: str, configuration: str) -> None:
     """The solver's process."""
-    notes = os.open(Path(configuration).with_name(NOTES), os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+    notes, fields = (
+        os.open(Path(configuration).with_name(name), os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+        for name in (NOTES, FIELDS)
+    )
     publish = solver_process.Worker.publish
 
     def note(worker: solver_process.Worker, job: object, pattern: Pattern, began_ns: int) -> None:
         for field in pattern.gray:
             os.write(notes, crc32(field).to_bytes(4, "little"))
+        for laser, (field, light) in enumerate(zip(pattern.gray, pattern.brightness, strict=False)):
+            if light > 0:  # the colours are in the order of the board's lasers
+                os.write(fields, crc32(field).to_bytes(4, "little") + bytes([1 << laser]))
         publish(worker, job, pattern, began_ns)  # type: ignore[arg-type]
 
     solver_process.Worker.publish = note  # type: ignore[method-assign,assignment]

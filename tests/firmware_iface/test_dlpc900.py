@@ -14,6 +14,7 @@ from firmware_iface.panel import Panel, open_dlpc900, run_length_encoding
 from firmware_iface.panel import phase_light_modulator as plm
 from firmware_iface.panel.dlpc900 import PatternUpload
 from firmware_iface.panel.dlpc900_commands import Dlpc900Control, parse_answer
+from firmware_iface.panel.fields import Field, FieldPanel, colours_in_turn
 from firmware_iface.panel.phase_light_modulator import P47, P67, Modulator
 from firmware_iface.virtual.usb import Dlpc900Model, VirtualUsb
 from firmware_iface.virtual.usb.run_length_decoding import CommandError, decode_image
@@ -254,3 +255,47 @@ def test_exposures_that_the_controller_cannot_do_are_refused() -> None:
     for exposure in (104, 1 << 24):
         with pytest.raises(InputError, match="105"):
             open_dlpc900(backend=VirtualUsb(small_model()), exposure_us=exposure)
+
+
+def test_the_bytes_of_colours_in_turn() -> None:
+    """LED enables to the sequencer; lines of the table with their colours, darkness and trigger output 2."""
+    bus = Transcript(Dlpc900Model((2, 4)), longest=64)
+    panel = open_dlpc900(modulator=Modulator((1, 2), P47.electrodes), backend=bus, exposure_us=4000, fields=3)
+    assert isinstance(panel, FieldPanel) and panel.field_us == 4000 and panel.fields == 3
+
+    def sent() -> list[bytes]:
+        return [bytes.fromhex(line[5:])[2:] for line in bus.lines if line.startswith("01 >")]
+
+    assert [p[:5].hex(" ") for p in sent() if p[2:4] == b"\x07\x1a"] == ["03 00 07 1a 08"]
+    gray = np.array([[0, 240]], np.uint8)
+    begun = len(sent())
+    panel.show_fields(
+        [Field(gray, 1, 0, 2000), Field(gray, 2, 1000, 600), Field(gray, 4, 0, 100), Field(gray, 0, 0, 0)]
+    )
+    lines = [p[4:16].hex(" ") for p in sent()[begun:] if p[2:4] == b"\x34\x1a"]
+    assert lines == [
+        "00 00 d0 07 00 11 d0 07 00 00 00 00",  # red, 2000 us of 4000, trigger output 2
+        "01 00 58 02 00 21 48 0d 00 01 00 08",  # green, 600 us; no trigger; bit 1
+        "02 00 69 00 00 01 37 0f 00 01 00 10",  # too short to be exposed: no colour
+        "03 00 69 00 00 01 37 0f 00 01 00 18",
+    ]
+    assert [p[4:10].hex(" ") for p in sent()[begun:] if p[2:4] == b"\x31\x1a"] == ["04 00 00 00 00 00"]
+
+
+def test_each_colour_is_enabled_in_its_own_field_alone() -> None:
+    model = small_model()
+    panel = open_dlpc900(modulator=SMALL, backend=VirtualUsb(model), exposure_us=5000, fields=3)
+    assert isinstance(panel, FieldPanel)
+    grays = np.stack([pattern(seed) for seed in range(3)])
+    panel.show_fields(colours_in_turn(grays, [2, 0, 1], [1.0, 0.4, 0.0], panel.field_us))
+    assert [model.leds(k) for k in range(3)] == [4, 1, 0]
+    for k, gray in enumerate(grays):
+        np.testing.assert_array_equal(model.plane(k), plm.bit_plane(gray, SMALL))
+        entry = model.entries[k]
+        assert entry.exposure_us + entry.dark_us == 5000 and entry.trigger_2 == (k == 0)
+    panel.close()
+    assert [model.leds(k) for k in range(3)] == [0, 0, 0]
+    with pytest.raises(InputError, match="display link"):
+        open_dlpc900(1, backend=VirtualUsb(model), fields=3)
+    with pytest.raises(InputError, match="lasers 0 to 2"):
+        panel.show_fields([Field(grays[0], 8, 0, 1000)])

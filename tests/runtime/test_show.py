@@ -68,6 +68,69 @@ def test_each_pattern_is_seen_by_the_camera(
         assert one["brightest_counts"] == counts.max() and one["saturated_share"] < 0.05
 
 
+COLOUR = (
+    BENCH
+    + """
+[[channel]]
+name = "red"
+wavelength_nm = 638.0
+[[channel]]
+name = "green"
+wavelength_nm = 520.0
+[[channel]]
+name = "blue"
+wavelength_nm = 450.0
+[camera]
+bit_depth = 16
+"""
+)
+
+
+@pytest.mark.parametrize("emulated", [False, True])
+def test_colours_in_turn_are_seen_together(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, emulated: bool
+) -> None:
+    """The camera's picture is the sum of the colours, each of its own pattern, for a sixth of the time."""
+    bench = tmp_path / "bench.toml"
+    bench.write_text(COLOUR, encoding="utf-8")
+    colours, paths, grays = ["red", "green", "blue"], [], []
+    for name in colours:
+        grays.append(np.random.default_rng(len(name)).integers(0, 256, (48, 64), dtype=np.uint8))
+        paths.append(tmp_path / f"picture-{name}.png")
+        Image.fromarray(grays[-1]).save(paths[-1])
+    words = ["show", *paths, "--in-turn", ",".join(colours), "--headset", bench, "--exposure-ms", 16.66]
+    words += ["--out", tmp_path / "seen", "--json", *(["--emulated"] if emulated else [])]
+    code, result, err = run(capsys, *words)
+    assert code == 0 and not err, err
+    assert result["channel"] == "red,green,blue"
+    (one,) = result["shown"]
+    assert one["fields"] == {name: str(path) for name, path in zip(colours, paths, strict=True)}
+    assert one["seen"] == str(tmp_path / "seen" / "picture-red-seen.png")
+    truth = open_headset(str(bench))
+    black = truth.description.camera.black_level
+    expected = sum(truth.expected_counts(g, c) - black for g, c in zip(grays, colours, strict=True))
+    counts = seen(one["seen"])
+    expected = expected * 16.66 / 10 / 6
+    if counts.max() <= 1023:  # an OAK's ten bits
+        expected, black = expected / 64, black / 64
+    assert np.corrcoef(counts.ravel(), np.asarray(expected).ravel())[0, 1] > 0.97
+    assert counts.mean() - black == pytest.approx(np.mean(expected), rel=0.05)
+
+
+def test_patterns_that_are_no_pictures_of_these_colours_are_refused(
+    capsys: pytest.CaptureFixture[str], bench: Path, patterns: list[Path]
+) -> None:
+    for words, message in (
+        ((*patterns, patterns[0], "--in-turn", "red,green"), "needs 2 patterns a picture, and 3 are given"),
+        ((*patterns, "--in-turn", "red"), "not several colours"),
+        ((*patterns, "--in-turn", "red,red"), "not several colours"),
+        ((*patterns, "--in-turn", "green,blue"), "there is no laser 'blue'"),
+        ((*patterns, "--in-turn", "green,blue", "--channel", "green"), "not allowed with"),
+    ):
+        code, _, err = run(capsys, "show", *words, "--headset", bench)
+        assert code == 2 and message in err and err.count("\n") == 1, err
+
+
 def test_what_cannot_be_shown_says_why(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, bench: Path, patterns: list[Path]
 ) -> None:

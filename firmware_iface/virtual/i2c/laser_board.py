@@ -1,7 +1,8 @@
 """The emulated laser board: its parts on the bus, three laser diodes, and the light that they emit.
 
-DAC -> limiter of the safety controller -> laser-diode controller (50 mA/V, enabled by the gate and by a pin of the
-expander) -> diode -> photodiode -> converter, whose ALERT goes back to the safety controller.
+DAC -> limiter of the safety controller -> laser-diode controller (50 mA/V, enabled by the gate, by a pin of the
+expander and by the panel's light output) -> diode -> photodiode -> converter, whose ALERT goes back to the safety
+controller. A photodiode's amplifier holds what it saw while the panel keeps its laser dark.
 """
 
 from __future__ import annotations
@@ -74,6 +75,8 @@ class LaserBoard:
         Called with (time s, {laser: µW}) whenever the light changes.
     faults : Faults or None
         Script of the bus.
+    gates : callable
+        Gives the panel's light outputs that are open, bit k for laser k. Without a panel, all.
 
     Attributes
     ----------
@@ -92,8 +95,11 @@ class LaserBoard:
         clock: Callable[[], float] = time.monotonic,
         emission: Callable[[float, dict[str, float]], None] = lambda time_s, power_uw: None,
         faults: Faults | None = None,
+        gates: Callable[[], int] = lambda: 0b111,
     ) -> None:
-        self._clock, self._emission = clock, emission
+        self._clock, self._emission, self.gates = clock, emission, gates
+        self._held_v = [0.0] * 3
+        self._open = 0  # the panel's light outputs, as of the last time that everything was settled
         self.bus = I2cBus(self.settle, faults)
         self._key = self._interlock = False
         self._celsius = 25.0
@@ -128,6 +134,7 @@ class LaserBoard:
         with self.bus.lock:
             if self.bus.faults.standing("unplug"):
                 self._power_on()
+            self._open = self.gates()
             self.thermometer.settle()
             self.controller.settle()
             self.converter.settle()  # after the limiter has come this far
@@ -146,6 +153,10 @@ class LaserBoard:
 
     def power_uw(self, laser: int) -> float:
         """Light of one laser, 0 to 2, µW."""
+        return self._driven_uw(laser) if self._open >> laser & 1 else 0.0
+
+    def _driven_uw(self, laser: int) -> float:
+        """Light that a laser makes where the panel's light output lets it, µW."""
         enabled = self.expander.registers[0] >> laser & 1 == 0 and self.expander.pins() >> laser & 1
         if not (self.controller.gate and enabled):
             return 0.0
@@ -203,7 +214,10 @@ class LaserBoard:
         """Voltage from a photodiode, V."""
         if self._photodiode_broken[laser]:
             return 0.0
-        return self.power_uw(laser) * self.diodes[laser].photodiode_v_per_uw
+        driven_uw = self._driven_uw(laser)
+        if driven_uw == 0 or self._open >> laser & 1:
+            self._held_v[laser] = driven_uw * self.diodes[laser].photodiode_v_per_uw
+        return self._held_v[laser]
 
     def hot(self) -> bool:
         """The thermometer's ALERT."""

@@ -37,12 +37,15 @@ _HEIGHT |= {11: 0.3274, 10: 0.361, 9: 0.4204, 8: 0.5046, 15: 0.5916, 14: 0.673, 
 
 @dataclass(frozen=True)
 class PatternEntry:
-    """One line of the pattern table."""
+    """One line of the pattern table; `colours` are the LED enables that are active during its exposure."""
 
     exposure_us: int
     bits: int
     image: int
     position: int
+    colours: int = 0b111
+    dark_us: int = 0
+    trigger_2: bool = True
 
 
 class Dlpc900Model(UsbModel):
@@ -70,6 +73,8 @@ class Dlpc900Model(UsbModel):
         (H, W), mirrors.
     power, mode : int
     running : bool
+    led_enables : int
+        As command 0x1A07 sets it: bit 3 follows the pattern table, else bits 0 to 2 are red, green and blue.
     entries : dict of int to PatternEntry
     images : dict of (int, int) to uint32 array
         By image and controller, as loaded.
@@ -125,7 +130,15 @@ class Dlpc900Model(UsbModel):
             image = np.hstack([self.images[entry.image, side] for side in range(self._controllers)])
         return (image >> entry.position & 1).astype(np.uint8)
 
+    def leds(self, number: int) -> int:
+        """LED enables, bit 0 red, 1 green, 2 blue, during the exposure of pattern `number` of the table."""
+        with self._lock:
+            if not self.present or not self.running or self.power:
+                return 0
+            return self.entries[number].colours if self.led_enables & 8 else self.led_enables & 7
+
     def on_reset(self) -> None:
+        self.led_enables = 8
         self.power = self.mode = self.error = self.commands = 0
         self.running = False
         self.entries: dict[int, PatternEntry] = {}
@@ -178,6 +191,7 @@ class Dlpc900Model(UsbModel):
             0x0205: struct.pack("<4I", 0x06000000, 0, 0, 0),
             0x0206: b"\x02DLPC900 model\0",
             0x1100: bytes(6),
+            0x1A07: bytes([self.led_enables]),
             0x1A0A: b"\x01",
             0x1A0B: b"\x01",
             0x1A0C: bytes([main]),
@@ -196,6 +210,8 @@ class Dlpc900Model(UsbModel):
                     self.power = _within(data[0], 1)
             case 0x0201 | 0x1100 | 0x1A00 | 0x1A01 | 0x1A03:
                 pass
+            case 0x1A07:
+                self.led_enables = _within(data[0], 15)
             case 0x1A1B:
                 if self.running:
                     raise CommandError(5)
@@ -224,7 +240,16 @@ class Dlpc900Model(UsbModel):
             raise CommandError(15)
         if exposure_us < 105:
             raise CommandError(14)
-        self.entries[index] = PatternEntry(exposure_us, (options >> 1 & 7) + 1, where & 0x7FF, where >> 11)
+        dark_us = int.from_bytes(data[6:9], "little")
+        self.entries[index] = PatternEntry(
+            exposure_us,
+            (options >> 1 & 7) + 1,
+            where & 0x7FF,
+            where >> 11,
+            options >> 4 & 7,
+            dark_us,
+            not data[9] & 1,
+        )
 
     def _load(self, side: int, data: bytes) -> None:
         if side not in self._loading:

@@ -11,8 +11,11 @@ from firmware_iface.errors import InputError
 from firmware_iface.lasers.eye_safety import (
     ALL_IN_ONE_SPOT,
     SIZES_MRAD,
+    GatedLight,
     exposure,
+    largest_pulsed_mrad,
     photochemical_limit_uw,
+    pulse_limit_uw,
     spot_shares,
     thermal_limit_uw,
 )
@@ -82,3 +85,46 @@ def test_the_hot_spots_of_all_colours_are_taken_to_coincide() -> None:
 def test_what_is_no_picture_is_refused(picture: np.ndarray, pitch: float) -> None:
     with pytest.raises(InputError):
         spot_shares(picture, pitch)
+
+
+def test_fields_in_turn_use_their_sum_over_the_frame() -> None:
+    """Each laser at the limit of a point source would be three times too much at once, and is just allowed in turn."""
+    full = {"red": 390.0, "green": 390.0, "blue": 0.0, "more": 390.0}
+    nm = NM | {"more": 600.5}
+    assert exposure(full, nm).thermal == pytest.approx(3)
+    in_turn = GatedLight(duty=1 / 3, pulse_s=0.005, frame_s=0.015)
+    assert exposure(full, nm, gated=in_turn).thermal == pytest.approx(1)
+    found = exposure({"red": 130.0, "green": 130.0, "blue": 13.0}, NM, gated=GatedLight(1 / 6, 0.002, 0.012))
+    assert found.thermal == pytest.approx(273 / 390 / 6)
+    assert found.photochemical == pytest.approx((13 / 39 + 130 / 979.6) / 6, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("mrad", "pulse_s", "mw"),
+    [
+        (1.5, 0.25, 0.99),  # the limit of 1 mW for a quarter of a second
+        (1.5, 0.004, 2.783),  # 7e-4 t^-0.25
+        (5.0, 0.004, 2.783 * 5 / 1.5),
+        (10.0, 0.004, 0.2 * 2.783 * 10 / 1.5),
+        (100.0, 0.004, 0.2 * 2.783 * 12.649 / 1.5),  # as large as 200 t^0.5 mrad at most
+        (1.5, 1e-9, 14.80),  # counts as 5 us
+    ],
+)
+def test_a_pulse_has_a_limit_of_its_own(mrad: float, pulse_s: float, mw: float) -> None:
+    assert pulse_limit_uw(mrad, pulse_s) == pytest.approx(1e3 * mw, rel=1e-3)
+    assert largest_pulsed_mrad(0.004) == pytest.approx(12.649, rel=1e-3)
+
+
+def test_a_short_bright_pulse_is_limited_by_itself_and_not_by_the_mean() -> None:
+    rare = GatedLight(duty=0.004, pulse_s=0.004, frame_s=1.0)
+    found = exposure({"red": 3000.0}, NM, gated=rare)
+    # a source of 6.1 mrad bears the least: 0.2 * 6.1 / 1.5 of what a point bears
+    assert found.worst == found.thermal == pytest.approx(3.0 / 2.783 / (0.2 * SIZES_MRAD[4] / 1.5), rel=1e-3)
+    spread = exposure({"red": 3000.0}, NM, {"red": (0.02,) * len(SIZES_MRAD)}, rare)
+    assert spread.thermal < found.thermal
+
+
+@pytest.mark.parametrize(("duty", "pulse_s", "frame_s"), [(0, 1, 1), (1.1, 1, 1), (0.5, 0, 1), (0.5, 2, 1)])
+def test_gated_light_that_cannot_be_is_refused(duty: float, pulse_s: float, frame_s: float) -> None:
+    with pytest.raises(InputError, match="within the frame"):
+        GatedLight(duty, pulse_s, frame_s)

@@ -26,6 +26,7 @@ def test_every_kind_of_fault_is_survived() -> None:
         "dark_in_time",
         "worst_dark_ms",
         "torn_frames",
+        "wrongly_lit_fields",
         "lost_without_error",
         "recovered",
         "not_recovered",
@@ -33,6 +34,7 @@ def test_every_kind_of_fault_is_survived() -> None:
     assert found["faults"] == found["recovered"] == sum(found["by_kind"].values()) == 68, result.troubles
     assert set(found["by_kind"]) == {kind.name for kind in KINDS}
     assert found["torn_frames"] == found["lost_without_error"] == found["not_recovered"] == 0
+    assert found["wrongly_lit_fields"] == 0 and result.lit_fields > 30
     assert found["dark_required"] > 30
     # a busy machine may delay it by some milliseconds; the table in the README was measured on an idle one
     assert found["dark_in_time"] >= 0.9 * found["dark_required"]

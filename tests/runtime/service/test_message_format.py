@@ -22,7 +22,8 @@ VALUES = {
     "Q": st.integers(0, 2**64 - 1),
     "f": st.floats(width=32, allow_nan=False),
     "8s": st.binary(min_size=8, max_size=8),
-    "52s": st.binary(min_size=52, max_size=52),
+    "156s": st.binary(min_size=156, max_size=156),
+    "12s": st.binary(min_size=12, max_size=12),
     "240s": st.text(max_size=59).filter(lambda text: "\0" not in text),
 }
 
