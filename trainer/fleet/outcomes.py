@@ -40,9 +40,12 @@ def outcomes(
     left = list(range(len(tasks)))
     suspects: list[int] = []
     while left:
+        before = len(left)
         with open_pool(workers, cluster) as pool:
             at_once = len(tasks) if cluster is not None else pool.workers
             yield from _ended(pool, function, tasks, left, at_once, suspects)
+        if len(left) == before:
+            raise InputError(LOST)
     for k in suspects:
         lost: list[int] = []
         with open_pool(2) as pool:  # one alone would be this process
@@ -81,5 +84,6 @@ def _ended(
             except CancelledError:
                 raise InputError(CLUSTER_LOST) from None
             except Exception as error:
-                outcome = error
+                killed = type(error).__name__ == "KilledWorker"  # Dask's, which need not be installed
+                outcome = InputError(LOST) if killed else error
             yield k, outcome
