@@ -20,6 +20,7 @@ from trainer.effects.definition import Parameter
 from trainer.effects.effect_catalogue import Catalogue, catalogue
 from trainer.fitting.pool import open_pool
 from trainer.fleet.recalibration import recalibrate
+from trainer.fleet.set_facts import time_of
 from trainer.fleet.set_result import FittedNumber, SetFacts, SetResult
 from trainer.model.model import EffectInstance, Model
 from trainer.model.model_file import read_model
@@ -65,6 +66,7 @@ def failed(task: SetTask, error: Exception) -> SetResult:
 
 def _result(task: SetTask) -> SetResult:
     captures = opened(Path(task.facts.folder))
+    time_of(captures)  # which says what is wrong with it
     known = catalogue(task.effects)
     warnings = _warnings(captures)
     found = SetResult(
