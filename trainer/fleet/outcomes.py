@@ -12,7 +12,9 @@ from trainer.fitting.pool import Pool, open_pool
 T = TypeVar("T")
 
 LOST = "the process that worked on it has ended, as when memory runs out: use fewer --workers, or smaller captures"
-CLUSTER_LOST = "the Dask cluster is gone: start it again, and then the same command, which goes on from what is finished"
+CLUSTER_LOST = (
+    "the Dask cluster is gone: start it again, and then the same command, which goes on from what is finished"
+)
 
 
 def outcomes(

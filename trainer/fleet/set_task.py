@@ -113,9 +113,7 @@ def _warnings(captures: CaptureSet) -> tuple[str, ...]:
     InputError
         Where every number would be wrong, or no capture can be used.
     """
-    said = [
-        p.message for p in errors_unless_misread(captures.folder, ideal_irradiance) if p.kind != "dark"
-    ]
+    said = [p.message for p in errors_unless_misread(captures.folder, ideal_irradiance) if p.kind != "dark"]
     _, left_out = with_signal(captures)
     return (*said, *(f"left out capture {name} ({why})" for name, why in left_out.items()))
 
