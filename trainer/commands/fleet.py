@@ -205,10 +205,11 @@ COMMAND = Command(
     about="Explain or recalibrate many headsets' capture sets in one run; say which effects drift together.",
     description="""Explain or recalibrate many headsets' capture sets in one run; say which effects drift together.
 
-A set that fails costs only itself: its row of the table says what failed. After Ctrl-C, after a failure and with further
-folders, the same command goes on: it takes up what is finished and has not changed. A headset is told by the name in
-bench.toml, so give each its own; several sets of one name are one headset at several times. The time of a set is
-taken_at of its first row in captures.csv (such as 2026-03-01T14:30:00Z), otherwise that of its first picture's file.""",
+A set that fails costs only itself: its row of the table says what failed. After Ctrl-C, after a failure and with
+further folders, the same command goes on: it takes up what is finished and has not changed. A headset is told by the
+name in bench.toml, so give each its own; several sets of one name are one headset at several times. The time of a set
+is taken_at of its first row in captures.csv (such as 2026-03-01T14:30:00Z), otherwise that of its first picture's
+file.""",
     options=options,
     run=run,
     show=show,

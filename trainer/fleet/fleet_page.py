@@ -23,11 +23,12 @@ METHOD = (
     "effect. Over headsets, each headset's mean is one point; over time, each set is compared with its own headset's "
     "mean. Of parameters whose sign no capture can tell, the size is taken.",
     f"Correlations are Spearman's, with {100 * CONFIDENCE:.0f} % intervals after Bonett and Wright (2000); nothing is "
-    f"said of fewer than {LEAST} headsets, or {LEAST} sets beyond the first of each headset. Only numbers that spread by "
-    f"more than {VARIES:g} times their fits' error are compared, and of each two effects the pair that is surest is shown.",
-    "Two effects drift together where the interval, corrected for all pairs of numbers that were tried, lies beyond the "
-    "correlation that the fits' errors alone could make (the broad bar). That they do says nothing of the cause: a third "
-    "thing, such as temperature, may move both.",
+    f"said of fewer than {LEAST} headsets, or {LEAST} sets beyond the first of each headset. Only numbers that spread "
+    f"by more than {VARIES:g} times their fits' error are compared, and of each two effects the pair that is surest is "
+    "shown.",
+    "Two effects drift together where the interval, corrected for all pairs of numbers that were tried, lies beyond "
+    "the correlation that the fits' errors alone could make (the broad bar). That they do says nothing of the cause: "
+    "a third thing, such as temperature, may move both.",
 )
 VERDICTS = {"complete": "good", "missing": "warn", "incomplete": "warn", "outside_catalogue": "bad"}
 

@@ -71,8 +71,8 @@ def doubts(results: Sequence[SetResult], task: str) -> list[str]:
     by_file = sum(r.facts.time_from == "file" for r in done)
     if by_file:
         said.append(
-            f"The time of {by_file} of {len(done)} sets is that of their first picture's file, which copying may change; "
-            "a column taken_at in captures.csv says it for good."
+            f"The time of {by_file} of {len(done)} sets is that of their first picture's file, which copying may "
+            "change; a column taken_at in captures.csv says it for good."
         )
     alike = sorted({name for r in done for name, _ in r.indistinguishable})
     if alike:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
 from typing import Any, TypeVar
 
@@ -19,7 +19,7 @@ CLUSTER_LOST = (
 
 def outcomes(
     function: Callable[..., T], tasks: Sequence[tuple[Any, ...]], workers: int, cluster: str | None
-) -> Iterator[tuple[int, T | Exception]]:
+) -> Generator[tuple[int, T | Exception], None, None]:
     """(number of the task, what it returned or what it raised), as tasks end.
 
     A process of this machine that is lost takes others with it. Their tasks are done again, one at a time, so that a
