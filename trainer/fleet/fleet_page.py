@@ -133,15 +133,16 @@ def _varying(drifts: Sequence[Drift]) -> list[dict[str, str]]:
     ranked = sorted(both.values(), key=lambda d: min(one.error_share for one in d.values()))
     rows = []
     for found in ranked[:MOST_VARYING]:
-        over = found.get("headsets")
-        any_of = over or found["time"]
+        over, of_sets = found.get("headsets"), found.get("time")
+        one = over or of_sets
+        assert one is not None
         rows.append(
             {
-                "name": label(any_of.number),
+                "name": label(one.number),
                 "mean": number(float(over.values.mean())) if over else "–",
                 "headsets": number(over.spread) if over else "–",
-                "time": number(found["time"].spread) if "time" in found else "–",
-                "error": number(any_of.error, 2),
+                "time": number(of_sets.spread) if of_sets else "–",
+                "error": number((of_sets or one).error, 2),
             }
         )
     return rows

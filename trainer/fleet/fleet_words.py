@@ -11,13 +11,13 @@ from trainer.formatting import UNITLESS, listed, number, plain
 
 def label(one: FittedNumber) -> str:
     """The effect's and the number's name with the unit, for axes and tables."""
-    parts = [plain(one.parameter)]
+    parts = [] if one.parameter == one.effect else [plain(one.parameter)]
     if one.term is not None:
         parts.append(one.term_name or f"term {one.term}")
     if one.channel is not None:
         parts.append(one.channel)
     unit = "" if one.unit in UNITLESS else f" / {one.unit}"
-    return f"{plain(one.effect)}: {', '.join(parts)}{unit}"
+    return plain(one.effect) + (f": {', '.join(parts)}" if parts else "") + unit
 
 
 def drift_sentence(drift: Drift) -> str:
