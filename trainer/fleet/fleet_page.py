@@ -95,7 +95,7 @@ def _drift(drift: Drift, times: dict[str, Any]) -> dict[str, Any]:
     return {
         "title": f"What drifts together over {drift.over}",
         "sentence": drift_sentence(drift),
-        "about": "Each headset's mean is one point."
+        "about": "Each headset's mean departure is one point."
         if drift.over == "headsets"
         else "Each set is compared with the mean of its own headset, so differences between headsets play no part.",
         "pairs": pairs_chart(drift.pairs[:MOST_PAIRS]) if drift.pairs else None,
