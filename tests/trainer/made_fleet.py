@@ -14,7 +14,9 @@ from trainer.fleet.set_result import FittedNumber, SetFacts, SetResult
 START = datetime(2026, 1, 5, 9, tzinfo=UTC)
 
 
-def fitted(effect: str, parameter: str, value: float, error: float = 1e-3, absent: float = 0.0) -> FittedNumber:
+def fitted(
+    effect: str, parameter: str, value: float, error: float = 1e-3, absent: float = 0.0
+) -> FittedNumber:
     """A number of an effect, of no channel and term."""
     return FittedNumber(effect, "panel", parameter, None, None, None, value, error, absent, "1")
 
@@ -25,17 +27,15 @@ def result(headset: str, session: int, *numbers: FittedNumber, failed: str | Non
     facts = SetFacts(folder, headset, "bench.toml", START + timedelta(weeks=session), "captures.csv", "stamp")
     if failed:
         return SetResult(facts, failed)
-    return SetResult(
-        facts, None, None, "complete", 0.5, 2e-4, 0.04, (), numbers, (), "0" * 64, 8, 1.5
-    )
+    return SetResult(facts, None, None, "complete", 0.5, 2e-4, 0.04, (), numbers, (), "0" * 64, 8, 1.5)
 
 
 def set_of_bench(folder: Path, headset: str, seed: int, *defects: str, patterns: int = 4) -> Path:
     """A capture set of a simulated headset of 96 x 80 pixels with these defects (TOML lines after [[defect]])."""
-    bench = bench_file(folder, *defects)
-    bench.write_text(bench.read_text().replace('name = "bench"', f'name = "{headset}"'))
     where = folder / f"{headset}-{seed}"
-    acquire_from(str(bench), where, patterns=patterns, seed=seed)
+    acquire_from(str(bench_file(folder, *defects)), where, patterns=patterns, seed=seed)
+    known = where / "bench.toml"
+    known.write_text(known.read_text().replace('name = "virtual-bench"', f'name = "{headset}"'))
     return where
 
 

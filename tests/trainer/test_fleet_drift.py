@@ -117,7 +117,10 @@ def test_a_correlation_that_errors_could_make_does_not_count() -> None:
     results = []
     for h in range(4000):
         shared, a, b = RNG.standard_normal(3)
-        numbers = (fitted("warm", "size", a + 0.4 * shared, 0.4), fitted("cool", "size", b + 0.4 * shared, 0.4))
+        numbers = (
+            fitted("warm", "size", a + 0.4 * shared, 0.4),
+            fitted("cool", "size", b + 0.4 * shared, 0.4),
+        )
         results.append(result(f"unit-{h}", 0, *numbers))
     found = drift_of(results, "headsets", KNOWN).pairs[0]
     assert found.ci95[0] > 0  # beyond chance
@@ -137,13 +140,16 @@ def test_the_sign_of_a_parameter_that_no_capture_can_tell_plays_no_part() -> Non
 
 
 def test_one_wrong_fit_neither_makes_nor_hides_drift() -> None:
+    values = RNG.normal(size=(30, 2))
     independent = [
-        result(f"u{h}", 0, *(fitted(name, "size", v) for name, v in zip(("warm", "cool"), RNG.normal(size=2), strict=True)))
-        for h in range(30)
-    ]  # fmt: skip
+        result(f"u{h}", 0, fitted("warm", "size", a), fitted("cool", "size", b))
+        for h, (a, b) in enumerate(values)
+    ]
     wild = result("wild", 0, fitted("warm", "size", 1e4), fitted("cool", "size", 1e4))
     assert not drift_of([*independent, wild], "headsets", KNOWN).pairs[0].together
-    other = result("wild", 0, fitted("warm", "size", 1e4), fitted("cool", "size", 1e4), fitted("third", "size", 0))
+    other = result(
+        "wild", 0, fitted("warm", "size", 1e4), fitted("cool", "size", 1e4), fitted("third", "size", 0)
+    )
     assert pair(drift_of([*fleet(30, 1, 1, 0), other], "headsets", KNOWN), "warm", "cool").together
 
 
@@ -153,7 +159,8 @@ def test_among_many_independent_effects_few_fleets_show_any_pair() -> None:
     for seed in range(200):
         values = np.random.default_rng(seed).standard_normal((12, 6))
         results = [
-            result(f"u{h}", 0, *(fitted(f"e{k}", "size", v) for k, v in enumerate(row))) for h, row in enumerate(values)
+            result(f"u{h}", 0, *(fitted(f"e{k}", "size", v) for k, v in enumerate(row)))
+            for h, row in enumerate(values)
         ]
         drift = drift_of(results, "headsets", KNOWN)
         assert drift.tried == 15

@@ -65,6 +65,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     from trainer.effects.effect_catalogue import catalogue
     from trainer.fleet.drift import OVER, drift_of
     from trainer.fleet.fleet_run import plan, results_there, run_fleet, settings_of
+    from trainer.fleet.fleet_words import one_name
 
     known = catalogue(args.effects)  # what is wrong with a file of effects is wrong for every set
     settings = settings_of(args.model, args.effects)
@@ -76,6 +77,8 @@ def run(args: Namespace, screen: Screen) -> Result:
     except KeyboardInterrupt:
         raise Interrupted(_interrupted(args, settings)) from None
     _note_failures(results, screen)
+    if same := one_name(results):
+        screen.note(f"warning: {same}")
     if all(r.failed for r in results):
         raise InputError(f"none of {len(results)} sets could be used; the first: {results[0].failed}")
     drifts = [drift_of(results, over, known) for over in OVER]

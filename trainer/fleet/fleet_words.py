@@ -51,16 +51,22 @@ def _lacking(drift: Drift) -> str:
     return f"{drift.count} sets beyond the first of each headset, and it takes {LEAST}"
 
 
+def one_name(results: Sequence[SetResult]) -> str:
+    """What to change where all sets seem to be of one headset; "" where they are of several."""
+    names = [r.facts.headset for r in results if r.failed is None]
+    if len(names) < 2 or len(set(names)) > 1:
+        return ""
+    return (
+        f"All sets have the name {names[0]!r}, so they count as one headset at several times: if they are of several, "
+        "give each bench.toml a name of its own."
+    )
+
+
 def doubts(results: Sequence[SetResult], task: str) -> list[str]:
     """What a reader must know before believing the page."""
     done = [r for r in results if r.failed is None]
-    said = []
-    names = {r.facts.headset for r in done}
-    if len(names) == 1 and len(done) > 1:
-        said.append(
-            f"All sets have the name {next(iter(names))!r}, so they count as one headset at several times: if they are "
-            "of several, give each bench.toml a name of its own."
-        )
+    same = one_name(results)
+    said = [same] if same else []
     left = sum(r.verdict != "complete" for r in done)
     if left:
         where = "explain them" if task == "recalibrate" else "see their verdicts"
