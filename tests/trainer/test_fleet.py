@@ -15,7 +15,7 @@ import pytest
 
 from firmware_iface.errors import InputError
 from tests.trainer.hidden import ran
-from tests.trainer.made_fleet import drifting, fitted, result, set_of_bench
+from tests.trainer.made_fleet import column_added, drifting, fitted, result, set_of_bench, start_model
 from trainer.captures.capture_set import opened, read_captures
 from trainer.cli import main
 from trainer.effects.effect_catalogue import catalogue
@@ -25,8 +25,6 @@ from trainer.fleet.outcomes import outcomes
 from trainer.fleet.set_facts import set_facts, time_of
 from trainer.fleet.set_result import SetResult
 from trainer.fleet.set_task import SetTask, failed
-from trainer.model.model import Model, absent, instance_with
-from trainer.model.model_file import write_model
 
 pandas = pytest.importorskip("pandas")
 pytest.importorskip("pyarrow")
@@ -52,15 +50,7 @@ def headsets(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 @pytest.fixture(scope="module")
 def model(headsets: list[Path]) -> Path:
     """A model with the three effects, at values of no headset."""
-    bench = read_captures(headsets[0]).bench
-    known = catalogue()
-    start = (
-        Model(bench).having(absent(known["distance"], bench)).having(absent(known["phase_response"], bench))
-    )
-    leak = instance_with(known["zero_order"], bench, {"leak_real": 0.05, "leak_imaginary": 0.1})
-    path = headsets[0].parent / "start.toml"
-    write_model(path, start.having(leak))
-    return path
+    return start_model(headsets[0].parent / "start.toml", headsets[0])
 
 
 # --- the numbers ---
@@ -117,7 +107,16 @@ def test_recalibrated_headsets_show_what_drifts_together(
     assert third["taken_up"] == HEADSETS + 1
 
 
-def test_a_set_is_explained_as_explain_does(tmp_path: Path, capsys: Any) -> None:
+def test_a_set_is_explained_as_explain_does(
+    tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = {
+        name: effect
+        for name, effect in catalogue().items()
+        if name in ("distance", "vignetting", "sensor_blur")
+    }
+    for module in ("effects.effect_catalogue", "fleet.set_task"):
+        monkeypatch.setattr(f"trainer.{module}.catalogue", lambda files=(): few)
     folder = set_of_bench(tmp_path, "unit-a", 3, 'kind = "distance"\noffset_mm = 0.15')
     found = ran(capsys, "fleet", folder, "--out", tmp_path / "t.parquet")
     assert found["verdicts"] == {"complete": 1}
@@ -126,6 +125,7 @@ def test_a_set_is_explained_as_explain_does(tmp_path: Path, capsys: Any) -> None
     assert [s["added"] for s in alone["steps"]] == [None, *row.effects]
     assert row.excess_before == pytest.approx(alone["steps"][0]["excess"], rel=1e-6)
     assert row.excess_after == pytest.approx(alone["steps"][-1]["excess"], rel=1e-3, abs=1e-7)
+    assert row.effects == ("distance",)
     offset = alone["effects"][0]["parameters"]["offset_mm"]
     (number,) = [n for n in row.numbers if n.parameter == "offset"]
     assert (number.value, number.error) == pytest.approx((offset["value"], offset["error"]), rel=1e-3)
@@ -167,10 +167,11 @@ def test_the_time_is_that_of_captures_csv_or_else_of_the_first_picture(
     time, where = time_of(captures)
     assert (time.isoformat(), where) == ("2023-11-14T22:13:20+00:00", "file")
     path = folder / "captures.csv"
-    lines = path.read_text().splitlines()
+    without = path.read_text()
 
     def taken(text: str) -> None:
-        path.write_text("\n".join([lines[0] + ",taken_at", *(f"{line},{text}" for line in lines[1:])]) + "\n")
+        path.write_text(without)
+        column_added(path, "taken_at", text)
 
     taken("2026-03-01T14:30:00+01:00")
     time, where = time_of(read_captures(folder))
@@ -330,14 +331,11 @@ ENDS = "__import__('os')._exit(1)"
 ONCE = ENDS + " if not __import__('os').path.exists({0!r}) and not open({0!r}, 'w').close() else {1}"
 
 
-def test_a_process_that_dies_costs_its_task_alone(tmp_path: Path) -> None:
-    tasks = [(f"{k} * {k}",) for k in range(6)]
-    tasks[1] = (ONCE.format(str(tmp_path / "once"), 1),)  # another run of it works
-    tasks[3] = (ENDS,)
-    found = dict(outcomes(eval, tasks, 2, None))
-    assert {k: v for k, v in found.items() if k != 3} == {0: 0, 1: 1, 2: 4, 4: 16, 5: 25}
-    assert isinstance(found[3], InputError)
-    assert "fewer --workers" in str(found[3])
+def test_a_process_that_dies_costs_its_task_alone() -> None:
+    beside = "__import__('time').sleep(2) or 7"  # under way when the other one dies, and done again
+    found = dict(outcomes(eval, [(beside,), (ENDS,), ("2 * 2",)], 2, None))
+    assert isinstance(found.pop(1), InputError)
+    assert found == {0: 7, 2: 4}
 
 
 @pytest.fixture(scope="module")
