@@ -3,10 +3,10 @@
     python -m tests.campaigns.fleet                            # 20 headsets, each 10 times: some minutes on two cores
     python -m tests.campaigns.fleet --headsets 12 --sessions 2 --json
 
-The headsets are simulated, of 96 x 80 pixels, with a distance and a phase's gain that drift together, over headsets and
-from session to session, and a leak that drifts for itself. One model is fitted again to each set (`fleet --model`). When a
-quarter is done, one of the cluster's two workers is killed; when half is done, the run gets Ctrl-C, and the same command
-is started again. The campaign fails (exit 1) unless every set is finished, nothing that was finished before the
+The headsets are simulated, of 96 x 80 pixels, with a distance and a phase's gain that drift together, over headsets
+and from session to session, and a leak that drifts for itself. One model is fitted again to each set (`fleet --model`).
+When a quarter is done, one of the cluster's two workers is killed; when half is done, the run gets Ctrl-C, and the same
+command is started again. The campaign fails (exit 1) unless every set is finished, nothing that was finished before the
 interruption was done again, and what drifts together is found, and nothing else.
 """
 

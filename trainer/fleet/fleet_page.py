@@ -162,7 +162,7 @@ def _set(result: SetResult) -> dict[str, Any]:
         "after": number(result.excess_after),
         "noise": percent(result.noise_nrmse),
         "effects": ", ".join(plain(e) for e in result.effects) or "–",
-        "seconds": f"{result.seconds:.0f}",
+        "seconds": f"{result.seconds:.1f}",
         "warnings": list(result.warnings),
     }
 
