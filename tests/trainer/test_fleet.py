@@ -315,6 +315,8 @@ def test_a_folders_own_model_comes_first(sets: list[Path], model: Path, tmp_path
     planned = fleet_run.plan(sets[:2], tmp_path / "t.parquet", settings, [], Path("own.toml"))
     assert [t.model for t in planned.tasks] == [Path("own.toml").absolute(), sets[1] / "own.toml"]
     assert planned.tasks[0].facts.stamp == ""  # there is none: the set fails, and says why
+    with pytest.raises(InputError, match="--model none.toml is not there, and in no set's folder either"):
+        fleet_run.plan(sets, tmp_path / "t.parquet", settings, [], Path("none.toml"))
 
 
 def test_when_no_set_can_be_used_it_is_one_sentence(tmp_path: Path, capsys: Any) -> None:

@@ -108,6 +108,11 @@ def plan(
     ----------
     model : Path or None
         A model to fit again; a file of that name inside a set's folder comes first, for that set.
+
+    Raises
+    ------
+    InputError
+        Where there is no such model for any set.
     """
     before = {r.facts.folder: r for r in there}
     named: dict[str, SetTask] = {}
@@ -115,6 +120,8 @@ def plan(
         own = _own_model(folder, model)
         facts = set_facts(folder, own)
         named.setdefault(facts.folder, SetTask(facts, own, tuple(p.absolute() for p in effects)))
+    if model is not None and not any(task.model and task.model.is_file() for task in named.values()):
+        raise InputError(f"--model {model} is not there, and in no set's folder either: give the path of a model")
     done = {
         name
         for name, task in named.items()
@@ -159,7 +166,7 @@ def run_fleet(planned: FleetRun, workers: int, cluster: str | None, progress: Pr
             with ctrl_c_waits():
                 write_table(planned.table, told(), planned.settings)
             also = f", {broken} failed" if broken else ""
-            progress(done / total, f"{done} of {total} sets{also}; last: {task.facts.headset}")
+            progress(done / total, f"{done} of {total} sets{also}; last: {Path(task.facts.folder).name}")
     return told()
 
 

@@ -68,6 +68,7 @@ def _result(task: SetTask) -> SetResult:
     captures = opened(Path(task.facts.folder))
     time_of(captures)  # which says what is wrong with it
     known = catalogue(task.effects)
+    model = None if task.model is None else read_model(task.model, known, captures.bench)
     warnings = _warnings(captures)
     found = SetResult(
         task.facts,
@@ -76,9 +77,9 @@ def _result(task: SetTask) -> SetResult:
         captures_sha256=captures.content_hash(),
         captures=len(captures),
     )
-    if task.model is None:
+    if model is None:
         return _explained(found, captures, known)
-    again = recalibrate(captures, read_model(task.model, known, captures.bench))
+    again = recalibrate(captures, model)
     return replace(
         found,
         verdict="complete" if again.complete else "incomplete",
