@@ -217,9 +217,6 @@ file.""",
     run=run,
     show=show,
     outputs=outputs,
-    examples=(
-        "fleet sets/* --out fleet.parquet --report fleet.html",
-        "fleet sets/* --model model.toml --cluster tcp://10.0.0.5:8786 --out fleet.parquet",
-    ),
+    examples=("fleet sets/* --model model.toml --out fleet.parquet --report fleet.html",),
     after="Read the table: python -c \"import pandas; print(pandas.read_parquet('fleet.parquet'))\"",
 )
