@@ -134,15 +134,14 @@ def _varying(drifts: Sequence[Drift]) -> list[dict[str, str]]:
     rows = []
     for found in ranked[:MOST_VARYING]:
         over, of_sets = found.get("headsets"), found.get("time")
-        one = over or of_sets
-        assert one is not None
+        any_of = next(iter(found.values()))
         rows.append(
             {
-                "name": label(one.number),
+                "name": label(any_of.number),
                 "mean": number(float(over.values.mean())) if over else "–",
                 "headsets": number(over.spread) if over else "–",
                 "time": number(of_sets.spread) if of_sets else "–",
-                "error": number((of_sets or one).error, 2),
+                "error": number((of_sets or any_of).error, 2),
             }
         )
     return rows

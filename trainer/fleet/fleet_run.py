@@ -121,7 +121,9 @@ def plan(
         facts = set_facts(folder, own)
         named.setdefault(facts.folder, SetTask(facts, own, tuple(p.absolute() for p in effects)))
     if model is not None and not any(task.model and task.model.is_file() for task in named.values()):
-        raise InputError(f"--model {model} is not there, and in no set's folder either: give the path of a model")
+        raise InputError(
+            f"--model {model} is not there, and in no set's folder either: give the path of a model"
+        )
     done = {
         name
         for name, task in named.items()
