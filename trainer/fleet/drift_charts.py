@@ -13,8 +13,8 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure
 
 from trainer.fleet.drift import Departures, DriftPair
-from trainer.fleet.fleet_words import label
-from trainer.formatting import number, plain
+from trainer.fleet.fleet_words import label, two_places
+from trainer.formatting import plain
 from trainer.report.chart_style import INK, MAIN, OTHER, PAPER, QUIET, STYLE, THIRD, new_chart, svg
 
 WIDE = 7.2  # inches
@@ -48,7 +48,7 @@ def pairs_chart(pairs: Sequence[DriftPair]) -> Markup:
         axes.tick_params(axis="y", length=0)
         axes.grid(axis="y", visible=False)
         axes.set_xlabel("rank correlation, 95 % interval")
-        said = ", ".join(f"{' and '.join(p.effects)} {number(p.correlation, 2)}" for p in pairs)
+        said = ", ".join(f"{' and '.join(p.effects)} {two_places(p.correlation)}" for p in pairs)
         return svg(
             figure, f"Rank correlation of each two effects with its interval, the surest first: {said}."
         )
@@ -69,7 +69,7 @@ def pair_chart(pair: DriftPair) -> Markup:
         axes.ticklabel_format(useOffset=False)
         what = "headsets" if one.over == "headsets" else "sets, from their headset's mean"
         text = f"{label(one.number)} against {label(other.number)}: {len(one.values)} {what}, "
-        return svg(figure, f"{text}rank correlation {number(pair.correlation, 2)}.")
+        return svg(figure, f"{text}rank correlation {two_places(pair.correlation)}.")
 
 
 def time_chart(pair: DriftPair, times: Mapping[str, datetime | None]) -> Markup | None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from trainer.fleet.drift import CONFIDENCE, LEAST, VARIES, Departures, Drift
 from trainer.fleet.drift_charts import effects_chart, pair_chart, pairs_chart, time_chart
-from trainer.fleet.fleet_words import correlation_text, doubts, drift_sentence, label
+from trainer.fleet.fleet_words import correlation_text, doubts, drift_sentence, label, two_places
 from trainer.fleet.set_result import SetResult
 from trainer.formatting import number, percent, plain
 from trainer.report.html_report import report_style, write_page
@@ -94,7 +94,6 @@ def _drift(drift: Drift, times: dict[str, Any]) -> dict[str, Any]:
     of_time = [chart for p in shown[:1] if (chart := time_chart(p, times)) is not None]
     return {
         "title": f"What drifts together over {drift.over}",
-        "sentence": drift_sentence(drift),
         "about": "Each headset's mean departure is one point."
         if drift.over == "headsets"
         else "Each set is compared with the mean of its own headset, so differences between headsets play no part.",
@@ -106,9 +105,9 @@ def _drift(drift: Drift, times: dict[str, Any]) -> dict[str, Any]:
             {
                 "first": label(p.first.number),
                 "second": label(p.second.number),
-                "correlation": number(p.correlation, 2),
-                "interval": f"{number(p.ci95[0], 2)} to {number(p.ci95[1], 2)}",
-                "by_error": number(p.by_error, 2),
+                "correlation": two_places(p.correlation),
+                "interval": " to ".join(map(two_places, p.ci95)),
+                "by_error": two_places(p.by_error),
                 "count": len(p.first.values),
                 "together": p.together,
             }

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from trainer.fleet.drift import LEAST, Drift, DriftPair
 from trainer.fleet.set_result import FittedNumber, SetResult
-from trainer.formatting import UNITLESS, listed, number, plain
+from trainer.formatting import UNITLESS, listed, plain
 
 
 def label(one: FittedNumber) -> str:
@@ -39,10 +39,13 @@ def drift_sentence(drift: Drift) -> str:
 
 def correlation_text(pair: DriftPair) -> str:
     """A correlation with its interval."""
-    low, high = pair.ci95
-    return (
-        f"rank correlation {number(pair.correlation, 2)}, 95 % interval {number(low, 2)} to {number(high, 2)}"
-    )
+    low, high = map(two_places, pair.ci95)
+    return f"rank correlation {two_places(pair.correlation)}, 95 % interval {low} to {high}"
+
+
+def two_places(value: float) -> str:
+    """A correlation as text."""
+    return f"{value:.2f}".replace("-", "−")
 
 
 def _lacking(drift: Drift) -> str:
