@@ -90,7 +90,8 @@ def read_table(path: Path) -> tuple[list[SetResult], dict[str, Any]]:
         f"--out {path} is there already and is no table of fleet: give another name, or --overwrite to replace it"
     )
     try:
-        table = parquet.read_table(path)
+        # As one piece: pyarrow opens a path more than once, and a run may replace the file in between.
+        table = parquet.read_table(pa.BufferReader(path.read_bytes()))
         about = json.loads((table.schema.metadata or {})[KEY])
         if about["fleet"] != FORMAT or not table.schema.equals(_schema(pa)):
             raise wrong
