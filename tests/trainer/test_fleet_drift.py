@@ -11,9 +11,10 @@ import pytest
 
 from tests.trainer.made_fleet import fitted, result
 from trainer.effects.effect_catalogue import catalogue
-from trainer.fleet.drift import LEAST, Drift, DriftPair, drift_of, interval, spearman
+from trainer.fleet.drift import LEAST, Drift, DriftPair, drift_of
 from trainer.fleet.fleet_page import write_page_of_fleet
 from trainer.fleet.fleet_words import doubts, drift_sentence
+from trainer.fleet.rank_correlation import interval, spearman
 from trainer.fleet.set_result import SetResult
 
 KNOWN = catalogue()

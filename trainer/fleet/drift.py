@@ -15,21 +15,18 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from statistics import NormalDist
 from typing import Any
 
 import numpy as np
-from scipy.stats import rankdata
 
 from trainer.effects.effect_catalogue import Catalogue
+from trainer.fleet.rank_correlation import Array, interval, spearman
 from trainer.fleet.set_result import FittedNumber, SetResult
 
 LEAST = 10  # headsets, or departures from headsets' means that are free to vary
 VARIES = 2.0  # times its error: from here on a number's spread is more than its error
 MOST_NUMBERS = 6  # of an effect, those that vary most; more pairs would only widen the intervals of all
-CONFIDENCE = 0.95
 
-Array = np.ndarray
 ByHeadset = dict[str, list[tuple[str, float, float]]]  # folder, departure from the absent value, error
 OVER = ("headsets", "time")
 
@@ -272,38 +269,10 @@ def _pair(first: Departures, second: Departures, tried: int) -> DriftPair:
     # Over time, as many as there would be of one headset.
     count = first.free + (first.over == "time")
     by_error = math.sqrt(first.error_share * second.error_share)
-    low, high = interval(r, count, CONFIDENCE, tried)
+    low, high = interval(r, count, tried=tried)
     return DriftPair(
         first, second, r, interval(r, count), by_error, together=low > by_error or high < -by_error
     )
-
-
-def spearman(first: Array, second: Array) -> float:
-    """Spearman's rank correlation of two arrays [n]; 0 where one of them does not vary."""
-    ranks = [rankdata(a) - (len(a) + 1) / 2 for a in (first, second)]
-    size = math.sqrt(float((ranks[0] ** 2).sum() * (ranks[1] ** 2).sum()))
-    return float((ranks[0] * ranks[1]).sum()) / size if size > 0 else 0.0
-
-
-def interval(r: float, count: int, confidence: float = CONFIDENCE, tried: int = 1) -> tuple[float, float]:
-    """Two-sided interval of a rank correlation.
-
-    Parameters
-    ----------
-    r : float
-    count : int
-        Pairs of values, more than 3.
-    tried : int
-        Correlations that were looked at, for Bonferroni's correction.
-
-    References
-    ----------
-    Bonett and Wright 2000.
-    """
-    most = 1 - 1 / count**2  # few ranks can be in perfect order by chance
-    z = math.atanh(min(max(r, -most), most))
-    width = NormalDist().inv_cdf(1 - (1 - confidence) / (2 * tried)) * math.sqrt((1 + r**2 / 2) / (count - 3))
-    return math.tanh(z - width), math.tanh(z + width)
 
 
 def _named(number: FittedNumber) -> dict[str, Any]:

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from trainer.fleet.drift import CONFIDENCE, LEAST, VARIES, Departures, Drift
+from trainer.fleet.drift import LEAST, VARIES, Departures, Drift
 from trainer.fleet.drift_charts import effects_chart, pair_chart, pairs_chart, time_chart
 from trainer.fleet.fleet_words import correlation_text, doubts, drift_sentence, label, two_places
+from trainer.fleet.rank_correlation import CONFIDENCE
 from trainer.fleet.set_result import SetResult
 from trainer.formatting import number, percent, plain
 from trainer.report.html_report import report_style, write_page
