@@ -6,6 +6,7 @@ import json
 import math
 import os
 import shutil
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -325,6 +326,16 @@ def test_when_no_set_can_be_used_it_is_one_sentence(tmp_path: Path, capsys: Any)
     said = capsys.readouterr().err.splitlines()[-1]
     assert "none of 1 sets could be used" in said
     assert "bench.toml" in said
+
+
+def test_without_pyarrow_it_is_one_sentence_before_any_work(
+    sets: list[Path], worked: Stub, tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    done = worked()
+    assert main(["fleet", *map(str, sets), "--out", str(tmp_path / "t.parquet"), "--overwrite"]) == 2
+    assert capsys.readouterr().err.splitlines()[-1].endswith("pip install 'hololoop[cluster]'")
+    assert done == []
 
 
 # --- lost workers ---

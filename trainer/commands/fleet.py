@@ -69,7 +69,7 @@ def run(args: Namespace, screen: Screen) -> Result:
 
     known = catalogue(args.effects)  # what is wrong with a file of effects is wrong for every set
     settings = settings_of(args.model, args.effects)
-    there = [] if args.overwrite else results_there(args.out, settings)
+    there = results_there(args.out, settings, begin_anew=args.overwrite)
     planned = plan(args.folders, args.out, settings, there, args.model, args.effects)
     try:
         with screen.progress("fleet") as progress:

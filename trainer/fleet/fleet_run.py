@@ -13,7 +13,7 @@ from firmware_iface.errors import InputError
 from runtime.program.interrupt import ctrl_c_waits
 from runtime.program.progress import Progress
 from runtime.program.version import installed_version
-from trainer.fleet.fleet_table import read_table, write_table
+from trainer.fleet.fleet_table import arrow, read_table, write_table
 from trainer.fleet.outcomes import outcomes
 from trainer.fleet.set_facts import set_facts
 from trainer.fleet.set_result import SetResult
@@ -74,15 +74,21 @@ def settings_of(model: Path | None, effects: Sequence[Path]) -> dict[str, Any]:
     }
 
 
-def results_there(table: Path, settings: dict[str, Any]) -> list[SetResult]:
+def results_there(table: Path, settings: dict[str, Any], begin_anew: bool = False) -> list[SetResult]:
     """What an earlier run with the same settings left in its table; nothing where there is none.
+
+    Parameters
+    ----------
+    begin_anew : bool
+        Whatever is there is passed over.
 
     Raises
     ------
     InputError
-        Where the table is something else's, or of a run with other settings.
+        Where the table is something else's, or of a run with other settings, or pyarrow is not installed.
     """
-    if not table.exists():
+    arrow()  # before any work, and not after the first set
+    if begin_anew or not table.exists():
         return []
     found, before = read_table(table)
     for key, value in settings.items():

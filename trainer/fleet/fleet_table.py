@@ -69,7 +69,7 @@ def write_table(path: Path, results: Sequence[SetResult], settings: Mapping[str,
     InputError
         Where it cannot be written, or pyarrow is not installed.
     """
-    pa, parquet = _arrow()
+    pa, parquet = arrow()
     about = json.dumps({"fleet": FORMAT, "settings": settings}, sort_keys=True)
     schema = _schema(pa).with_metadata({KEY: about.encode()})
     table = pa.Table.from_pylist([row for r in results for row in _rows(r)], schema=schema)
@@ -85,7 +85,7 @@ def read_table(path: Path) -> tuple[list[SetResult], dict[str, Any]]:
     InputError
         Where it is no such table, or pyarrow is not installed.
     """
-    pa, parquet = _arrow()
+    pa, parquet = arrow()
     wrong = InputError(
         f"--out {path} is there already and is no table of fleet: give another name, or --overwrite to replace it"
     )
@@ -104,8 +104,14 @@ def read_table(path: Path) -> tuple[list[SetResult], dict[str, Any]]:
     return [_result(group) for group in sets.values()], about["settings"]
 
 
-def _arrow() -> tuple[Any, Any]:
-    """pyarrow, which takes a moment to import and is not part of the extra `trainer`."""
+def arrow() -> tuple[Any, Any]:
+    """pyarrow and its Parquet, which take a moment to import and are not part of the extra `trainer`.
+
+    Raises
+    ------
+    InputError
+        Where they are not installed.
+    """
     try:
         import pyarrow
         from pyarrow import parquet
