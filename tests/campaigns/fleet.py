@@ -73,7 +73,10 @@ class Run:
     def __init__(self, words: Sequence[str], table: Path) -> None:
         self.table = table
         command = [sys.executable, "-m", "trainer.cli", "fleet", *words, "--json"]
-        self.process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+        # A campaign in a shell's background ignores Ctrl-C, and so would what it starts.
+        self.process = subprocess.Popen(
+            command, cwd=ROOT, stdout=subprocess.PIPE, text=True, preexec_fn=_heeds_ctrl_c
+        )
 
     def until(self, count: int) -> None:
         """Wait until that many sets are in the table, or the process ends."""
@@ -88,6 +91,10 @@ class Run:
         """Exit code, and what it printed."""
         out, _ = self.process.communicate()
         return self.process.returncode, json.loads(out) if out.strip() else {}
+
+
+def _heeds_ctrl_c() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def campaign(folder: Path, headsets: int, sessions: int) -> dict[str, Any]:
