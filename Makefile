@@ -20,6 +20,8 @@ QUICK := tests/test_layers.py \
 	tests/trainer/test_captures.py \
 	tests/trainer/test_check.py \
 	tests/trainer/test_conventions.py \
+	tests/trainer/test_fleet_drift.py \
+	tests/trainer/test_kept_pictures.py \
 	tests/trainer/test_model_file.py \
 	tests/trainer/test_verdict.py
 

@@ -31,6 +31,7 @@ BELOW = {
     "model": {"captures", "prediction", "effects", "networks"},
     "fitting": {"captures", "prediction", "effects", "model"},
     "diagnosis": {"captures", "prediction", "effects", "model", "fitting", "networks", "training"},
+    "fleet": {"captures", "prediction", "effects", "model", "fitting", "diagnosis", "report"},
     "studio": {
         "captures",
         "prediction",

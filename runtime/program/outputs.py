@@ -50,6 +50,8 @@ class Output:
         Of a folder: names in it with one of which the command goes on, so that nothing is replaced.
     makes_folders : bool
         Whether the command makes the folder that it is in.
+    goes_on : bool
+        Of a file: whether it is this command's own, which it goes on with, so that nothing is lost.
     """
 
     path: Path
@@ -58,6 +60,7 @@ class Output:
     goes_on_from: Path | None = None
     resumed_by: tuple[str, ...] = ()
     makes_folders: bool = False
+    goes_on: bool = False
 
     def __str__(self) -> str:
         return f"{self.option} {self.path}"
@@ -106,7 +109,7 @@ def check_outputs(outputs: Sequence[Output], args: Namespace) -> None:
             _check_folder(output, args.overwrite)
         else:
             _check_file(output, mode)
-        if mode is not None and not stat.S_ISDIR(mode) and not args.overwrite:
+        if mode is not None and not stat.S_ISDIR(mode) and not (args.overwrite or output.goes_on):
             raise InputError(f"{output} is there already: give another name, or --overwrite to replace it")
 
 

@@ -31,7 +31,7 @@ from trainer.captures.png_reader import read_picture
 
 @dataclass(frozen=True)
 class CaptureSet:
-    """A capture set that can be read; pictures are read from disk at each call and nothing is kept.
+    """A capture set that can be read; pictures are read from disk at each call, and only workers keep some of them.
 
     Attributes
     ----------

@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from firmware_iface.errors import InputError
+from trainer.captures.kept_pictures import kept_or_read
 
 PNG_END = b"\0\0\0\0IEND\xae\x42\x60\x82"
 
@@ -44,12 +45,17 @@ def read_picture(path: Path, shape: tuple[int, int], bits: int, what: str) -> np
     Returns
     -------
     uint8 array [height, width] when bits is 8, otherwise uint16
+        Not writeable in a worker, which keeps it.
 
     Raises
     ------
     PictureError
         If it is missing, truncated or damaged, not gray of that depth, or of another size.
     """
+    return kept_or_read(path, (tuple(shape), bits), lambda: _read(path, shape, bits, what))
+
+
+def _read(path: Path, shape: tuple[int, int], bits: int, what: str) -> np.ndarray:
     try:
         data = path.read_bytes()
     except OSError as error:

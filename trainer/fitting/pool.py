@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from firmware_iface.errors import InputError
 from runtime.program.large_blocks import keep_large_blocks
+from trainer.captures.kept_pictures import keep_pictures
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -74,23 +75,28 @@ class Pool:
         InputError
             When a process that works on tasks is lost; whatever the function raises otherwise.
         """
-        if self.elsewhere:
-            packed = [pickle.dumps((function, task)) for task in tasks]
-            futures: list[Future[Any]] = [self.executor.submit(_packed, p) for p in packed]
-        else:
-            futures = [self.executor.submit(function, *task) for task in tasks]
+        futures = [self.submit(function, task) for task in tasks]
         try:
             for done, _ in enumerate(as_completed(futures), 1):
                 if progress:
                     progress(done)
-            results = [f.result() for f in futures]
-            return [pickle.loads(r) for r in results] if self.elsewhere else results
+            return [self.result(f) for f in futures]
         except (BrokenExecutor, CancelledError) as error:
             raise InputError(LOST) from error
         except BaseException:
             for f in futures:
                 f.cancel()
             raise
+
+    def submit(self, function: Callable[..., Any], task: tuple[Any, ...]) -> Future[Any]:
+        """The future of `function(*task)`, for `result`."""
+        if self.elsewhere:
+            return self.executor.submit(_packed, pickle.dumps((function, task)))
+        return self.executor.submit(function, *task)
+
+    def result(self, future: Future[Any]) -> Any:
+        """What a task returned, or raises what it raised; waits for it."""
+        return pickle.loads(future.result()) if self.elsewhere else future.result()
 
 
 def cores() -> int:
@@ -250,6 +256,7 @@ def _packed(task: bytes) -> bytes:
     """
     # Dask starts its workers so that they give back every temporary; also those that join later are told here.
     keep_large_blocks()
+    keep_pictures()  # tasks carry paths, and the next one is often of the same captures
     function, arguments = pickle.loads(task)
     return pickle.dumps(function(*arguments))
 

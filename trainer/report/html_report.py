@@ -82,7 +82,7 @@ def write_report(
     probed = stages(found, getattr(diagnosis, "probe_pictures", None) or ())
     context = {
         "title": title,
-        "style": page_style(),
+        "style": report_style(),
         "light_path": light_path_html(model, found) if model is not None else None,
         "headline": headline(compared, found, steps),
         "facts": facts(compared, heldout, found),
@@ -96,7 +96,25 @@ def write_report(
         "model": model_table(model) if model is not None else None,
         "method": METHOD,
     }
-    html = _template().render(context)
+    write_page(path, "trainer.report", "report.html", context)
+
+
+def write_page(path: Path | str, package: str, template: str, context: Mapping[str, Any]) -> None:
+    """Write an HTML page from a template next to a package's files, whole or not at all.
+
+    Parameters
+    ----------
+    package, template : str
+        Where the template is, such as "trainer.report" and "report.html".
+    context : mapping
+        What its names stand for.
+
+    Raises
+    ------
+    InputError
+        Where the file cannot be written.
+    """
+    html = _template(package, template).render(context)
     with whole_file(path, "w") as stream:
         stream.write(html)
 
@@ -105,6 +123,12 @@ def write_report(
 def page_style() -> Markup:
     """The style sheet that reports and the studio share."""
     return Markup((LOOK / "page.css").read_text(encoding="utf-8"))
+
+
+@lru_cache(maxsize=1)
+def report_style() -> Markup:
+    """The style sheet of pages that are files: that of the studio, and what only they have."""
+    return page_style() + Markup((LOOK / "report.css").read_text(encoding="utf-8"))
 
 
 def _steps(ladder: Any) -> tuple[Sequence[Mapping[str, Any]], float | None]:
@@ -119,14 +143,14 @@ def _more(ladder: Any) -> Sequence[Any]:
     return ladder.get("suggested_captures") or () if isinstance(ladder, Mapping) else ()
 
 
-@lru_cache(maxsize=1)
-def _template() -> Template:
+@lru_cache(maxsize=4)
+def _template(package: str, name: str) -> Template:
     environment = Environment(
-        loader=PackageLoader("trainer.report", "."),
+        loader=PackageLoader(package, "."),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     environment.filters.update(number=number, percent=percent, listed=listed, sentence=sentence)
-    return environment.get_template("report.html")
+    return environment.get_template(name)
