@@ -1,0 +1,125 @@
+"""Several strong effects that hide one another are found together, from pictures that are smoothed less and less."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.trainer.hidden import bench_file
+from tests.trainer.test_unregistered import taken
+from trainer.captures.acquire import acquire_from
+from trainer.captures.batches import Batch, load
+from trainer.captures.capture_set import CaptureSet, read_captures
+from trainer.captures.held_out import capture_roles
+from trainer.captures.smoothing import smoothed
+from trainer.diagnosis.explanation import explain
+from trainer.diagnosis.together import explain_together
+from trainer.diagnosis.verdict import Thresholds
+from trainer.effects.effect_catalogue import Catalogue, catalogue
+from trainer.fitting.gains import with_gains
+from trainer.fitting.gauss_newton import fit
+from trainer.fitting.joint_start import joint_start
+from trainer.fitting.pool import open_pool
+from trainer.fitting.predictor import Predictor, evaluate_captures
+from trainer.model.model import Model, absent
+
+NARROW_BEAM = 'kind = "illumination"\nwaist_x_share = 0.8\nwaist_y_share = 0.9'
+OFF_PLANE = 'kind = "distance"\noffset_mm = 0.6'
+STRONG_PHASE = 'kind = "phase_response"\ngain = 1.25\ns_curvature = 0.15'
+
+
+def known(*names: str) -> Catalogue:
+    return {name: effect for name, effect in catalogue().items() if name in names}
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory: pytest.TempPathFactory) -> CaptureSet:
+    """A narrow beam, a plane that is elsewhere, a wrong response and a picture that lies elsewhere."""
+    folder = tmp_path_factory.mktemp("far")
+    moved = 'kind = "misregistration"\nshift_x_px = 3.4\nshift_y_px = -2.6'
+    acquire_from(str(bench_file(folder, NARROW_BEAM, OFF_PLANE, STRONG_PHASE, moved)), folder / "captures")
+    return read_captures(folder / "captures")
+
+
+def batches_of(captures: CaptureSet) -> list[Batch]:
+    return load(captures, capture_roles(captures).fitted)
+
+
+def test_smoothing_adds_variances_and_keeps_the_light() -> None:
+    point = torch.zeros((1, 81, 81))
+    point[0, 40, 40] = 3.0
+    twice = smoothed(smoothed(point, 3.0), 4.0)
+    assert float(twice.sum()) == pytest.approx(3.0, rel=1e-5)
+    y, x = (torch.arange(81.0) - 40,) * 2
+    for along, axis in ((y[:, None], 0), (x[None, :], 1)):
+        assert float((twice[0] * along**2).sum() / 3) == pytest.approx(25, rel=0.02), axis
+
+
+def test_a_prediction_of_a_smoothed_picture_is_the_smoothed_prediction(captures: CaptureSet) -> None:
+    (batch,) = batches_of(captures)
+    model = with_gains(captures, Model(captures.bench), capture_roles(captures).fitted)
+    coarse = batch.smoothed(4.0)
+    expected = smoothed(batch.mask * Predictor(model, batch).predict(model), 4.0)
+    torch.testing.assert_close(Predictor(model, coarse).predict(model), expected)
+    assert float(coarse.signal.std()) < 0.7 * float(batch.signal.std())
+
+
+def test_no_effect_alone_gets_anywhere_and_all_together_do(captures: CaptureSet) -> None:
+    names = ("illumination", "distance", "phase_response", "misregistration")
+    roles, batches = capture_roles(captures), batches_of(captures)
+    ideal = with_gains(captures, Model(captures.bench), roles.fitted)
+    before = evaluate_captures(captures, roles.held_out, ideal).excess
+    for name in names[:2]:
+        alone = fit(ideal.having(absent(catalogue()[name], captures.bench)), [name], batches).model
+        assert evaluate_captures(captures, roles.held_out, alone).excess > 0.5 * before
+    together = joint_start(ideal, known(*names), batches).model
+    after = evaluate_captures(captures, roles.held_out, together).excess
+    assert after < 0.02 * before
+    assert float(together.instance("distance").values["offset"]) == pytest.approx(0.6, rel=0.05)
+    assert float(together.instance("phase_response").values["gain"][0]) == pytest.approx(1.25, rel=0.05)
+
+
+def test_what_is_not_needed_is_left_out_again(captures: CaptureSet) -> None:
+    roles = capture_roles(captures)
+    ideal = with_gains(captures, Model(captures.bench), roles.fitted)
+    errors = evaluate_captures(captures, roles.held_out, ideal)
+    names = ("illumination", "distance", "phase_response", "misregistration", "zero_order")
+    with open_pool(1) as pool:
+        found = explain_together(roles, ideal, errors, known(*names), pool, Thresholds())
+    assert found is not None
+    assert set(found.model.names) == set(names[:-1])
+    assert [name for name, _ in found.ladder] != [] and found.ladder[-1][1].excess < 0.02 * errors.excess
+
+
+def test_one_strong_effect_alone_is_not_far_away(tmp_path: Path) -> None:
+    acquire_from(str(bench_file(tmp_path, OFF_PLANE)), tmp_path / "captures")
+    captures = read_captures(tmp_path / "captures")
+    roles = capture_roles(captures)
+    ideal = with_gains(captures, Model(captures.bench), roles.fitted)
+    errors = evaluate_captures(captures, roles.held_out, ideal)
+    with open_pool(1) as pool:
+        found = explain_together(roles, ideal, errors, known("distance", "illumination"), pool, Thresholds())
+    assert found is None
+
+
+@pytest.mark.slow
+def test_five_effects_behind_an_unregistered_camera_are_found_whole(tmp_path: Path) -> None:
+    bent = 'kind = "panel_wavefront"\npeak_to_valley_nm = 900'
+    taken(tmp_path, NARROW_BEAM, OFF_PLANE, STRONG_PHASE, bent, panel=(128, 160), camera=(167, 209))
+    path = tmp_path / "captures" / "bench.toml"
+    stated = np.array(read_captures(path.parent).bench.camera.homography)
+    angle = np.deg2rad(0.6)
+    off = np.eye(3)
+    off[:2, :2] = 1.006 * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    off[:2, 2] = np.array([79.5, 63.5]) - off[:2, :2] @ [79.5, 63.5] + [2.5, -3.5]
+    path.write_text(re.sub(r"homography = .*", f"homography = {(off @ stated).tolist()}", path.read_text()))
+    captures = read_captures(path.parent)
+    with open_pool(1) as pool:
+        found = explain(captures, Model(captures.bench), catalogue(), pool)
+    expected = {"illumination", "distance", "phase_response", "panel_wavefront", "misregistration"}
+    assert set(found.model.names) >= expected
+    assert found.steps[-1].held_out.excess < 2e-3
