@@ -158,17 +158,20 @@ def ghost_starts(evidence: Sequence[Evidence], most: int = 3) -> Starts:
     expected = one.prediction.double().numpy()
     height, width = expected.shape[-2:]
     taper = np.outer(np.hanning(height + 2)[1:-1], np.hanning(width + 2)[1:-1])
-    correlation = np.abs(_correlation(residual, expected, taper, whiten=False))
-    correlation[:2, :2] = correlation[:2, -1:] = correlation[-1:, :2] = correlation[-1:, -1:] = 0
     starts = []
-    for _ in range(most):
-        i, j = np.unravel_index(int(correlation.argmax()), correlation.shape)
-        dy, dx = (int(k) - n if k > n / 2 else int(k) for k, n in ((i, height), (j, width)))
-        _, shift, _ = _on_panel(one.scene.bench, np.zeros((1, 2)), np.array([[dy, dx]], float), np.ones(1))
-        starts.append({"amplitude": 0.02, "shift_y": shift[0, 0], "shift_x": shift[0, 1]})
-        for a in range(-2, 3):
-            for b in range(-2, 3):
-                correlation[(i + a) % height, (j + b) % width] = 0
+    for sharp in (False, True):  # the sharp one parts a far copy from what is wrong near by
+        correlation = np.abs(_correlation(residual, expected, taper, whiten=False, sharp=sharp))
+        for i, j in _near(0, 0, correlation.shape):
+            correlation[i, j] = 0
+        for _ in range(most):
+            i, j = (int(n) for n in np.unravel_index(int(correlation.argmax()), correlation.shape))
+            dy, dx = (k - n if k > n / 2 else k for k, n in ((i, height), (j, width)))
+            _, shift, _ = _on_panel(
+                one.scene.bench, np.zeros((1, 2)), np.array([[dy, dx]], float), np.ones(1)
+            )
+            starts.append({"amplitude": 0.02, "shift_y": shift[0, 0], "shift_x": shift[0, 1]})
+            for a, b in _near(i, j, correlation.shape):
+                correlation[a, b] = 0
     return starts
 
 
@@ -264,13 +267,21 @@ def _tops(length: int, size: int) -> list[int]:
     return [round(k * (length - size) / (count - 1)) for k in range(count)]
 
 
-def _correlation(observed: NDArray, expected: NDArray, taper: NDArray, whiten: bool = True) -> NDArray:
-    """Circular cross-correlation over the captures, normalised so that 1 is a perfect match; peak at the shift."""
+def _correlation(
+    observed: NDArray, expected: NDArray, taper: NDArray, whiten: bool = True, sharp: bool = False
+) -> NDArray:
+    """Circular cross-correlation over the captures, normalised so that 1 is a perfect match; peak at the shift.
+
+    With `sharp`, divided by the expected picture's own spectrum (Wiener), so that a copy is a point.
+    """
     a, b = (
         np.fft.fft2((t - t.mean((-2, -1), keepdims=True)) * taper, axes=(-2, -1))
         for t in (observed, expected)
     )
     cross = (a * np.conj(b)).sum(0)
+    if sharp:
+        power = (np.abs(b) ** 2).sum(0)
+        cross = cross / (power + 0.1 * power.mean())
     if whiten:
         cross = cross / np.sqrt(np.abs(cross) + 1e-3 * np.abs(cross).max() + 1e-30)
     result = np.fft.ifft2(cross).real
