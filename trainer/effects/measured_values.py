@@ -14,7 +14,7 @@ from trainer.effects.starts import displacements
 LIKELY_GAIN, LIKELY_OFFSET = 0.05, 20.0  # where the estimate of their spreads begins: share, counts
 LIKELY_VARIANCES = tuple(0.06 * 1.6**n for n in range(-1, 10))  # of a blur, pixels^2, from 0.04 to 4
 ROUNDS = 6  # of that estimate
-REACH = 2  # pixels each way: the neighbours that a pixel's number is predicted from
+REACH = 3  # pixels each way: the neighbours that a pixel's number is predicted from
 
 
 def shift_spread(evidence: Sequence[Evidence]) -> dict[str, Any]:
@@ -68,14 +68,16 @@ def pixel_pattern(evidence: Sequence[Evidence]) -> dict[str, Any]:
         terms = (expected**2, expected, np.ones_like(expected), expected * beyond, beyond)
         sums += np.stack([(weight * t).sum(0) for t in terms])
     gain_spread, offset_spread = LIKELY_GAIN, LIKELY_OFFSET
+    # First what neighbours tell goes, again and again, because each time it is drawn towards zero.
     for _ in range(ROUNDS):
-        a, b, c = sums[0] + gain_spread**-2, sums[1], sums[2] + offset_spread**-2
-        determinant = a * c - b**2
-        gain = (c * sums[3] - b * sums[4]) / determinant
-        offset = (a * sums[4] - b * sums[3]) / determinant
-        gain, offset = (_own(m) for m in (gain, offset))
-        gain_spread = max(float(np.sqrt(np.mean(gain**2 + c / determinant))), 1e-5)
-        offset_spread = max(float(np.sqrt(np.mean(offset**2 + a / determinant))), 1e-3)
+        gain, offset, _ = _most_probable(sums, gain_spread, offset_spread)
+        gain, offset = gain - _own(gain), offset - _own(offset)
+        sums[3] -= sums[0] * gain + sums[1] * offset
+        sums[4] -= sums[1] * gain + sums[2] * offset
+    for _ in range(ROUNDS):
+        gain, offset, (gain_variance, offset_variance) = _most_probable(sums, gain_spread, offset_spread)
+        gain_spread = max(float(np.sqrt(np.mean(gain**2 + gain_variance))), 1e-5)
+        offset_spread = max(float(np.sqrt(np.mean(offset**2 + offset_variance))), 1e-3)
     return {
         "gain": np.maximum(gain, -0.99),
         "offset": offset,
@@ -84,10 +86,21 @@ def pixel_pattern(evidence: Sequence[Evidence]) -> dict[str, Any]:
     }
 
 
+def _most_probable(
+    sums: np.ndarray, gain_spread: float, offset_spread: float
+) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Gain and offset of each pixel and their variances, for spreads of both."""
+    a, b, c = sums[0] + gain_spread**-2, sums[1], sums[2] + offset_spread**-2
+    determinant = a * c - b**2
+    gain = (c * sums[3] - b * sums[4]) / determinant
+    offset = (a * sums[4] - b * sums[3]) / determinant
+    return gain, offset, (c / determinant, a / determinant)
+
+
 def _own(numbers: np.ndarray) -> np.ndarray:
     """Each pixel's number less the best prediction from its neighbours: linear, with the same weights everywhere."""
     height, width = numbers.shape
-    padded = np.pad(numbers, REACH, mode="reflect")
+    padded = np.pad(numbers, REACH, mode="reflect", reflect_type="odd")
     span = range(2 * REACH + 1)
     places = [(i, j) for i in span for j in span if (i, j) != (REACH, REACH)]
     near = np.stack([padded[i : i + height, j : j + width].ravel() for i, j in places])
