@@ -41,6 +41,8 @@ def test_at_one_plane_the_equivalent_facts_are_said(key, stated, true, tmp_path,
     facts = {f["fact"].split(".")[-1]: f for f in found["equal_facts"]}
     assert set(facts) == {"wavelength_nm", "pitch_um"}
     assert facts[key]["stated"] == stated and facts[key]["value"] == pytest.approx(true, rel=2e-4)
+    assert 0 < facts[key]["error"] < 1e-3 * true
+    assert "±" in found["sentence"].split("pitch_um")[1]
     assert "pitch_um" in found["sentence"] and "wavelength_nm" in found["sentence"]
     assert any("another" in s or "a wrong distance" in s for s in found["suggested_captures"])
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from trainer.captures.bench_file import Bench
 from trainer.captures.capture_set import CaptureSet
-from trainer.formatting import number
+from trainer.formatting import measured, number
 from trainer.model.model import Model
 
 PLANES = (0.6, 1.6)  # proposed planes, as shares of the stated distance
@@ -33,18 +33,22 @@ class EqualFact:
         table.key of bench.toml.
     stated, value : float
         As stated, and as it would have to be; in the key's unit.
+    error : float
+        Standard error of `value`, from the fitted effect's; 0 where it has none.
     """
 
     fact: str
     stated: float
     value: float
+    error: float = 0.0
 
     def as_json(self) -> dict[str, Any]:
-        """Keys `fact`, `stated` and `value`."""
+        """Keys `fact`, `stated`, `value` and `error`."""
         return dict(vars(self))
 
     def __str__(self) -> str:
-        return f"{self.fact} = {number(self.value, 4)} instead of {self.stated:g}"
+        value = measured(self.value, self.error) if self.error else number(self.value, 4)
+        return f"{self.fact} = {value} instead of {self.stated:g}"
 
 
 @dataclass(frozen=True)
@@ -94,26 +98,42 @@ def equal_facts(model: Model, captures: CaptureSet) -> EqualFacts:
         ratio = 1 + float(model.instance("distance").values["offset"]) / planes[0]
         if abs(ratio - 1) < LEAST or ratio <= 0:
             return EqualFacts()
-        return EqualFacts("distance", (*_wavelengths(bench, captures, ratio), _pitch(bench, ratio)), planes)
+        error = _relative_error(model, "distance", planes[0])
+        facts = (*_wavelengths(bench, captures, ratio, error), _pitch(bench, ratio, error))
+        return EqualFacts("distance", facts, planes)
     if "wavelength" in model.names:
         common = _common_ratio(model, captures)
         if common is None or abs(common - 1) < LEAST:
             return EqualFacts()
-        stated = bench.distance_mm
-        facts = (_pitch(bench, common), EqualFact("propagation.distance_mm", stated, stated * common))
+        stated, error = (
+            bench.distance_mm,
+            _relative_error(model, "wavelength", bench.channels[0].wavelength_nm),
+        )
+        distance = EqualFact("propagation.distance_mm", stated, stated * common, stated * error)
+        facts = (_pitch(bench, common, error), distance)
         return EqualFacts("wavelength", facts, planes)
     return EqualFacts()
 
 
-def _wavelengths(bench: Bench, captures: CaptureSet, ratio: float) -> list[EqualFact]:
+def _relative_error(model: Model, name: str, stated: float) -> float:
+    """Standard error of a fitted offset as a share of what is stated; the largest of several, 0 without errors."""
+    errors = model.instance(name).errors
+    return 0.0 if errors is None else float(np.max(errors["offset"])) / abs(stated)
+
+
+def _wavelengths(bench: Bench, captures: CaptureSet, ratio: float, error: float) -> list[EqualFact]:
     used = [c for c in bench.channels if c.name in captures.channels]
     if len(used) > 1:  # every one would have to be off in the same proportion
         return []
-    return [EqualFact("channel.wavelength_nm", used[0].wavelength_nm, used[0].wavelength_nm * ratio)]
+    stated = used[0].wavelength_nm
+    return [EqualFact("channel.wavelength_nm", stated, stated * ratio, stated * error)]
 
 
-def _pitch(bench: Bench, ratio: float) -> EqualFact:
-    return EqualFact("panel.pitch_um", bench.panel.pitch_um, bench.panel.pitch_um / math.sqrt(ratio))
+def _pitch(bench: Bench, ratio: float, error: float) -> EqualFact:
+    stated = bench.panel.pitch_um
+    return EqualFact(
+        "panel.pitch_um", stated, stated / math.sqrt(ratio), 0.5 * stated * error / math.sqrt(ratio) ** 3
+    )
 
 
 def _common_ratio(model: Model, captures: CaptureSet) -> float | None:
