@@ -71,6 +71,13 @@ def doubts(captures: CaptureSet) -> Doubts:
         return doubts_of(captures, Model(captures.bench), {n: KNOWN[n] for n in names}, pool)
 
 
+@pytest.fixture(scope="module")
+def extent_or_blur(captures: CaptureSet, doubts: Doubts) -> Doubts:
+    """The same doubt with the extent as the best explanation: which of the two is, rounding decides."""
+    rival = Rival("spatial_coherence", "sensor_blur", fitted(captures, "sensor_blur"))
+    return replace(doubts, model=fitted(captures, "spatial_coherence"), rivals=(rival,))
+
+
 def fitted(captures: CaptureSet, name: str) -> Model:
     """The model with one effect, fitted."""
     model = Model(captures.bench).having(absent(KNOWN[name], captures.bench))
@@ -177,10 +184,12 @@ def test_the_doubt_is_named(doubts: Doubts) -> None:
     assert not doubts.decided
 
 
-def test_the_first_captures_are_two_where_the_rivals_part(captures: CaptureSet, doubts: Doubts) -> None:
+def test_the_first_captures_are_two_where_the_rivals_part(
+    captures: CaptureSet, extent_or_blur: Doubts
+) -> None:
     """At the set's own plane an extent is a blur; elsewhere not. The second is there to judge by."""
     with open_pool(1) as pool:
-        found = next_captures(captures, doubts, possible_captures(captures, [8.0, 12.8], 3), 3, pool)
+        found = next_captures(captures, extent_or_blur, possible_captures(captures, [8.0, 12.8], 3), 3, pool)
     first, second, third = found.chosen
     assert first.plane_mm == second.plane_mm == 12.8
     assert "sensor_blur" in first.why and "spatial_coherence" in first.why
@@ -190,8 +199,10 @@ def test_the_first_captures_are_two_where_the_rivals_part(captures: CaptureSet, 
     assert len({one.gray.tobytes() for one in found.chosen}) == 3
 
 
-def test_without_rivals_the_captures_sharpen_the_numbers(captures: CaptureSet, doubts: Doubts) -> None:
-    alone = replace(doubts, rivals=())
+def test_without_rivals_the_captures_sharpen_the_numbers(
+    captures: CaptureSet, extent_or_blur: Doubts
+) -> None:
+    alone = replace(extent_or_blur, rivals=())
     with open_pool(1) as pool:
         found = next_captures(captures, alone, possible_captures(captures, [8.0], 2), 2, pool)
     assert all("sharpens spatial_coherence" in one.why or "extent" in one.why for one in found.chosen)

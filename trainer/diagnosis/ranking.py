@@ -167,10 +167,10 @@ def rank(
         How many were screened, which the test of each is corrected for.
     """
     ordered = sorted(fits, key=lambda f: f.held_out.excess)
-    if len(ordered) > 1 and known[ordered[0].effect].same_as == ordered[1].effect:
-        first, second = ordered[:2]
-        if thresholds.inseparable(removed_excess(second.held_out, first.held_out), first.held_out.excess):
-            ordered[:2] = second, first  # of two that the captures cannot tell apart, the plainer
+    plainer = next((f for f in ordered[1:] if _is_plainer(f, ordered[0], known, thresholds)), None)
+    if plainer is not None:  # of two that the captures cannot tell apart
+        ordered.remove(plainer)
+        ordered.insert(0, plainer)
     ranked = []
     for one in ordered:
         removed = removed_excess(before, one.held_out)
@@ -184,6 +184,19 @@ def rank(
         )
         ranked.append(RankedEffect(known[one.effect], one.model, one.held_out, removed, worth_adding, alike))
     return ranked
+
+
+def _is_plainer(one: CandidateFit, best: CandidateFit, known: Catalogue, thresholds: Thresholds) -> bool:
+    """Whether a candidate says as much as the best one with at most half as many numbers, or as its plain form."""
+    if not thresholds.inseparable(removed_excess(one.held_out, best.held_out), best.held_out.excess):
+        return False
+    if known[best.effect].same_as == one.effect:
+        return True
+    return known[one.effect].measure is None and 2 * _numbers(one) <= _numbers(best)
+
+
+def _numbers(fitted: CandidateFit) -> int:
+    return sum(values.size for values in fitted.model.instance(fitted.effect).values.values())
 
 
 def _inseparable(

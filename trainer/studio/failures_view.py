@@ -43,8 +43,8 @@ def failures_view(project: Project, visit: Visit) -> Any:
             )
             button.on_click(partial(_look_at, visit, name))
             buttons.append(button)
+        worst[:] = buttons  # before the words: who reads them can click
         words.object = f"<p class='small'>Worst {escape(title)} (click one to see it):</p>"
-        worst[:] = buttons
 
     def pick(event: Any) -> None:
         errors = project.set.errors
