@@ -18,7 +18,7 @@ from runtime.solver.drive_range import DriveRange
 
 Array = Any
 
-FEW = 64  # levels a turn; with more of them, rounding at the end loses less than the descent's own error
+FEW = 64  # levels a turn; of four patterns, rounding at the end loses 4 dB at 8, 1.7 at 16, 0.2 at 64, 0.1 at 128
 SHARPNESS = (1.0, 2.0, 4.0, 8.0, 16.0)  # one stage each: fewer, or twice as many, were worse
 SAME = 1e-4  # rad: levels nearer than this are one
 
