@@ -46,7 +46,7 @@ class Start:
     def __init__(self, objective: Objective, path: LightPath, colour: int, doubled: bool) -> None:
         xp = objective.backend.xp
         self.backend, self.objective, self.colour = objective.backend, objective, colour
-        self.optics: Optics = objective.optics[colour][0]
+        self.optics: Optics = objective.optics[colour * objective.frames][0]
         height, width = path.grid.shape
         pair = path.source.dtype
         self.wave = xp.zeros((height, width), pair)

@@ -16,9 +16,14 @@ from runtime.solver.video_motion import renewed, shifted
 
 Array = Any
 
+NOISE = 0.5  # rad, rms: with 0.1 the patterns part too slowly, with 1 the light is no nearer in the end
+STRIDE = 0.618  # of the panel's rows: how far a pattern's noise is moved from that of the pattern before
+
 
 class FirstPhases:
     """First phases for all colours of an objective, in place.
+
+    Of several patterns for one picture, each but the first gets noise of its own: equal ones would stay equal.
 
     Parameters
     ----------
@@ -26,7 +31,7 @@ class FirstPhases:
     stacks : list of list of LightPath
         Colours of planes; a start is for the first plane.
     drives : list of DriveRange
-        Of the colours.
+        Of the patterns, a colour's after one another.
     initialiser : bytes or None
         A network in ONNX from a target's amplitude to a first phase.
 
@@ -43,17 +48,23 @@ class FirstPhases:
         drives: Sequence[DriveRange],
         initialiser: bytes | None,
     ) -> None:
-        self.backend, self.drives, self.shape = objective.backend, drives, objective.shape[1:]
+        self.backend, self.shape = objective.backend, objective.shape[1:]
+        self.frames, self.drives = objective.frames, drives[:: objective.frames]
         self.starts = [
             Start(objective, stack[0], c, drive.gapless and initialiser is None)
-            for c, (stack, drive) in enumerate(zip(stacks, drives, strict=True))
+            for c, (stack, drive) in enumerate(zip(stacks, self.drives, strict=True))
         ]
+        self.noise: np.ndarray | None = None
+        if self.frames > 1:
+            noise = np.random.default_rng(0).normal(scale=NOISE, size=self.shape)
+            self.noise = noise.astype(stacks[0][0].response.dtype)
         self.initialiser = None if initialiser is None else Initialiser(initialiser, self.shape)
         self.amplitude = np.zeros(self.shape, stacks[0][0].response.dtype)
 
     def cold(self, targets: np.ndarray, phases: Array) -> None:
-        """Fill `phases` (rad) [C, H, W] from targets [C, K, H, W] alone, not from the picture before."""
-        for c, (drive, start, phase) in enumerate(zip(self.drives, self.starts, phases, strict=True)):
+        """Fill `phases` (rad), a pattern each, from targets [C, K, H, W] alone, not from the picture before."""
+        for c, (drive, start) in enumerate(zip(self.drives, self.starts, strict=True)):
+            phase, *others = phases[c * self.frames : (c + 1) * self.frames]
             np.multiply(
                 targets[c, 0], 1 / float(np.mean(targets[c, 0], dtype=np.float64)), out=self.amplitude
             )
@@ -66,6 +77,17 @@ class FirstPhases:
                 start.flat_phase(self.amplitude, phase)
             if drive.bounded:
                 phase[...] = self.backend.xp.asarray(drive.held(self.backend.to_host(phase)))
+            for n, other in enumerate(others, 1):
+                self._part(n, drive, phase, other)
+
+    def _part(self, n: int, drive: DriveRange, phase: Array, other: Array) -> None:
+        """Fill the n-th pattern of a picture: the first one's phase and its own noise."""
+        assert self.noise is not None
+        moved = np.roll(self.noise, round(n * STRIDE * self.shape[0]) + n, 0)
+        other[...] = phase
+        other += self.backend.xp.asarray(moved)
+        if drive.bounded:
+            other[...] = self.backend.xp.asarray(drive.held(self.backend.to_host(other)))
 
     def warm(
         self, before: Array, motion: tuple[int, int], targets: np.ndarray, phases: Array, room: Array
@@ -74,18 +96,18 @@ class FirstPhases:
 
         Parameters
         ----------
-        before : float array [C, H, W], rad
+        before : float array [C N, H, W], rad
             Phases of the frame before.
         motion : (int, int), pixels
             Down, right.
         targets : array [C, K, H, W]
             Of this frame: where content comes in, the start is cold.
-        phases, room : float array [C, H, W], rad
+        phases, room : float array [C N, H, W], rad
             The result, and room to work in.
         """
         shifted(before, motion, phases)
         if any(motion):
             self.cold(targets, room)
-            for phase, fresh, start in zip(phases, room, self.starts, strict=True):
-                for part in renewed(motion, start.edges, self.shape):
+            for n, (phase, fresh) in enumerate(zip(phases, room, strict=True)):
+                for part in renewed(motion, self.starts[n // self.frames].edges, self.shape):
                     phase[part] = fresh[part]

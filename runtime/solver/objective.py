@@ -13,6 +13,7 @@ from runtime.networks.onnx_approximator import Approximator
 from runtime.solver.array_backend import Backend
 from runtime.solver.in_place_path import Optics
 from runtime.solver.penalty import FLOOR, PENALTIES, Irradiance
+from runtime.solver.soft_levels import SoftLevels
 
 Array = Any
 
@@ -24,7 +25,9 @@ OPEN = 0.75
 class Objective:
     """Loss over phase [C, H, W] for targets [C, K, H, W]: C colours with a pattern each, K planes a colour.
 
-    A colour's planes share its pattern and its scale. `look` comes before `gradient`, which uses up what it left.
+    A colour's planes share its pattern and its scale. With N patterns for a picture, phase is [C N, H, W], a
+    colour's patterns after one another, and the loss is that of the mean of their irradiances. `look` comes before
+    `gradient`, which uses up what it left.
 
     Parameters
     ----------
@@ -39,6 +42,13 @@ class Objective:
     approximator : Approximator or None
         D, which takes all colours of the first plane at once.
     backend : Backend
+    frames : int
+        N, the patterns for each colour of a picture.
+
+    Attributes
+    ----------
+    rounding : SoftLevels or None
+        What a panel of few levels makes of a phase.
     """
 
     def __init__(
@@ -49,17 +59,22 @@ class Objective:
         weight: np.ndarray | None,
         approximator: Approximator | None,
         backend: Backend,
+        frames: int = 1,
     ) -> None:
         xp, path = backend.xp, stacks[0][0]
-        self.backend, self.stacks, self.fine = backend, stacks, fine
+        self.backend, self.stacks, self.fine, self.frames = backend, stacks, fine, frames
         self.approximator = approximator
+        self.rounding: SoftLevels | None = None
         self.penalty = PENALTIES[penalty](xp)
         # On the panel's own grid light is taken at pixel centres: integrating it there took longer and gained nothing.
         filtered = any(p.irradiance_filter is not None for stack in stacks for p in stack)
         integrate = fine > 1 or filtered or approximator is not None
-        self.optics = [[Optics(p, fine, integrate, backend) for p in stack] for stack in stacks]
+        # A pattern's fields are kept from `look` to `gradient`, so each has optics of its own.
+        self.optics = [
+            [Optics(p, fine, integrate, backend) for p in stack] for stack in stacks for _ in range(frames)
+        ]
         real = path.response.dtype
-        self.shape = (len(stacks), *path.grid.shape)
+        self.shape = (len(stacks) * frames, *path.grid.shape)
         deep = (len(stacks), len(stacks[0]), *path.grid.shape)
         self.light = xp.zeros(deep, real)
         self.wanted = xp.zeros(deep, real)
@@ -78,7 +93,7 @@ class Objective:
         """Change to other targets, irradiance [C, K, H, W] of any scale, none of them dark."""
         xp = self.backend.xp
         bare = isinstance(self.penalty, Irradiance)
-        for c in range(self.shape[0]):
+        for c in range(len(self.stacks)):
             mean = float(np.mean(targets[c], dtype=np.float64))
             for k in range(self.wanted.shape[1]):
                 wanted = self.wanted[c, k]
@@ -93,17 +108,25 @@ class Objective:
 
     def look(self, phase: Array) -> float:
         """The loss at a phase, mean over pixels; keeps what `gradient` needs."""
-        for c, stack in enumerate(self.optics):
+        if self.rounding is not None:
+            self.rounding.round(phase)
+            phase = self.rounding.phase
+        for pattern, stack in enumerate(self.optics):
+            c, again = divmod(pattern, self.frames)
             for k, optics in enumerate(stack):
-                optics.forward(phase[c], self.light[c, k])
+                optics.forward(phase[pattern], self.room if again else self.light[c, k])
+                if again:
+                    self.light[c, k] += self.room
+        if self.frames > 1:
+            self.light *= 1 / self.frames
         first = not self.floor
         if first:
-            self.mean_light = [float(self.light[c].mean()) for c in range(self.shape[0])]
+            self.mean_light = [float(self.light[c].mean()) for c in range(len(self.stacks))]
             self.floor = [FLOOR * mean for mean in self.mean_light]
         if self.approximator is not None:
             return self._look_through(self.approximator, first)
         loss = squares = 0.0
-        for c in range(self.shape[0]):
+        for c in range(len(self.stacks)):
             planes = range(self.wanted.shape[1])
             sums = [self._measure(c, k) for k in planes]
             self.scale[c] = self.penalty.scale(tuple(map(sum, zip(*sums, strict=True))))
@@ -114,12 +137,19 @@ class Objective:
         return self.loss
 
     def gradient(self, phase: Array, out: Array) -> None:
-        """Gradient of the loss's sum over pixels, over the phase of the last `look`: [C, H, W] written to `out`."""
-        for c, stack in enumerate(self.optics):
+        """Gradient of the loss's sum over pixels over the patterns' phases of the last `look`, written to `out`."""
+        if self.rounding is not None:
+            phase = self.rounding.phase
+        for pattern, stack in enumerate(self.optics):
             for k, optics in enumerate(stack):
-                optics.adjoint(phase[c], self.light[c, k], self.room if k else out[c])
+                slope = self.light[pattern // self.frames, k]
+                optics.adjoint(phase[pattern], slope, self.room if k else out[pattern])
                 if k:
-                    out[c] += self.room
+                    out[pattern] += self.room
+        if self.frames > 1:
+            out *= 1 / self.frames
+        if self.rounding is not None:
+            out *= self.rounding.slope
 
     def constrain(self, colour: int) -> None:
         """For Gerchberg-Saxton, in place of a slope: half of the factor that constrains each field."""
@@ -132,13 +162,15 @@ class Objective:
         """Amplitude PSNR of the last look, on the solver's own grid."""
         return 20 * math.log10(self.peak / max(math.sqrt(self.squared_error), 1e-15))
 
-    def curvature(self, colour: int) -> float:
+    def curvature(self, pattern: int) -> float:
         """The loss's approximate second derivative over a pixel's phase, for a path that loses no light."""
+        colour = pattern // self.frames
+        share = self.power[colour] / self.frames
         if self.approximator is not None:
-            return self.power[colour] / self.mean_light[colour]
+            return share / self.mean_light[colour]
         rms = math.sqrt(self.squared_error)
         bend = self.penalty.curvature(self.scale[colour], self.mean_light[colour], rms)
-        return bend * self.power[colour] * len(self.optics[colour])
+        return bend * share * len(self.stacks[colour])
 
     def _measure(self, c: int, k: int) -> tuple[float, ...]:
         light, wanted, weight, floor = self.light[c, k], self.wanted[c, k], self.weight, self.floor[c]
@@ -162,7 +194,7 @@ class Objective:
     def _look_through(self, d: Approximator, first: bool) -> float:
         """The loss of the light after D, mean over pixels."""
         xp = self.backend.xp
-        for c in range(self.shape[0]):
+        for c in range(len(self.stacks)):
             light, wanted = self.light[c, 0], self.wanted[c, 0]
             xp.multiply(light, 1 / self.mean_light[c], out=light)
             d.irradiance[c] = self.backend.to_host(light)
@@ -173,13 +205,13 @@ class Objective:
             d.correct()
             self.through = [
                 _root_scale(xp.asarray(d.corrected[c]), self.wanted[c, 0]) / self.scale[c]
-                for c in range(self.shape[0])
+                for c in range(len(self.stacks))
             ]
-        units = [max(self.scale[c] * self.through[c], 1e-15) ** 2 for c in range(self.shape[0])]
+        units = [max(self.scale[c] * self.through[c], 1e-15) ** 2 for c in range(len(self.stacks))]
         for c, unit in enumerate(units):
             np.multiply(self.backend.to_host(self.wanted[c, 0]), 1 / unit, out=d.target[c])
         loss = d.look()
-        for c in range(self.shape[0]):
+        for c in range(len(self.stacks)):
             self.light[c, 0] = xp.asarray(d.slope[c])
             self.light[c, 0] *= 1 / self.mean_light[c]
         self.loss = self.squared_error = loss / self.pixels * float(np.mean(units))

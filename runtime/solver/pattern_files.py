@@ -24,17 +24,22 @@ class PatternFile:
         The picture that the pattern shows.
     channel : str
         The colour of the picture that it shows.
+    frame : int
+        Which of the colour's patterns, from 1 on.
     out : Path
         The file that it is written to.
     """
 
     target: Path
     channel: str
+    frame: int
     out: Path
 
 
-def pattern_files(targets: Sequence[Path], channels: Sequence[str], out: Path) -> list[PatternFile]:
-    """Which file each colour of each picture goes to; makes the folder.
+def pattern_files(
+    targets: Sequence[Path], channels: Sequence[str], out: Path, frames: int = 1
+) -> list[PatternFile]:
+    """Which file each colour and frame of each picture goes to; makes the folder.
 
     Parameters
     ----------
@@ -44,6 +49,8 @@ def pattern_files(targets: Sequence[Path], channels: Sequence[str], out: Path) -
         The colours of each; where there are several, their names are added to the file's name.
     out : Path
         A PNG, for one picture, or a folder.
+    frames : int
+        Patterns for each colour; where there are several, their numbers end the file's name.
 
     Raises
     ------
@@ -59,8 +66,11 @@ def pattern_files(targets: Sequence[Path], channels: Sequence[str], out: Path) -
     for target in targets:
         base = out if single else out / f"{target.stem}.png"
         for channel in channels:
-            name = base if len(channels) == 1 else base.with_name(f"{base.stem}-{channel}{base.suffix}")
-            files.append(PatternFile(target, channel, name))
+            colour = "" if len(channels) == 1 else f"-{channel}"
+            for frame in range(1, frames + 1):
+                number = "" if frames == 1 else f"-{frame:0{len(str(frames))}d}"
+                name = base.with_name(f"{base.stem}{colour}{number}{base.suffix}")
+                files.append(PatternFile(target, channel, frame, name))
     owners: dict[Path, Path] = {}
     for file in files:
         if file.out in owners:

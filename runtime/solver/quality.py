@@ -87,8 +87,8 @@ def qualities_of(
     ----------
     stacks : list of list of LightPath
         Colours of planes.
-    patterns : uint8 array [C, H, W]
-        Gray levels.
+    patterns : uint8 array [C, N, H, W]
+        Gray levels; the irradiances of a colour's N patterns add.
     targets : float array [C, K, H, W]
         Irradiance.
     weight : float array [H, W] or None
@@ -102,7 +102,7 @@ def qualities_of(
         Planes of the first colour first.
     """
     light = np.stack(
-        [[shown(path, gray) for path in stack] for stack, gray in zip(stacks, patterns, strict=True)]
+        [[shown(path, gray).mean(0) for path in stack] for stack, gray in zip(stacks, patterns, strict=True)]
     )
     if approximator is not None:
         for c in range(len(light)):
@@ -110,6 +110,6 @@ def qualities_of(
         approximator.correct()
         light[:, 0] = approximator.corrected
     region = None if weight is None else weight > 0
-    shape = patterns.shape[1:]
+    shape = patterns.shape[2:]
     pairs = zip(light.reshape(-1, *shape), targets.reshape(-1, *shape), strict=True)
     return tuple(quality(one, target, region) for one, target in pairs)

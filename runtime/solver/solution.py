@@ -13,18 +13,22 @@ from runtime.solver.quality import Quality
 
 @dataclass
 class Solution:
-    """Patterns for the colours of one picture; one colour has no axis of its own.
+    """Patterns for the colours and frames of one picture; one colour and one frame have no axis of their own.
 
     Both arrays belong to the solver: its second next solve writes `gray` again, its next solve writes `phase` again.
 
     Attributes
     ----------
-    gray : uint8 array [C, H, W] or [H, W]
+    gray : uint8 array [C, N, H, W], [C, H, W], [N, H, W] or [H, W]
         Gray levels to send to the panel.
-    phase : float array [C, H, W] or [H, W], rad
+    phase : float array, of the same shape, rad
         What was asked of the panel, before rounding.
     psnr_db : tuple of float, dB
-        Amplitude PSNR before rounding, at the start and after each iteration, on the solver's own grid.
+        Amplitude PSNR before rounding, at the start and after each iteration, on the solver's own grid. Where the
+        panel's few levels are in the loop, of phases that are rounded ever more sharply.
+    expected_psnr_db : float, dB
+        The pattern's PSNR on the solver's own grid, known at once: the best of `psnr_db`, or, with few levels in the
+        loop, that of the gray levels.
     milliseconds : float, ms
         From the target to the gray levels.
     """
@@ -32,6 +36,7 @@ class Solution:
     gray: np.ndarray
     phase: np.ndarray
     psnr_db: tuple[float, ...]
+    expected_psnr_db: float
     milliseconds: float
     _judge: Callable[[], tuple[Quality, ...]] = field(repr=False)
 
@@ -40,16 +45,11 @@ class Solution:
         """Steps that were made."""
         return len(self.psnr_db) - 1
 
-    @property
-    def expected_psnr_db(self) -> float:
-        """The pattern's PSNR on the solver's own grid, known at once: the best of `psnr_db`."""
-        return max(self.psnr_db)
-
     @cached_property
     def qualities(self) -> tuple[Quality, ...]:
         """Of the gray levels, through the whole padded light path on the fine grid, a colour and plane each.
 
-        Computed when first asked for.
+        Of several frames, of the mean of their irradiances. Computed when first asked for.
 
         Raises
         ------

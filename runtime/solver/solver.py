@@ -12,6 +12,7 @@ time never gives a worse one, up to the rounding to gray levels.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -30,9 +31,11 @@ from runtime.solver.objective import Objective, needs_fine_grid
 from runtime.solver.penalty import PENALTIES
 from runtime.solver.quality import Quality, qualities_of
 from runtime.solver.retrieval_methods import METHODS, OLDER_NAMES, Method
+from runtime.solver.soft_levels import FEW, SHARPNESS, SoftLevels, levels_a_turn
 from runtime.solver.solution import Solution
 from runtime.solver.solver_input import (
     check_approximator,
+    check_frames,
     check_iterations,
     checked_region,
     checked_target,
@@ -61,8 +64,8 @@ class Solver:
         One of PENALTIES.
     grid : str or None
         "panel" computes irradiance once a pixel. "fine" computes it twice an axis, for about four times the work;
-        that is worth it where the iris passes more than three quarters of the panel's band and there is time. None
-        decides by the iris.
+        that is worth it where the iris passes more than three quarters of the panel's band and there is time, and for
+        several frames, which come nearer to the picture. None decides by these.
     region : array [H, W] or None
         Which pixels count, or how much; light is free to go to the others.
     approximator : Approximator or None
@@ -71,6 +74,9 @@ class Solver:
         "gradient" takes D into each iteration; "predistorted" gives the optics a target that D makes right.
     initialiser : bytes or None
         A network in ONNX from a target's amplitude to a first phase.
+    frames : int
+        Patterns for each colour of a picture, shown in quick turn: their irradiances add in the eye. They are solved
+        for together; where the panel has few levels, these are in the loop.
     on : Backend or None
         Where the arrays are; None: the machine's own.
     **options
@@ -94,6 +100,7 @@ class Solver:
         approximator: Approximator | None = None,
         through: str = "predistorted",
         initialiser: bytes | None = None,
+        frames: int = 1,
         on: Backend | None = None,
         **options: Any,
     ) -> None:
@@ -108,15 +115,21 @@ class Solver:
                 raise InputError(f"there is no {what} '{name}': {nearest(name, known)}")
         self.stacks = stacked(paths)
         self.shape = self.stacks[0][0].grid.shape
-        self.drives = [DriveRange(stack[0], levels) for stack in self.stacks]
+        self.frames = check_frames(frames, method)
+        self.drives = [DriveRange(stack[0], levels) for stack in self.stacks for _ in range(frames)]
         if approximator is not None:
             check_approximator(approximator.shape, self.stacks)
         self.approximator, self.through = approximator, through
         self.region = checked_region(region, self.shape)
         self.on = on or backend()
-        fine = needs_fine_grid(self.stacks) if grid is None else grid == "fine"
+        fine = frames > 1 or needs_fine_grid(self.stacks) if grid is None else grid == "fine"
         in_the_loop = approximator if through == "gradient" else None
-        self.objective = Objective(self.stacks, 2 if fine else 1, penalty, self.region, in_the_loop, self.on)
+        self.objective = Objective(
+            self.stacks, 2 if fine else 1, penalty, self.region, in_the_loop, self.on, frames
+        )
+        if frames > 1 and min(map(levels_a_turn, self.drives)) <= FEW:
+            on, objective = self.on, self.objective
+            objective.rounding = SoftLevels(self.drives, objective.shape, objective.strip, on)
         self.first = FirstPhases(self.objective, self.stacks, self.drives, initialiser)
         made = METHODS[method]
         self.method: Method | None = made(self.objective, self.drives, **options) if made else None
@@ -125,7 +138,7 @@ class Solver:
                 "gerchberg_saxton constrains amplitude: use penalty amplitude, predistorted targets"
             )
         xp, real = self.on.xp, self.stacks[0][0].response.dtype
-        whole = (len(self.stacks), *self.shape)
+        whole = self.objective.shape
         self.phases = [xp.zeros(whole, real) for _ in range(3)]
         self.grays = [np.zeros(whole, np.uint8) for _ in range(2)]
         self.before = np.zeros(self.shape, real)
@@ -148,6 +161,8 @@ class Solver:
         The start is always made, also past the deadline. The first solve with a deadline measures this machine
         beforehand.
 
+        Of several frames, the solution's arrays have them behind the colours: [N, H, W] or [C, N, H, W].
+
         Parameters
         ----------
         target : array [H, W], or a colour each [C, H, W], or a plane each too [C, K, H, W] ([K, H, W] for one colour)
@@ -157,7 +172,7 @@ class Solver:
         deadline_ms : float or None, ms
             From the target to the gray levels.
         start : float array [H, W] or [C, H, W], or None, rad
-            Phase to begin from; None: double phase.
+            Phase to begin from, of each frame; None: double phase.
         progress : callable or None
             Called with the iterations done and the best PSNR (dB) so far.
 
@@ -244,16 +259,53 @@ class Solver:
         self.follows = True
         if iterations is None:
             iterations = ITERATIONS if deadline_ms is None else _ENDLESS
-        if self.method is None:
-            iterations = 0
-        else:
-            self.method.begin()
-        deadline = Deadline(deadline_ms, self.step, self.finish)
-        now, self.best = self.phases[0], self.phases[0]
-        lowest = self.objective.look(now)
-        history = [self.objective.psnr_db]
+        history: list[float] = []
+        rounding = self.objective.rounding
+        stages = (0.0,) if rounding is None else SHARPNESS
+        for stage, sharpness in enumerate(stages, 1):
+            if rounding is not None:
+                rounding.sharpness = sharpness
+            part = None if deadline_ms is None else deadline_ms * stage / len(stages)
+            self._descend(begun, iterations * stage // len(stages), part, history, progress)
         clock = time.perf_counter()
-        self.begin.took(1e3 * (clock - begun))
+        expected = max(history)
+        if rounding is not None:
+            rounding.sharpness = math.inf
+            self.objective.look(self.best)
+            expected = self.objective.psnr_db
+        self.grays.reverse()
+        for drive, phase, gray in zip(self.drives, self.best, self.grays[0], strict=True):
+            drive.gray(self.on.to_host(phase), gray)
+        done = time.perf_counter()
+        self.finish.took(1e3 * (done - clock))
+        gray, phase = self.grays[0], self.on.to_host(self.best)
+        leading = [n for n in (len(self.stacks), self.frames) if n > 1]
+        gray, phase = (a.reshape(*leading, *self.shape) for a in (gray, phase))
+        self.solved += 1
+        judge = partial(self._judged, self.grays[0], targets, self.solved)
+        return Solution(gray, phase, tuple(history), expected, 1e3 * (done - begun), judge)
+
+    def _descend(
+        self,
+        begun: float,
+        iterations: int,
+        deadline_ms: float | None,
+        history: list[float],
+        progress: IterationReport | None,
+    ) -> None:
+        """Steps until `history` (PSNR, dB, at the start and after each) has that many, or the time is used up.
+
+        From phases[0], or from the best phase of the stage before.
+        """
+        deadline = Deadline(deadline_ms, self.step, self.finish)
+        now = self.best = self.best if history else self.phases[0]
+        if self.method is not None:
+            self.method.begin()
+        lowest = self.objective.look(now)
+        clock = time.perf_counter()
+        if not history:
+            history.append(self.objective.psnr_db)
+            self.begin.took(1e3 * (clock - begun))
         while True:
             if progress:
                 progress(len(history) - 1, max(history))
@@ -270,17 +322,6 @@ class Solver:
                 lowest, self.best = loss, now
             before, clock = clock, time.perf_counter()
             self.step.took(1e3 * (clock - before))
-        self.grays.reverse()
-        for drive, phase, gray in zip(self.drives, self.best, self.grays[0], strict=True):
-            drive.gray(self.on.to_host(phase), gray)
-        done = time.perf_counter()
-        self.finish.took(1e3 * (done - clock))
-        gray, phase = self.grays[0], self.on.to_host(self.best)
-        if len(gray) == 1:
-            gray, phase = gray[0], phase[0]
-        self.solved += 1
-        judge = partial(self._judged, self.grays[0], targets, self.solved)
-        return Solution(gray, phase, tuple(history), 1e3 * (done - begun), judge)
 
     def _aim(self, targets: np.ndarray) -> np.ndarray:
         """Point the objective at targets; returns those that the optics should show."""
@@ -295,7 +336,8 @@ class Solver:
             raise InputError(
                 "the pattern has been written again: ask for its quality before the second next solve"
             )
-        return qualities_of(self.stacks, patterns, targets, self.region, self.approximator)
+        grays = patterns.reshape(len(self.stacks), self.frames, *self.shape)
+        return qualities_of(self.stacks, grays, targets, self.region, self.approximator)
 
     def _checked(self, target: np.ndarray) -> np.ndarray:
         return checked_target(target, len(self.stacks), len(self.stacks[0]), self.shape)

@@ -10,6 +10,8 @@ import numpy as np
 from firmware_iface.errors import InputError
 from runtime.lightpath.light_path import LightPath
 
+MOST_FRAMES = 32  # patterns for each colour of a picture; each takes as much memory as a colour
+
 
 def stacked(paths: Any) -> list[list[LightPath]]:
     """Light paths as colours of planes.
@@ -108,6 +110,15 @@ def check_iterations(iterations: int | None) -> None:
     """Raise InputError for a number of iterations below zero."""
     if iterations is not None and iterations < 0:
         raise InputError(f"{iterations} iterations: give 0 (the start alone) or more")
+
+
+def check_frames(frames: int, method: str) -> int:
+    """The number of patterns a picture; InputError where it is out of range or the method has one only."""
+    if not 1 <= frames <= MOST_FRAMES:
+        raise InputError(f"{frames} frames a picture: give from 1 to {MOST_FRAMES}")
+    if frames > 1 and method in ("gerchberg_saxton", "double_phase"):
+        raise InputError(f"{method} makes one pattern a picture: use bfgs or adam for {frames} frames")
+    return frames
 
 
 def check_approximator(shape: tuple[int, int, int], stacks: list[list[LightPath]]) -> None:

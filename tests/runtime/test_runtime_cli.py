@@ -15,7 +15,7 @@ from PIL import Image
 from runtime.bundle.bundle_folder import read_bundle, write_bundle
 from runtime.bundle.light_path_arrays import load_light_path, pack_light_paths
 from runtime.cli import main
-from runtime.solver import quality_of
+from runtime.solver import quality, quality_of, shown
 from runtime.solver.targets import encode_srgb, read_target
 from tests.runtime.benches import converted, ideal_path, scene
 
@@ -144,6 +144,31 @@ def test_colours_get_a_pattern_each_of_their_own_part_of_the_picture(
     assert (tmp_path / "b.png").read_bytes() == (tmp_path / "p-blue.png").read_bytes()
 
 
+def test_frames_of_a_picture_are_numbered_and_their_mean_is_judged(
+    green: Path, colour: Path, picture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    patterns = solved(capsys, green, picture, "--out", tmp_path / "p.png", "--iterations", 8, "--frames", 2)
+    assert [p["phase"] for p in patterns] == [str(tmp_path / f"p-{n}.png") for n in (1, 2)]
+    assert [p["frame"] for p in patterns] == [1, 2]
+    path = load_light_path(read_bundle(green), "green", 6.0)
+    light = [shown(path, np.asarray(Image.open(p["phase"]))) for p in patterns]
+    seen = quality((light[0] + light[1]) / 2, read_target(picture, SHAPE))
+    assert all(p["psnr_db"] == pytest.approx(seen.psnr_db, abs=1e-3) for p in patterns)
+    (one,) = solved(capsys, green, picture, "--out", tmp_path / "one.png", "--iterations", 8, "--frames", 1)
+    (plain,) = solved(capsys, green, picture, "--out", tmp_path / "plain.png", "--iterations", 8)
+    assert Path(one["phase"]).read_bytes() == Path(plain["phase"]).read_bytes()
+    assert one["frame"] == plain["frame"] == 1
+    assert seen.psnr_db > one["psnr_db"] + 1
+    many = solved(capsys, colour, picture, "--out", tmp_path / "d", "--iterations", 1, "--frames", 10)
+    assert len(many) == 30
+    assert Path(many[0]["phase"]).name == "picture-red-01.png"
+    code, said, _ = run(
+        capsys, "solve", green, picture, "--out", tmp_path / "q", "--iterations", 1, "--frames", 2
+    )
+    assert code == 0
+    assert said.count("(the mean of 2 frames)") == 1
+
+
 def test_a_deadline_names_of_solvers_and_an_iris_beside_the_axis(
     green: Path, picture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -209,6 +234,12 @@ def test_bad_input_is_one_line_and_exit_code_2(
         (("solve", green, tmp_path / "none.png", *out), "none.png is missing"),
         (("solve", green, picture), "--out"),
         (("solve", green, picture, *out, "--iterations", "-1"), "'-1' is not a whole number from 0"),
+        (("solve", green, picture, *out, "--frames", "0"), "'0' is not a whole number from 1 to 32"),
+        (("solve", green, picture, *out, "--frames", "two"), "'two' is not a whole number from 1 to 32"),
+        (
+            ("solve", green, picture, *out, "--frames", "2", "--solver", "gerchberg_saxton"),
+            "one pattern a picture",
+        ),
         (("solve", green, picture, *out, "--plane", "near"), "'near' is not a distance in mm"),
         (("solve", green, picture, *out, "--plane", "5"), "no plane at 5 mm for green: use one of 4, 6"),
         (("solve", green, picture, *out, "--channel", "gren"), "did you mean 'green'"),
