@@ -18,6 +18,8 @@ from trainer.fitting.pool import Pool
 from trainer.model.model import Model
 from trainer.model.parameters import json_values
 
+# A number for each pixel takes up a little of whatever stays in its place: share of the excess that it must remove.
+PIXEL_SHARE = 0.01
 FITTED_TOGETHER = 3  # candidates fitted with the present effects free, when none explains anything alone
 
 
@@ -175,6 +177,8 @@ def rank(
     for one in ordered:
         removed = removed_excess(before, one.held_out)
         worth_adding = thresholds.worth_adding(removed, ideal_excess, candidates)
+        if any(p.per_pixel for p in known[one.effect].parameters):
+            worth_adding = worth_adding and removed.value > PIXEL_SHARE * before.excess
         alike = tuple(
             other.effect
             for other in ordered
