@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from urllib.error import HTTPError
@@ -226,10 +227,10 @@ def test_an_earlier_step_is_compared_with_the_present_model(browser: Any, home: 
         ).click()
         playwright.expect(ladder).to_be_visible()
         idle(page)
-    for _ in range(10):  # a click on a page that is just being drawn anew may be lost
-        if button(page, "Compare").count():
-            button(page, "Compare").click()
-        page.wait_for_timeout(3000)
+    for _ in range(8):  # a click on a page that is just being drawn anew may be lost
+        with suppress(playwright.TimeoutError):
+            button(page, "Compare").click(timeout=5000)
+        page.wait_for_timeout(5000)
         if page.get_by_label("Second model").is_visible():
             break
     page.get_by_label("Second model").select_option("step 0")
