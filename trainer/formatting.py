@@ -53,6 +53,18 @@ def percent(share: Any, digits: int = 3) -> str:
     return "–" if share is None or not math.isfinite(share) else f"{number(100 * share, digits)} %"
 
 
+def change_of(step: Mapping[str, Any]) -> str:
+    """What a step of a ladder changed, with names as in a model file; "" for the start.
+
+    Parameters
+    ----------
+    step : mapping
+        A step of `explain --json` or a record of a model's history: `added`, `removed` and `refined`, where given.
+    """
+    signs = (("+", "added"), ("−", "removed"), ("map of", "refined"))
+    return " ".join(f"{sign} {step[key]}" for sign, key in signs if step.get(key))
+
+
 def measured(value: Any, error: Any = None, unit: str = "") -> str:
     """A value with its standard error, rounded to the error's second digit, and unit."""
     tail = "" if unit in UNITLESS else f" {unit}"

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from runtime.program.progress import no_progress
 from tests.trainer.hidden import bench_file
 from tests.trainer.test_unregistered import taken
 from trainer.captures.acquire import acquire_from
@@ -16,6 +17,7 @@ from trainer.captures.batches import Batch, load
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.held_out import capture_roles
 from trainer.captures.smoothing import smoothed
+from trainer.diagnosis.diagnosis import screen_candidates
 from trainer.diagnosis.explanation import explain
 from trainer.diagnosis.together import explain_together
 from trainer.diagnosis.verdict import Thresholds
@@ -89,7 +91,8 @@ def test_what_is_not_needed_is_left_out_again(captures: CaptureSet) -> None:
     errors = evaluate_captures(captures, roles.held_out, ideal)
     names = ("illumination", "distance", "phase_response", "misregistration", "zero_order")
     with open_pool(1) as pool:
-        found = explain_together(roles, ideal, errors, known(*names), pool, Thresholds())
+        screened = screen_candidates(roles, ideal, known(*names), pool, no_progress)
+    found = explain_together(roles, ideal, errors, known(*names), screened, Thresholds())
     assert found is not None
     assert set(found.model.names) == set(names[:-1])
     assert [name for name, _ in found.ladder] != [] and found.ladder[-1][1].excess < 0.02 * errors.excess
@@ -102,7 +105,8 @@ def test_one_strong_effect_alone_is_not_far_away(tmp_path: Path) -> None:
     ideal = with_gains(captures, Model(captures.bench), roles.fitted)
     errors = evaluate_captures(captures, roles.held_out, ideal)
     with open_pool(1) as pool:
-        found = explain_together(roles, ideal, errors, known("distance", "illumination"), pool, Thresholds())
+        screened = screen_candidates(roles, ideal, known("distance", "illumination"), pool, no_progress)
+    found = explain_together(roles, ideal, errors, catalogue(), screened, Thresholds())
     assert found is None
 
 

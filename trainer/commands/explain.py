@@ -156,25 +156,33 @@ def show(result: Result, args: Namespace, screen: Screen) -> None:
     rows = []
     first = args.model.name if args.model else "ideal model"
     for step in result["steps"]:
-        what = step["added"] or (f"without {step['removed']}" if step.get("removed") else first)
+        what = step["added"] or _other_change(step) or first
         also = ", ".join(step["indistinguishable_from"]) or ""
         rows.append((what, step["nrmse"], step["excess"], also))
     screen.table(("added", "nrmse", "excess", "not told apart from"), rows)
     learned = result.get("learned")
     if learned:
-        for step in learned["steps"]:
-            screen.table(("learned at", "nrmse", "excess"), [(step["stage"], step["nrmse"], step["excess"])])
+        at = [(step["stage"], step["nrmse"], step["excess"]) for step in learned["steps"]]
+        if at:
+            screen.table(("learned at", "nrmse", "excess"), at)
         screen.say(f"\n{learned['sentence']}")
     screen.say(f"\nThe camera's noise alone: nrmse {result['noise_nrmse']:.4g}.")
     say_suggested(result, screen)
     screen.say(f"\nThe model is {args.out}." + (f" The report is {args.report}." if args.report else ""))
-    if result["verdict"] == "complete":
+    if result["verdict"] == "complete" or (learned and learned["at_floor"]):
         then_export(args.out, args, screen)
     elif result["verdict"] == "outside_catalogue":
         then_propose(args.out, args, screen)
         then_write_or_learn(result.get("stage"), args.out, args, screen)
     else:
         screen.next(command_line("diagnose", args.captures, args=args, model=args.out))
+
+
+def _other_change(step: Result) -> str:
+    """What a step without a new effect did, in words; "" for the first one."""
+    if step.get("removed"):
+        return f"without {step['removed']}"
+    return f"map of {step['refined']}" if step.get("refined") else ""
 
 
 def _explained(result: Result) -> str:

@@ -172,6 +172,7 @@ def diagnose(
     progress: Progress | None = None,
     ideal: PredictionErrors | None = None,
     with_probes: bool = True,
+    screened: Sequence[ScreenResult] | None = None,
 ) -> Diagnosis:
     """What is missing from `model` on a capture set.
 
@@ -186,6 +187,8 @@ def diagnose(
     with_probes : bool
         False leaves out what the verdict does not need: the stages' free-form probes unless nothing named fits, and
         all of it for a complete model.
+    screened : sequence of ScreenResult, optional
+        What `screen_candidates` says of this very model, where it was asked before.
     """
     thresholds = thresholds or Thresholds()
     report = progress or no_progress
@@ -214,8 +217,8 @@ def diagnose(
             equal_facts=equal_facts(model, captures),
         )
 
-    candidates = [e for e in known.values() if e.name not in model.names and tells(e, captures)]
-    screened = screen_all(roles, model, candidates, pool, report)
+    if screened is None:
+        screened = screen_candidates(roles, model, known, pool, report)
     order = sorted(screened, key=lambda s: -s.removed_excess)
     promising = [
         s for s in order[:FITTED_FIRST] if s.removed_excess > 0.05 * max(order[0].removed_excess, 1e-12)
@@ -224,15 +227,15 @@ def diagnose(
     blind = [s for s in order if known[s.effect].rugged or known[s.effect].measure]
     first = promising + [s for s in blind if s not in promising]
     fits = try_all(roles, model, before, first[:2] if little else first, pool, report, 0.3, 0.6)
-    ranking = rank(before, fits, known, thresholds, ideal_excess, len(candidates))
+    ranking = rank(before, fits, known, thresholds, ideal_excess, len(screened))
     if not complete and not any(r.worth_adding for r in ranking):
         rest = [s for s in order if s.effect not in {f.effect for f in fits}]
         fits += try_all(roles, model, before, rest, pool, report, 0.6, 0.7)
-        ranking = rank(before, fits, known, thresholds, ideal_excess, len(candidates))
+        ranking = rank(before, fits, known, thresholds, ideal_excess, len(screened))
         if model.present and not any(r.worth_adding for r in ranking):
             report(0.7, "fitting candidates and present effects together")
             without, together = try_together_with_present(roles, model, fits, pool)
-            jointly = rank(without, together, known, thresholds, ideal_excess, len(candidates))
+            jointly = rank(without, together, known, thresholds, ideal_excess, len(screened))
             ranking = jointly + [r for r in ranking if r.effect.name not in {f.effect for f in together}]
     verdict = verdict_of(complete, bool(ranking) and ranking[0].worth_adding)
 
@@ -268,6 +271,14 @@ def diagnose(
 def tells(effect: Effect, captures: CaptureSet) -> bool:
     """Whether captures can tell an effect from the one that it equals at one colour and plane."""
     return not effect.same_as or len(scenes(captures.captures)) > 1
+
+
+def screen_candidates(
+    roles: CaptureRoles, model: Model, known: Catalogue, pool: Pool, report: Progress
+) -> list[ScreenResult]:
+    """Screen the effects that a model lacks and that the captures can tell."""
+    candidates = [e for e in known.values() if e.name not in model.names and tells(e, roles.captures)]
+    return screen_all(roles, model, candidates, pool, report)
 
 
 def screen_all(

@@ -1,8 +1,8 @@
 """Where the error of a prediction goes: named physics, what was learned, the camera's noise, and what is left.
 
 All are shares of the measured signal's variance on held-out captures, and add up to the ideal model's mean squared
-error: what the named effects remove from it, what the panel's learned field and the network remove after them (both
-are counted as `network`), the camera's noise, and the rest.
+error: what the named effects remove from it, what was learned at stages and the network remove after them
+(all of it is counted as `network`), the camera's noise, and the rest.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class ErrorBudget:
     Attributes
     ----------
     named_physics, network : float
-        What effects, and what the learned field and the network remove; negative where they make it worse.
+        What effects, and what is learned without a name, remove; negative where they make it worse.
     noise : float
         The camera's noise.
     unexplained : float
@@ -72,8 +72,8 @@ def error_budget(
     ideal = with_gains(captures, Model(captures.bench, method=model.method), divided.fitted)
     model = with_gains(captures, replace(model, gain={}), divided.fitted)
     named = model
-    if model.panel_field is not None:
-        named = with_gains(captures, replace(model, gain={}, panel_field=None), divided.fitted)
+    if model.panel_field is not None or model.learned:
+        named = with_gains(captures, replace(model, gain={}, panel_field=None, learned={}), divided.fitted)
     stacks = stacked(captures, divided.held_out)
     rows: list[tuple[PredictionErrors, PredictionErrors, PredictionErrors]] = []
     with torch.no_grad():

@@ -13,10 +13,10 @@ from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.capture_table import Capture
 from trainer.captures.held_out import FIT_CAPTURES, CaptureRoles, capture_roles, scenes, split, with_stopping
-from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors
+from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors, screen_candidates
 from trainer.diagnosis.learned_rest import LearnedRest, learn_rest
 from trainer.diagnosis.screen import ScreenResult, screen_batches
-from trainer.diagnosis.together import explain_together
+from trainer.diagnosis.together import explain_together, is_far
 from trainer.diagnosis.unnecessary import without_one
 from trainer.diagnosis.verdict import Thresholds, below_the_noise
 from trainer.effects.definition import Effect
@@ -134,7 +134,7 @@ class Explanation:
         """The object that `explain --json` prints.
 
         Keys `steps`, `verdict`, `stage`, `noise_nrmse`, `model`, `sentence`, `held_out` (false where the captures
-        hold one pattern), `suggested_captures` and `equal_facts`.
+        hold one pattern), `suggested_captures`, `equal_facts`, and `learned` where that was asked for.
         """
         return {
             "steps": [s.as_json() for s in self.steps],
@@ -294,8 +294,14 @@ def explain(
             if save:
                 save(model)
 
-    together = explain_together(roles, model, errors, known, pool, thresholds, part_of(report, 0, 0.4))
+    screened = together = None
+    if is_far(roles, model, errors):
+        screened = screen_candidates(roles, model, known, pool, report)
+        together = explain_together(
+            roles, model, errors, known, screened, thresholds, part_of(report, 0.3, 0.4)
+        )
     if together is not None:
+        screened = None  # of another model
         history = model
         for name, errors in together.ladder:
             history = recorded(history, name, errors)
@@ -308,7 +314,8 @@ def explain(
         done = len(steps) - 1
         report_share = part_of(report, 1 - 0.6**done, 1 - 0.6**done * 0.6)
         diagnosing = part_of(report_share, 0, 0.9)
-        found = diagnose(captures, model, known, pool, thresholds, diagnosing, ideal, with_probes=False)
+        found = diagnose(captures, model, known, pool, thresholds, diagnosing, ideal, False, screened)
+        screened = None
         diagnoses.append(found)
         best = found.best
         if best is None or len(model.names) >= MOST_EFFECTS:
@@ -347,7 +354,7 @@ def explain(
             found = diagnose(captures, model, known, pool, thresholds, None, ideal, with_probes=False)
             diagnoses.append(found)
     rest = None
-    if learn and diagnoses[-1].verdict == "outside_catalogue" and not below_the_noise(errors):
+    if learn and diagnoses[-1].verdict != "complete" and not below_the_noise(errors):
         rest = learn_rest(roles, model, diagnoses[-1], pool, part_of(report, 0.8, 1.0))
         model = rest.model
     report(1.0, "done")

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from runtime.excess import PredictionErrors
 from runtime.program.progress import Progress, no_progress, part_of
 from trainer.captures.batches import load
 from trainer.captures.held_out import CaptureRoles
-from trainer.diagnosis.diagnosis import screen_all, tells
+from trainer.diagnosis.screen import ScreenResult
 from trainer.diagnosis.unnecessary import without_one
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import Catalogue
 from trainer.fitting.gains import with_gains
 from trainer.fitting.joint_start import joint_start
-from trainer.fitting.pool import Pool
 from trainer.fitting.predictor import evaluate_captures
 from trainer.fitting.refit import settled
 from trainer.model.model import Model
@@ -39,12 +39,17 @@ class JointExplanation:
     ladder: tuple[tuple[str, PredictionErrors], ...]
 
 
+def is_far(roles: CaptureRoles, model: Model, errors: PredictionErrors) -> bool:
+    """Whether so much is missing from a model without effects that several strong ones may hide one another."""
+    return not model.present and errors.excess >= FAR and roles.is_held_out
+
+
 def explain_together(
     roles: CaptureRoles,
     model: Model,
     errors: PredictionErrors,
     known: Catalogue,
-    pool: Pool,
+    screened: Sequence[ScreenResult],
     thresholds: Thresholds,
     progress: Progress | None = None,
 ) -> JointExplanation | None:
@@ -53,25 +58,23 @@ def explain_together(
     Parameters
     ----------
     model : Model
-        Without effects, with fitted gains.
+        For which `is_far` holds, with fitted gains.
     errors : PredictionErrors
         Of `model` on the held-out captures.
+    screened : sequence of ScreenResult
+        What the screen expects of each effect alone.
 
     Returns
     -------
     JointExplanation or None
-        None where little is missing, where the screen expects that one effect alone removes half of it, and where all
-        together do not.
+        None where the screen expects that one effect alone removes half of what is missing, and where all together do
+        not.
     """
     report = progress or no_progress
-    if model.present or errors.excess < FAR or not roles.is_held_out:
-        return None
-    candidates = [e for e in known.values() if tells(e, roles.captures)]
-    screened = screen_all(roles, model, candidates, pool, report)
-    if min(s.after for s in screened) < HELPS * errors.excess:
+    if min((s.after for s in screened), default=errors.excess) < HELPS * errors.excess:
         return None
     batches = load(roles.captures, roles.fitted)
-    joint = settled(joint_start(model, known, batches, part_of(report, 0.3, 0.7)).model, batches).model
+    joint = settled(joint_start(model, known, batches, part_of(report, 0.0, 0.6)).model, batches).model
     after = evaluate_captures(roles.captures, roles.held_out, joint)
     if after.excess > HELPS * errors.excess:
         return None

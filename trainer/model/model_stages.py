@@ -14,7 +14,6 @@ from trainer.effects.free_form import surface_over
 from trainer.effects.own_effect import applied
 from trainer.model.model import EffectInstance, Model
 from trainer.prediction.free_stages import with_learned
-from trainer.prediction.panel_field import with_field
 from trainer.prediction.predict import bare_irradiance
 from trainer.prediction.scene import Scene, Stages, bare_stages, scene_at
 
@@ -88,13 +87,9 @@ def stages_of(scene: Scene, model: Model, tensors: Any = None) -> Stages:
         As in `stages_for`.
     """
     stages = stages_for(scene, model.present, tensors)
-    if model.panel_field is not None:
-        maps = {
-            name: torch.as_tensor(surface, dtype=scene.dtype) for name, surface in model.panel_field.items()
-        }
-        stages = replace(stages, panel=with_field(stages.panel, maps))
-    for stage, learned in model.learned.items():
-        stages = with_learned(stages, model.bench, stage, learned)
+    field = {} if model.panel_field is None else {"panel": model.panel_field}
+    for stage, maps in {**field, **model.learned}.items():
+        stages = with_learned(stages, model.bench, stage, maps)
     return stages
 
 

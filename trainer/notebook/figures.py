@@ -14,7 +14,7 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
 from trainer.diagnosis.comparison import CapturePicture
-from trainer.formatting import percent
+from trainer.formatting import change_of, percent
 from trainer.report.palettes import DIFFERENCE, IRRADIANCE, palette
 
 
@@ -68,7 +68,7 @@ def image_tag(figure: NotebookFigure, alt: str) -> str:
 
 
 def _draw_ladder(axes: Axes, ladder: Sequence[Mapping[str, Any]], noise: float) -> None:
-    labels = ["start" if not (s["added"] or s.get("removed")) else _change(s) for s in ladder]
+    labels = [change_of(s) or "start" for s in ladder]
     errors = [float(s["nrmse"]) for s in ladder]
     rows = np.arange(len(ladder))
     axes.plot(errors, rows, marker="o")
@@ -82,10 +82,6 @@ def _draw_ladder(axes: Axes, ladder: Sequence[Mapping[str, Any]], noise: float) 
     axes.set_yticks(rows, labels)
     axes.set_ylim(len(ladder) - 0.5, -0.5)
     axes.set_xlabel("error on held-out captures (nrmse)")
-
-
-def _change(step: Mapping[str, Any]) -> str:
-    return f"+ {step['added']}" if step["added"] else f"− {step['removed']}"
 
 
 def _draw_picture(axes: Sequence[Axes], pictures: Sequence[CapturePicture]) -> None:

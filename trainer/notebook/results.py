@@ -17,7 +17,7 @@ from trainer.diagnosis.comparison import Comparison
 from trainer.diagnosis.comparison import compare as compare_model
 from trainer.diagnosis.diagnosis import Diagnosis
 from trainer.diagnosis.explanation import Explanation
-from trainer.formatting import number
+from trainer.formatting import change_of, number
 from trainer.model.model import Model
 from trainer.notebook.figures import NotebookFigure, comparison_figure, explanation_figure, image_tag
 from trainer.report import write_report
@@ -284,7 +284,7 @@ class ExplanationResult:
 
     def _repr_html_(self) -> str:
         """What a notebook shows."""
-        rows = [(_step(step), step["nrmse"], step["excess"]) for step in self.ladder]
+        rows = [(change_of(step) or "start", step["nrmse"], step["excess"]) for step in self.ladder]
         return (
             f"<p>{escape(self.sentence)}</p>"
             + _table(("step", "nrmse", "excess"), rows)
@@ -317,12 +317,6 @@ def _viewed(every: Mapping[str, Callable[[], Any]], names: Sequence[str]) -> Any
         if name not in every:
             raise InputError(f"there is no view '{name}': {nearest(name, list(every))}")
     return together(every, names)
-
-
-def _step(step: dict[str, Any]) -> str:
-    if step["added"]:
-        return f"+ {step['added']}"
-    return f"− {step['removed']}" if step.get("removed") else "start"
 
 
 def _table(columns: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -244,8 +245,9 @@ LEARNED = "learned"  # table of a model file
 LEARNED_STAGES = ("drive", "pupil", "sensor")  # what is learned at the panel is its field (`panel_field`)
 
 
+@lru_cache(maxsize=8)
 def learned_stage(bench: Bench, stage: str) -> FreeFormStage:
-    """What may be learned at a stage of LEARNED_STAGES: the stage's free form, as far as it is one light path."""
+    """What may be learned at a stage: its free form, as far as it is one light path."""
     free = FREE_STAGES[stage](bench)
     shapes = {n: s for n, s in free.shapes.items() if free.irradiance is None or n != "spread"}
     return replace(free, shapes=shapes, irradiance=None)

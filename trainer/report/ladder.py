@@ -7,7 +7,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from trainer.formatting import number, percent, plain
+from trainer.formatting import change_of, number, percent, plain
 from trainer.report.charts import ladder_chart
 
 
@@ -17,7 +17,7 @@ def ladder_rows(history: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     Parameters
     ----------
     history : sequence of mapping
-        Records with the keys `added`, `removed`, `nrmse`, `excess` and, if known, `noise_nrmse` and
+        Records with the keys `added`, `removed`, `refined`, `nrmse`, `excess` and, if known, `noise_nrmse` and
         `indistinguishable_from`.
 
     Returns
@@ -30,12 +30,10 @@ def ladder_rows(history: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     for record in history:
         if not isinstance(record.get("nrmse"), float):
             continue
-        parts = [
-            f"{sign} {record[key]}" for sign, key in (("+", "added"), ("−", "removed")) if record.get(key)
-        ]
-        if rows and not parts:
+        change = change_of(record)
+        if rows and not change:
             continue  # the start of a later explanation
-        change = " ".join(parts) or "ideal model"
+        change = change or "ideal model"
         rows.append(
             {
                 "label": plain(change),

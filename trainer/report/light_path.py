@@ -66,6 +66,8 @@ def _stage(
 ) -> Markup:
     title, about = ABOUT[name]
     held = Markup("").join(_effect(one, model) for one in model.present if one.effect.stage == name)
+    if name in model.learned:
+        held += EFFECT.format(every="", name="learned, without a name", values="")
     if name == "gray":
         board = model.bench.panel
         held = SMALL.format(f"{board.width} × {board.height}, {board.levels:g} levels")
