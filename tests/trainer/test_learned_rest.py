@@ -13,6 +13,7 @@ from trainer.captures.acquire import acquire_from
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.held_out import capture_roles
 from trainer.diagnosis.diagnosis import Diagnosis, diagnose
+from trainer.diagnosis.error_budget import error_budget
 from trainer.diagnosis.learned_rest import LearnedRest, learn_rest
 from trainer.effects.effect_catalogue import catalogue
 from trainer.fitting.pool import open_pool
@@ -41,6 +42,9 @@ def test_fringes_are_learned_at_the_sensor_and_stay_off_the_headset(tmp_path: Pa
     assert rest.steps[-1][1].excess < 0.05 * found.held_out.excess
     assert "Learned at the sensor" in rest.sentence
     assert rest.model.history[-1]["added"].startswith("learned_")
+
+    budget = error_budget(captures, rest.model)
+    assert abs(budget.named_physics) < 1e-9 and budget.network > 0.9 * found.held_out.excess
 
     write_model(tmp_path / "model.toml", rest.model)
     again = read_model(tmp_path / "model.toml", catalogue())

@@ -21,6 +21,7 @@ from trainer.formatting import measured, number, parameters, percent
 from trainer.model.model import Model, absent
 from trainer.report import write_report
 from trainer.report.heat_maps import blocks, heat_map, place
+from trainer.report.ladder import ladder_rows
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 HOSTILE = '<script>alert("1")</script> & $\\frac{a}$'
@@ -315,3 +316,15 @@ def test_parameters_by_colour_and_long_lists_are_one_line_each() -> None:
     assert [p.name for p in shown] == ["gain, red", "gain, blue", "offset", "map", "plain"]
     assert shown[0].text == "1.10 ± 0.10" and shown[2].text == "0.500 mm"
     assert "6 terms, together 0.500 rad" in shown[3].text and len(shown[3].terms) == 6
+
+
+def test_a_map_that_went_on_is_a_step_of_the_ladder() -> None:
+    errors = {"nrmse": 0.1, "noise_nrmse": 0.05, "excess": 0.01}
+    steps = [
+        {"added": "", **errors},
+        {"added": "illumination", **errors},
+        {"added": "", "refined": "illumination", **errors},
+        {"added": "", "removed": "crosstalk", **errors},
+    ]
+    changes = [row["change"] for row in ladder_rows(steps)]
+    assert changes == ["ideal model", "+ illumination", "map of illumination", "− crosstalk"]
