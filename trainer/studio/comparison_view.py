@@ -106,10 +106,11 @@ def comparison_view(project: Project, visit: Visit) -> Any:
                 f"<p class='{'bad-text' if fault else 'quiet'}'>{escape(fault) or 'Predicting …'}</p>"
             )
             return
-        if found is not pictures.shown or other is not pictures.other:
-            pictures.show(found, other)
-        note.object = _words(project, found)
-        scales.object = scales_html(pictures)
+        with pn.io.hold(visit.document):  # one message, not one for each change
+            if found is not pictures.shown or other is not pictures.other:
+                pictures.show(found, other)
+            note.object = _words(project, found)
+            scales.object = scales_html(pictures)
 
     def choose(event: Any) -> None:
         if event.new and event.new != visit.capture:

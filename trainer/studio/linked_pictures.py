@@ -67,7 +67,7 @@ class LinkedPictures:
             active_scroll="wheel_zoom",
             toolbar_location=None,
             min_border=0,
-            lod_timeout=60,  # ms after a zoom until finer pixels are asked for
+            lod_timeout=20,  # ms after a zoom until finer pixels are asked for
             width=400,
             height=max(1, round(400 * height / width)),
             sizing_mode="scale_width",
