@@ -102,3 +102,59 @@ def test_images_moved_far_are_not_taken_for_the_wrong_ones(tmp_path, capsys) -> 
     problems = ran(capsys, "check", captures)["problems"]
     assert [p["kind"] for p in problems if p["kind"] != "too_few"] == ["shifted"]
     assert "-31 rows and -44 columns" in problems[-1]["message"]
+
+
+def test_a_plane_that_is_misread_is_a_fact_of_the_table(tmp_path, capsys) -> None:
+    captures = captured(capsys, tmp_path, options=TWO_PLANES)
+    table = captures / "captures.csv"
+    assert ",18.0," in table.read_text()
+    table.write_text(table.read_text().replace(",18.0,", ",17.4,"))
+    found = ran(capsys, "diagnose", captures, "--workers", 1)
+    (fact,) = found["table_facts"]
+    assert fact["fact"] == "plane_mm" and fact["stated"] == 17.4
+    assert fact["value"] == pytest.approx(18.0, abs=max(0.005, 4 * fact["error"]))
+    assert "captures.csv" in found["sentence"] and "17.4" in found["sentence"]
+
+
+def test_a_distance_that_is_off_alike_is_no_fact_of_the_table(tmp_path, capsys) -> None:
+    captures = captured(capsys, tmp_path, 'kind = "distance"\noffset_mm = 0.5', options=TWO_PLANES)
+    found = ran(capsys, "diagnose", captures, "--workers", 1)
+    assert found["ranking"][0]["effect"] == "distance" and found["table_facts"] == []
+
+
+@pytest.mark.parametrize("drifts", [False, True])
+def test_an_exposure_that_is_misread_is_a_fact_of_the_table(drifts, tmp_path, capsys) -> None:
+    secrets = ('kind = "laser_drift"',) if drifts else ()
+    captures = captured(capsys, tmp_path, *secrets)
+    table = captures / "captures.csv"
+    head, *rows = table.read_text().splitlines()
+    column = head.split(",").index("exposure_ms")
+    changed = []
+    for k, row in enumerate(rows):
+        cells = row.split(",")
+        if k % 3 == 2:  # these captures were taken at the same exposure as the others
+            cells[column] = str(float(cells[column]) * 1.1)
+        changed.append(",".join(cells))
+    table.write_text("\n".join([head, *changed]) + "\n")
+    found = ran(capsys, "diagnose", captures, "--workers", 1)
+    assert found["ranking"][0]["effect"] == "laser_drift"
+    facts = found["table_facts"]
+    if drifts:  # a drift of several per cent hides which exposure is wrong
+        assert all(abs(f["value"] / f["stated"] - 1 / 1.1) < 5 * f["error"] for f in facts)
+    else:
+        (fact,) = facts
+        assert fact["fact"] == "exposure_ms" and fact["value"] == pytest.approx(
+            fact["stated"] / 1.1, rel=0.003
+        )
+        assert "captures.csv" in found["sentence"]
+
+
+def test_a_wrong_black_level_looks_like_stray_light_and_is_said(tmp_path, capsys) -> None:
+    captures = captured(capsys, tmp_path)
+    state(captures, "black_level", 52)
+    found = explained(capsys, captures, tmp_path)
+    assert [s["added"] for s in found["steps"]] == [None, "stray_light"]
+    (fact,) = found["equal_facts"]
+    assert fact["fact"] == "camera.black_level" and fact["value"] == pytest.approx(64, abs=1)
+    assert "black_level" in found["sentence"]
+    assert any("laser off" in s for s in found["suggested_captures"])

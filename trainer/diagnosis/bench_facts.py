@@ -1,8 +1,9 @@
-"""Facts of bench.toml that captures cannot tell from a fitted distance or wavelength.
+"""Facts of bench.toml that captures cannot tell from a fitted distance, wavelength or stray light.
 
 Near the axis, light from a panel of pixels arrives by wavelength x distance / pitch^2 alone. So at one plane a wrong
 distance, wavelength or pixel pitch is one number. Another plane tells a distance that is off by the same length
-everywhere from the other two; a second colour tells one wrong wavelength from a wrong pitch.
+everywhere from the other two; a second colour tells one wrong wavelength from a wrong pitch. Stray light that is the
+same everywhere adds counts as a wrong black level does.
 """
 
 from __future__ import annotations
@@ -21,6 +22,9 @@ from trainer.model.model import Model
 PLANES = (0.6, 1.6)  # proposed planes, as shares of the stated distance
 ALIKE = 3.0  # standard errors up to which two colours are off in the same proportion
 LEAST = 1e-4  # a proportion closer to 1 says nothing of the facts
+FLAT = (
+    0.9  # share of stray light's counts, squared, that is the same everywhere where it may be the black level
+)
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,7 @@ class EqualFacts:
     Attributes
     ----------
     effect : str
-        "distance" or "wavelength"; "" for none.
+        "distance", "wavelength" or "stray_light"; "" for none.
     facts : tuple of EqualFact
         Empty for none.
     planes_mm : tuple of float, mm
@@ -77,11 +81,14 @@ class EqualFacts:
         facts = " or ".join(map(str, self.facts))
         if self.effect == "distance":
             return f"At one plane this distance cannot be told from {facts} in bench.toml."
-        return f"Instead of the wavelength, bench.toml may err in {facts}: that is the same here."
+        words = "stray light" if self.effect == "stray_light" else "the wavelength"
+        return f"Instead of {words}, bench.toml may err in {facts}: that is the same here."
 
     @property
     def deciding_captures(self) -> list[str]:
         """Captures that would tell which fact it is, as sentences."""
+        if self.effect == "stray_light":
+            return ["one capture with the laser off: what it shows is the black level, not stray light"]
         if not self.facts or len(self.planes_mm) > 1:
             return []
         near, far = (f"{self.planes_mm[0] * share:.3g}" for share in PLANES)
@@ -92,7 +99,7 @@ class EqualFacts:
 
 
 def equal_facts(model: Model, captures: CaptureSet) -> EqualFacts:
-    """Facts that would explain the captures as well as the model's distance or wavelength does."""
+    """Facts that would explain the captures as well as the model's distance, wavelength or stray light does."""
     bench, planes = model.bench, captures.planes
     if "distance" in model.names and len(planes) == 1 and planes[0]:
         ratio = 1 + float(model.instance("distance").values["offset"]) / planes[0]
@@ -112,7 +119,20 @@ def equal_facts(model: Model, captures: CaptureSet) -> EqualFacts:
         distance = EqualFact("propagation.distance_mm", stated, stated * common, stated * error)
         facts = (_pitch(bench, common, error), distance)
         return EqualFacts("wavelength", facts, planes)
+    if "stray_light" in model.names:
+        return _black_level(model, planes)
     return EqualFacts()
+
+
+def _black_level(model: Model, planes: tuple[float, ...]) -> EqualFacts:
+    """The black level that would explain stray light which is nearly the same everywhere."""
+    present, camera = model.instance("stray_light"), model.bench.camera
+    counts = np.atleast_1d(present.values["counts"])
+    same, error = float(counts[0]), 0.0 if present.errors is None else float(present.errors["counts"][0])
+    if same**2 < FLAT * float((counts**2).sum()) or abs(same) <= ALIKE * error:
+        return EqualFacts()
+    stated = float(camera.black_level)
+    return EqualFacts("stray_light", (EqualFact("camera.black_level", stated, stated + same, error),), planes)
 
 
 def _relative_error(model: Model, name: str, stated: float) -> float:

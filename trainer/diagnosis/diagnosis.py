@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,12 +14,13 @@ from trainer.captures.bench_file import Camera
 from trainer.captures.camera_numbers import camera_of_residual
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import CaptureRoles, capture_roles, scenes
-from trainer.diagnosis.bench_facts import EqualFacts, equal_facts
+from trainer.diagnosis.bench_facts import EqualFact, EqualFacts, equal_facts
 from trainer.diagnosis.previews import CandidatePreview, previews
 from trainer.diagnosis.probes import ProbeResult, probe
 from trainer.diagnosis.ranking import RankedEffect, rank, try_all, try_together_with_present
 from trainer.diagnosis.screen import ScreenResult, screen
 from trainer.diagnosis.separate import captures_that_separate
+from trainer.diagnosis.table_facts import DRIFT, exposure_facts, facts_sentence, plane_facts
 from trainer.diagnosis.verdict import Thresholds, below_the_noise, noise_floor, verdict_of
 from trainer.effects.definition import STAGES, Effect
 from trainer.effects.effect_catalogue import Catalogue
@@ -58,6 +59,8 @@ class Diagnosis:
     equal_facts : EqualFacts
         Facts of bench.toml that would explain the captures as well as the model's, or the best candidate's, distance
         or wavelength does.
+    table_facts : tuple of EqualFact
+        Planes and exposures of captures.csv that the captures contradict, with what they should be.
     """
 
     model: Model
@@ -73,6 +76,7 @@ class Diagnosis:
     is_held_out: bool = True
     equal_facts: EqualFacts = field(default_factory=EqualFacts)
     previews: tuple[CandidatePreview, ...] = ()
+    table_facts: tuple[EqualFact, ...] = ()
 
     @property
     def best(self) -> RankedEffect | None:
@@ -87,7 +91,11 @@ class Diagnosis:
 
     @property
     def sentence(self) -> str:
-        """The verdict in one sentence."""
+        """The verdict in one sentence, and what is to be corrected in captures.csv."""
+        return f"{self._verdict_sentence} {facts_sentence(self.table_facts)}".rstrip()
+
+    @property
+    def _verdict_sentence(self) -> str:
         left = number(self.held_out.excess, 2)
         if below_the_noise(self.held_out):
             return overstated_noise(self.held_out, self.model.bench.camera)
@@ -120,7 +128,7 @@ class Diagnosis:
 
         Keys `heldout`, `held_out` (false where the captures hold one pattern), `verdict`, `stage`, `stages`,
         `ranking`, `suggested_captures`, `ideal_excess`, `thresholds`,
-        `screen`, `equal_facts` and `sentence`.
+        `screen`, `equal_facts`, `table_facts` and `sentence`.
         """
         return {
             "heldout": self.held_out.as_json(),
@@ -134,6 +142,7 @@ class Diagnosis:
             "thresholds": self.thresholds.as_json(),
             "screen": [{"effect": s.effect, "excess_removed": s.removed_excess} for s in self.screened],
             "equal_facts": [f.as_json() for f in self.equal_facts.facts],
+            "table_facts": [f.as_json() for f in self.table_facts],
             "sentence": self.sentence,
         }
 
@@ -203,6 +212,7 @@ def diagnose(
 
     overstated = below_the_noise(before)
     if overstated or (little and not with_probes):
+        same = equal_facts(model, captures)
         return Diagnosis(
             model,
             before,
@@ -211,10 +221,11 @@ def diagnose(
             None,
             (),
             (),
-            (),
+            tuple(same.deciding_captures),
             thresholds,
             is_held_out=roles.is_held_out,
-            equal_facts=equal_facts(model, captures),
+            equal_facts=same,
+            table_facts=_exposures(roles, model, model.names),
         )
 
     if screened is None:
@@ -249,6 +260,12 @@ def diagnose(
         # A probe of a few thousand numbers that removes nothing on held-out captures points nowhere.
         telling = [p for p in probes if thresholds.worth_adding(p.removed, ideal_excess, len(probes))]
         stage = max(telling, key=lambda p: p.removed.value).stage if telling else None
+    table: tuple[EqualFact, ...] = ()
+    if verdict != "complete":
+        best = min([before, *(f.held_out for f in fits)], key=lambda e: e.excess)
+        table = plane_facts(roles, model, best, known, pool, thresholds, ideal_excess)
+    drifts = [f.effect for f in fits if f.held_out.excess < before.excess]
+    table += _exposures(roles, model, (*model.names, *drifts))
     same = equal_facts(ranking[0].model if verdict == "missing" else model, captures)
     suggestions = same.deciding_captures + suggest(roles, verdict, ranking)
     report(1.0, "done")
@@ -265,7 +282,14 @@ def diagnose(
         tuple(order),
         roles.is_held_out,
         same,
+        table_facts=table,
     )
+
+
+def _exposures(roles: CaptureRoles, model: Model, names: Collection[str]) -> tuple[EqualFact, ...]:
+    """Exposures that captures.csv states wrongly, where a gain of each capture is among the effects that help."""
+    rows = {c.capture: c for c in (*roles.fitted, *roles.held_out)}
+    return exposure_facts(roles.captures, tuple(rows.values()), model) if DRIFT in names else ()
 
 
 def tells(effect: Effect, captures: CaptureSet) -> bool:

@@ -134,7 +134,7 @@ class Explanation:
         """The object that `explain --json` prints.
 
         Keys `steps`, `verdict`, `stage`, `noise_nrmse`, `model`, `sentence`, `held_out` (false where the captures
-        hold one pattern), `suggested_captures`, `equal_facts`, and `learned` where that was asked for.
+        hold one pattern), `suggested_captures`, `equal_facts`, `table_facts`, and `learned` where that was asked for.
         """
         return {
             "steps": [s.as_json() for s in self.steps],
@@ -148,6 +148,7 @@ class Explanation:
                 dict.fromkeys(s for d in self.diagnoses for s in d.suggested_captures)
             ),
             "equal_facts": [f.as_json() for f in self.diagnosis.equal_facts.facts],
+            "table_facts": [f.as_json() for f in self.diagnosis.table_facts],
             **({} if self.learned is None else {"learned": self.learned.as_json()}),
         }
 
