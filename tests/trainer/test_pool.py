@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from firmware_iface.errors import InputError
 from trainer.captures.capture_set import CaptureSet, read_captures
@@ -77,9 +78,12 @@ def watched(captures: CaptureSet, own: Path, workers: int) -> tuple[Diagnosis, l
 
 
 @pytest.fixture(scope="module")
-def alone(captures: CaptureSet, own: Path) -> tuple[Diagnosis, list[float]]:
-    """What one process finds."""
-    return watched(captures, own, 1)
+def alone(captures: CaptureSet, own: Path) -> Iterator[tuple[Diagnosis, list[float]]]:
+    """What one process finds, by sums in the order of the pool's processes, which have one thread each."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield watched(captures, own, 1)
+    torch.set_num_threads(threads)
 
 
 def test_one_process_and_two_give_the_same_numbers(

@@ -81,6 +81,14 @@ class Batch:
             seen=self.mask,
         )
 
+    def first(self, count: int) -> Batch:
+        """The batch's first captures alone."""
+        tensors = {k: getattr(self, k)[:count] for k in ("gray", "signal", "mask", "noise", "exposure")}
+        seen = None if self.seen is None else self.seen[:count]
+        return replace(
+            self, ids=self.ids[:count], shown_before=lambda: self.shown_before()[:count], seen=seen, **tensors
+        )
+
     def as_compared(self, counts: Tensor) -> Tensor:
         """Predicted counts [B, h, w] as `signal` is: smoothed where it is smoothed."""
         return counts if self.seen is None else smoothed(self.seen * counts, self.smoothing_px)

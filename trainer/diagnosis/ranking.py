@@ -95,6 +95,8 @@ def try_all(
     """
     ids = tuple(c.capture for c in roles.fitted)
     held = tuple(c.capture for c in roles.held_out)
+    # The longest first, so that no process is left with one of them at the end.
+    screened = sorted(screened, key=lambda s: not s.start.effect.rugged)
 
     def fitted(count: int) -> None:
         report(start + (end - start) * count / max(1, len(screened)), "fitting candidates")

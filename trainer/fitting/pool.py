@@ -135,6 +135,8 @@ def open_pool(workers: int | None = None, cluster: str | None = None) -> Iterato
         yield Pool(_ThisProcess(), 1, elsewhere=False)
         return
     executor = _Processes(count, multiprocessing.get_context("spawn"), _single_threaded)
+    for _ in range(count):  # they import what they need while this process looks at the captures
+        executor.submit(_ready)
     try:
         yield Pool(executor, count)
     except BaseException:
@@ -259,6 +261,11 @@ def _packed(task: bytes) -> bytes:
     keep_pictures()  # tasks carry paths, and the next one is often of the same captures
     function, arguments = pickle.loads(task)
     return pickle.dumps(function(*arguments))
+
+
+def _ready() -> None:
+    """Imports what the first task needs."""
+    import_module(TASKS)
 
 
 def _single_threaded() -> None:

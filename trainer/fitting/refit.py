@@ -13,6 +13,8 @@ from trainer.fitting.start_points import pattern_search
 from trainer.model.model import EffectInstance, Model, raised
 
 POLYNOMIALS = 6  # order from which a map goes on in free form, where its effect has one
+SEARCH_PIXELS = 2 * 240 * 320  # of a scene, at least one capture: a pattern search need only come near
+SEARCH_SCENES = 3
 
 
 def settled(model: Model, batches: Sequence[Batch]) -> FitResult:
@@ -29,7 +31,8 @@ def fit_from(
     """Fit one effect from a start; where derivatives do not reach far, after a pattern search."""
     if start.effect.rugged:
         with torch.no_grad():
-            predictors = [Predictor(model.having(start), b) for b in batches[:3]]
+            few = [b.first(max(1, SEARCH_PIXELS // b.signal[0].numel())) for b in batches[:SEARCH_SCENES]]
+            predictors = [Predictor(model.having(start), b) for b in few]
             points = [p.trace(model) for p in predictors]
             start = pattern_search(model, predictors, points, start)
     return fit(model.having(start), [start.effect.name], batches, iterations)
