@@ -40,11 +40,13 @@ def options(parser: ArgumentParser) -> None:
 def run(args: Namespace, screen: Screen) -> Result:
     """Calibrate, report, and replace the bundle where that is right."""
     from runtime.bundle.bundle_folder import read_bundle
+    from runtime.bundle.light_path_arrays import bundle_channels
     from runtime.calibration.bundle_replacement import previous, replace_bundle, restore_bundle
     from runtime.calibration.calibration_report import write_report
     from runtime.calibration.self_calibration import calibrate
     from runtime.calibration.summary import numbers, sentence_of
-    from runtime.headset.open_devices import is_simulated, open_devices
+    from runtime.headset.colour_fields import open_colours
+    from runtime.headset.open_devices import is_simulated
 
     if args.restore:
         restore_bundle(args.bundle)
@@ -52,7 +54,11 @@ def run(args: Namespace, screen: Screen) -> Result:
     bundle = read_bundle(args.bundle)
     with screen.progress("calibrating") as progress:
         found = calibrate(
-            lambda: open_devices(args.headset, args.seed), bundle, args.plane, args.seed, progress
+            lambda: open_colours(args.headset, bundle_channels(bundle), args.seed),
+            bundle,
+            args.plane,
+            args.seed,
+            progress,
         )
     replaced = found.verdict == "recalibrated" and not args.check
     result: dict[str, Any] = {

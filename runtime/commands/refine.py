@@ -45,7 +45,8 @@ def run(args: Namespace, screen: Screen) -> Result:
     from runtime.bundle.light_path_arrays import bundle_channels, load_light_path
     from runtime.calibration.taking import Taker
     from runtime.camera.view import View, view_of
-    from runtime.headset.open_devices import is_simulated, open_devices
+    from runtime.headset.colour_fields import open_colours
+    from runtime.headset.open_devices import is_simulated
     from runtime.networks.onnx_approximator import approximator_of
     from runtime.refinement.panel_and_camera import PanelAndCamera
     from runtime.refinement.picture_refinement import Refinement, refine
@@ -68,7 +69,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     target = np.stack([targets[c] for c in channels])
     first = np.stack([solve(path, t).phase for path, t in zip(paths, target, strict=True)])
     opened = open(args.log, "a", encoding="utf-8") if args.log else nullcontext()  # noqa: SIM115 - closed below
-    with opened as log, open_devices(args.headset) as devices:
+    with opened as log, open_colours(args.headset, channels) as devices:
         view = view_of(bundle)
         if view is None and tuple(devices.camera.shape) == shape:
             view = View(shape)
