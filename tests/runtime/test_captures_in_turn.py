@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -11,76 +11,85 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from firmware_iface.virtual import open_headset
-from firmware_iface.virtual.remote_hardware import RemoteHardware
+from firmware_iface.virtual import BenchDescription, VirtualHeadset
+from firmware_iface.virtual.bench_description import ChannelDescription
+from firmware_iface.virtual.defects import make_defect
 from runtime.bundle.bundle_folder import write_bundle
 from runtime.bundle.light_path_arrays import pack_light_paths
 from runtime.calibration.drift import Drift
 from runtime.cli import main
-from runtime.headset.colour_fields import ColourPanel
+from runtime.headset import colour_fields
+from runtime.headset.open_devices import Devices
 from runtime.lightpath import ideal_path as ideal
 from runtime.refinement.panel_and_camera import PanelAndCamera
 from runtime.service.shared_memory import crc32
 from runtime.solver import quality
-from tests.campaigns.headset import COLOURS, hardware, write_configuration
+from tests.campaigns.headset import COLOURS
 from tests.runtime.benches import converted, scene
+from tests.runtime.calibration.drifting import devices
 
-DISTANCE_MM = 8.0
+SHAPE, DISTANCE_MM = (48, 64), 8.0
 
 
-def written(folder: Path, shape: tuple[int, int], defect: str, networks: dict[str, bytes]) -> dict[str, Path]:
-    """A bundle that knows no defect, a bench that has one, and a headset's configuration with and without fields."""
-    in_turn = write_configuration(folder, colours=True)
-    bench = f"[panel]\nheight = {shape[0]}\nwidth = {shape[1]}\n[propagation]\ndistance_mm = {DISTANCE_MM}\n"
-    bench += "".join(f'[[channel]]\nname = "{name}"\nwavelength_nm = {nm}\n' for name, nm in COLOURS.items())
-    (folder / "bench.toml").write_text(bench + f"[[defect]]\n{defect}\n")
-    one = folder / "one_colour.toml"
-    one.write_text(in_turn.read_text().replace("fields = 3\n", ""))
+class Headset:
+    """A virtual headset of three colours with a defect, opened with fields in turn or without.
+
+    It keeps what was lit in each picture of the camera: the patterns, by the lasers that shone on them.
+    """
+
+    def __init__(self, defect: str, fields: int) -> None:
+        channels = tuple(ChannelDescription(name, nm) for name, nm in COLOURS.items())
+        bench = BenchDescription(defects=(make_defect(defect),), channels=channels)
+        self.bench, self.fields = VirtualHeadset(bench.resized(*SHAPE, DISTANCE_MM), seed=2), fields
+        self.seen: set[tuple[int, int]] = set()
+        self.frames: set[tuple[int, ...]] = set()
+        self._capture = self.bench.camera.capture
+        self.bench.camera.capture = self.capture  # type: ignore[method-assign]
+
+    def capture(self) -> np.ndarray:
+        on = sum(1 << k for k, name in enumerate(COLOURS) if self.bench.lasers.power(name) > 0)
+        for field in self.bench.panel.fields:
+            if field.lasers & on:
+                self.seen.add((crc32(field.gray), field.lasers & on))
+        self.frames.add(tuple(field.lasers for field in self.bench.panel.fields))
+        return self._capture()
+
+    @contextmanager
+    def opened(self, spec: str, colours: Sequence[str], seed: int = 0) -> Iterator[Devices]:
+        plain = devices(self.bench)
+        yield plain if self.fields == 1 else colour_fields.gated(plain, colours, self.fields)
+
+    @property
+    def dark(self) -> bool:
+        return all(self.bench.lasers.power(name) == 0 for name in COLOURS)
+
+
+def bundle_of_three(folder: Path, networks: dict[str, bytes]) -> Path:
+    """A bundle that knows no defect."""
     paths = [
-        (n, DISTANCE_MM, nm, converted(ideal.ideal_path(shape, 8e-6, nm * 1e-9, DISTANCE_MM * 1e-3, 1.0), np.float32))
+        (n, DISTANCE_MM, nm, converted(ideal.ideal_path(SHAPE, 8e-6, nm * 1e-9, DISTANCE_MM * 1e-3, 1.0), np.float32))
         for n, nm in COLOURS.items()
     ]  # fmt: skip
     records, arrays = pack_light_paths(paths)
-    bundle = folder / "measured"
-    write_bundle(bundle, arrays, {"paths": records, "distance_mm": DISTANCE_MM}, {}, networks=networks)
-    return {"in_turn": in_turn, "one": one, "bundle": bundle, "bench": folder / "bench.toml"}
+    write_bundle(
+        folder / "bundle", arrays, {"paths": records, "distance_mm": DISTANCE_MM}, {}, networks=networks
+    )
+    return folder / "bundle"
 
 
-def ran(capsys: pytest.CaptureFixture[str], *words: object) -> dict:
-    assert main([str(word) for word in (*words, "--json")]) == 0, capsys.readouterr().err
-    return json.loads(capsys.readouterr().out)
-
-
-@contextmanager
-def noted(monkeypatch: pytest.MonkeyPatch) -> Iterator[set[tuple[int, int]]]:
-    """(CRC-32 of a pattern, mask of its own laser) of all that was to be shown, as the caller of a panel knows it."""
-    own: set[tuple[int, int]] = set()
-    show, light, both = ColourPanel.show, ColourPanel.light, PanelAndCamera.__call__
-    lit: list[str] = []
-
-    def note_light(panel: ColourPanel, colours: list[str]) -> None:
-        lit[:] = colours
-        light(panel, colours)
-
-    def note(panel: ColourPanel, gray: np.ndarray) -> None:
-        own.update((crc32(gray), 1 << list(COLOURS).index(colour)) for colour in lit)
-        show(panel, gray)
-
-    def note_all(display: PanelAndCamera, gray: np.ndarray) -> np.ndarray:
-        own.update((crc32(field), 1 << k) for k, field in enumerate(gray))
-        return both(display, gray)
-
+def ran(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], headset: Headset, *words: object
+) -> dict:
     with monkeypatch.context() as patched:
-        patched.setattr(ColourPanel, "light", note_light)
-        patched.setattr(ColourPanel, "show", note)
-        patched.setattr(PanelAndCamera, "__call__", note_all)
-        yield own
+        patched.setattr(colour_fields, "open_colours", headset.opened)
+        code = main([str(word) for word in (*words, "--headset", "virtual:colour", "--json")])
+    out, err = capsys.readouterr()
+    assert code == 0, err
+    assert headset.dark
+    return json.loads(out)
 
 
-def all_in_their_own_fields(remote: RemoteHardware, own: set[tuple[int, int]]) -> bool:
-    """Whether every colour was lit, and never on another colour's pattern or in another's field; dark at the end."""
-    lit = remote.lit()
-    return lit <= own and {mask for _, mask in lit} == {1, 2, 4} and remote.light()[-1][1] == 0
+ALONE = {(1, 0, 0), (0, 2, 0), (0, 0, 4)}  # frames in which one colour has light, in its own field
 
 
 def test_a_refinement_in_turn_is_what_it_is_in_one_colour(
@@ -90,53 +99,61 @@ def test_a_refinement_in_turn_is_what_it_is_in_one_colour(
     from trainer.networks.approximator import Approximator, Architecture
     from trainer.networks.onnx_files import onnx_files
 
-    shape = (48, 64)
     torch.manual_seed(0)
-    networks = onnx_files(Approximator(Architecture("compact", 8, shape, 3)))
-    files = written(tmp_path, shape, 'kind = "phase_response"', networks)
-    target = np.stack([scene(shape), scene(shape)[:, ::-1], scene(shape)[::-1]])
+    bundle = bundle_of_three(tmp_path, onnx_files(Approximator(Architecture("compact", 8, SHAPE, 3))))
+    target = np.stack([scene(SHAPE), scene(SHAPE)[:, ::-1], scene(SHAPE)[::-1]])
     np.save(tmp_path / "picture.npy", target)
-    words = ["refine", files["bundle"], tmp_path / "picture.npy", "--captures", 6]
-    found = {}
-    for name in ("in_turn", "one"):
-        with hardware(tmp_path) as remote, noted(monkeypatch) as own:
-            out = tmp_path / f"{name}.png"
-            found[name] = ran(capsys, *words, "--headset", files[name], "--out", out)
-            if name == "in_turn":
-                assert all_in_their_own_fields(remote, own)
-    in_turn, one = found["in_turn"]["psnr_db"], found["one"]["psnr_db"]
+    own: set[tuple[int, int]] = set()
+    whole = PanelAndCamera.__call__
+
+    def note(display: PanelAndCamera, gray: np.ndarray) -> np.ndarray:
+        own.update((crc32(field), 1 << k) for k, field in enumerate(gray))
+        return whole(display, gray)
+
+    monkeypatch.setattr(PanelAndCamera, "__call__", note)
+    found, headsets = {}, {}
+    for fields in (3, 1):
+        headsets[fields] = Headset("phase_response", fields)
+        out = tmp_path / f"{fields}.png"
+        words = ["refine", bundle, tmp_path / "picture.npy", "--captures", 6, "--out", out]
+        found[fields] = ran(monkeypatch, capsys, headsets[fields], *words)
+    assert {mask for _, mask in headsets[3].seen} == {1, 2, 4}
+    assert headsets[3].seen <= own, "a colour had light on a pattern that was not its own"
+    assert (
+        headsets[3].frames - {(-1,)} == ALONE
+    )  # before the first frame the panel has none, and no laser is on
+    in_turn, one = found[3]["psnr_db"], found[1]["psnr_db"]
     assert in_turn["best"] > in_turn["first"] + 2
     assert in_turn["first"] == pytest.approx(
         one["first"], abs=0.1
     )  # the same patterns: only the noise differs
     assert in_turn["best"] == pytest.approx(one["best"], abs=0.5)
-    truth = open_headset(str(files["bench"]))
     for colour, wanted in zip(COLOURS, target, strict=True):
         seen = {}
-        for name, result in found.items():
+        for fields, result in found.items():
             with Image.open(result["patterns"][colour]) as image:
-                seen[name] = quality(truth.true_irradiance(np.asarray(image), colour), wanted).psnr_db
-        assert seen["in_turn"] == pytest.approx(seen["one"], abs=1.0), colour
+                light = headsets[1].bench.true_irradiance(np.asarray(image), colour)
+            seen[fields] = quality(light, wanted).psnr_db
+        assert seen[3] == pytest.approx(seen[1], abs=1.0), colour
 
 
 def test_a_calibration_in_turn_is_what_it_is_in_one_colour(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    shape = (48, 64)
-    files = written(tmp_path, shape, 'kind = "panel_wavefront"', {})
+    bundle = bundle_of_three(tmp_path, {})
     found = {}
-    for name in ("in_turn", "one"):
-        with hardware(tmp_path) as remote, noted(monkeypatch) as own:
-            found[name] = ran(capsys, "calibrate", files["bundle"], "--headset", files[name], "--check")
-            if name == "in_turn":
-                assert all_in_their_own_fields(remote, own)
-    in_turn, one = found["in_turn"], found["one"]
+    for fields in (3, 1):
+        headset = Headset("panel_wavefront", fields)
+        found[fields] = ran(monkeypatch, capsys, headset, "calibrate", bundle, "--check")
+        if fields == 3:
+            assert headset.frames - {(-1,)} == ALONE and {mask for _, mask in headset.seen} == {1, 2, 4}
+    in_turn, one = found[3], found[1]
     assert in_turn["verdict"] == one["verdict"] == "recalibrated"
     assert in_turn["heldout"]["after"]["excess"] < 0.01 * in_turn["heldout"]["before"]["excess"]
-    waves = [Drift(np.array(f["wavefront"]["terms_nm"])).wavefront(shape) for f in (in_turn, one)]
+    waves = [Drift(np.array(f["wavefront"]["terms_nm"])).wavefront(SHAPE) for f in (in_turn, one)]
     noise_nm = np.hypot(*(f["wavefront"]["error_rms_nm"] for f in (in_turn, one)))
-    assert (waves[0] - waves[1]).std() < max(4 * noise_nm, 0.02 * waves[1].std())
     assert waves[1].std() > 20
+    assert (waves[0] - waves[1]).std() < max(4 * noise_nm, 0.02 * waves[1].std())
     for colour in COLOURS:
         shown = [f["channels"][colour]["picture_psnr_db"] for f in (in_turn, one)]
         assert shown[0]["after"] == pytest.approx(shown[1]["after"], abs=0.5)
