@@ -18,8 +18,8 @@ DESCRIPTION = """Show a picture, look at it with the headset's camera, and make 
 Each capture moves the pattern, and draws the bundle's approximator towards what the camera saw. Every third one is held
 out; where those are predicted worse than before, the refinement stops and goes back to the best. The bundle is not
 changed. The laser is switched on before and off after, and is not touched in between; several take turns, one lit at a
-time and each at its own power throughout. For bundles that were exported with a network, and whose camera a
-calibration has seen."""
+time and each at its own power throughout. Where the headset's configuration has fields in turn, each is lit in its
+own field alone. For bundles that were exported with a network, and whose camera a calibration has seen."""
 
 
 def options(parser: ArgumentParser) -> None:

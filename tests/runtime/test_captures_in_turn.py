@@ -16,7 +16,10 @@ from firmware_iface.virtual.bench_description import ChannelDescription
 from firmware_iface.virtual.defects import make_defect
 from runtime.bundle.bundle_folder import write_bundle
 from runtime.bundle.light_path_arrays import pack_light_paths
+from runtime.calibration.colour_captures import ColourCaptures, ColourPatterns, colour_captures
 from runtime.calibration.drift import Drift
+from runtime.calibration.shown_patterns import grains, grating
+from runtime.calibration.taking import Taker
 from runtime.cli import main
 from runtime.headset import colour_fields
 from runtime.headset.open_devices import Devices
@@ -37,10 +40,10 @@ class Headset:
     It keeps what was lit in each picture of the camera: the patterns, by the lasers that shone on them.
     """
 
-    def __init__(self, defect: str, fields: int) -> None:
+    def __init__(self, defect: str, fields: int, seed: int = 2) -> None:
         channels = tuple(ChannelDescription(name, nm) for name, nm in COLOURS.items())
         bench = BenchDescription(defects=(make_defect(defect),), channels=channels)
-        self.bench, self.fields = VirtualHeadset(bench.resized(*SHAPE, DISTANCE_MM), seed=2), fields
+        self.bench, self.fields = VirtualHeadset(bench.resized(*SHAPE, DISTANCE_MM), seed), fields
         self.seen: set[tuple[int, int]] = set()
         self.frames: set[tuple[int, ...]] = set()
         self._capture = self.bench.camera.capture
@@ -137,6 +140,44 @@ def test_a_refinement_in_turn_is_what_it_is_in_one_colour(
         assert seen[3] == pytest.approx(seen[1], abs=1.0), colour
 
 
+def calibration_captures(fields: int, seed: int) -> tuple[Headset, dict[str, ColourCaptures]]:
+    """What a calibration would capture, of few patterns."""
+    headset = Headset("phase_response", fields, seed)
+    patterns = ColourPatterns(
+        grains(SHAPE, 4, 1), [grating(SHAPE, 8, 100)], [grains(SHAPE, 4, 2)], [grains(SHAPE, 8, 3)]
+    )
+    with headset.opened("", tuple(COLOURS)) as lit:
+        taker = Taker(lit, lambda what: None)
+        black, floor = taker.darkness()
+        return headset, {c: colour_captures(taker, c, patterns, black, floor) for c in COLOURS}
+
+
+def difference(some: ColourCaptures, others: ColourCaptures) -> float:
+    """Mean squared difference of captures of the same patterns, over what their noise makes it."""
+    ratio, found = some.exposure_ms / others.exposure_ms, []
+    shots = ([c.dots, *c.sweep, *c.fitted, *c.heldout] for c in (some, others))
+    for a, b in zip(*shots, strict=True):
+        use = (a.weight > 0) & (b.weight > 0)
+        variance = 1 / a.weight[use] + ratio**2 / b.weight[use]
+        found.append(np.mean((a.signal[use] - ratio * b.signal[use]) ** 2 / variance))
+    return float(np.mean(found))
+
+
+def test_a_calibrations_captures_in_turn_are_those_of_one_colour_to_the_noise() -> None:
+    """They differ from those of one colour as those of one colour differ from one another."""
+    (headset, in_turn), (_, one), (_, again) = (
+        calibration_captures(*which) for which in ((3, 1), (1, 2), (1, 3))
+    )
+    assert headset.frames - {(-1,)} == ALONE and {mask for _, mask in headset.seen} == {1, 2, 4}
+    for colour in COLOURS:
+        assert in_turn[colour].exposure_ms == pytest.approx(one[colour].exposure_ms, rel=0.05)
+        assert in_turn[colour].noise.slope == pytest.approx(one[colour].noise.slope, rel=0.1)
+        noise = difference(again[colour], one[colour])
+        assert noise == pytest.approx(1, abs=0.3)
+        assert difference(in_turn[colour], one[colour]) == pytest.approx(noise, rel=0.06)
+
+
+@pytest.mark.slow
 def test_a_calibration_in_turn_is_what_it_is_in_one_colour(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
