@@ -121,7 +121,7 @@ def soak(
             lit_fields, wrongly_lit = lane.lit_fields(), lane.wrongly_lit()
         finally:
             lane.close()
-    quantiles = np.percentile(latency_ms, [50, 95, 99, 99.9, 100])
+    quantiles = np.percentile(latency_ms or [-1.0], [50, 95, 99, 99.9, 100])  # -1: nothing was shown
     return {
         "frames": frames,
         "seconds": round(took_s, 1),
