@@ -43,6 +43,12 @@ def memory_mb(pid: int) -> float:
     return 0.0
 
 
+def cpu_s(pid: int) -> float:
+    """Processor time of a process so far, s; what it takes does not depend on other work of the machine."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 def stage_ms(port: int) -> dict[str, float]:
     """Mean time of a frame in each stage so far, from the service's metrics, ms."""
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=5) as answer:
@@ -90,6 +96,7 @@ def soak(
         lane = Lane(Path(folder), 0, file=file)
         try:
             lit_up = lane.light_up(LIGHT_WITHIN_S)
+            used = {name: cpu_s(pid) for name, pid in processes(lane).items()}
             sent: dict[int, float] = {}
             began = time.monotonic()
             k = 0
@@ -105,16 +112,12 @@ def soak(
                         late += outcome.flags & 1
                         latency_ms.append((outcome.display_ns * 1e-9 - at) * 1e3)
                 if done >= len(grown["service"]) / SAMPLES:
-                    pids = {
-                        "service": lane.service.pid,
-                        "solver": lane.child("solver"),
-                        "camera": lane.child("camera"),
-                    }
-                    for name, pid in pids.items():
+                    for name, pid in processes(lane).items():
                         grown[name].append((k, memory_mb(pid)))
                 k += 1
             took_s = time.monotonic() - began
             frames, emitting = k, lane.lit()
+            used = {name: cpu_s(pid) - used[name] for name, pid in processes(lane).items()}
             unanswered = lane.unanswered()
             torn = lane.torn()
             stages = stage_ms(port)
@@ -139,7 +142,17 @@ def soak(
             zip(("p50", "p95", "p99", "p99_9", "worst"), quantiles.round(2).tolist(), strict=True)
         ),
         "stage_ms": stages,
+        "cpu_ms_a_frame": {name: round(1000 * s / max(1, len(latency_ms)), 1) for name, s in used.items()},
         "memory_mb": {name: _growth(samples, frames) for name, samples in grown.items()},
+    }
+
+
+def processes(lane: Lane) -> dict[str, int]:
+    """The numbers of the service's processes, by name."""
+    return {
+        "service": lane.service.pid,
+        "solver": lane.child("solver"),
+        "camera": lane.child("camera"),
     }
 
 
