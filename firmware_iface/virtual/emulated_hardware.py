@@ -81,7 +81,7 @@ class EmulatedHardware:
         """Let time pass for the parts, without end: the dead-man acts and frames appear also without traffic."""
         while True:
             self.lasers.settle()
-            self.board.gray  # noqa: B018 - a period that is over displays what was committed
+            self.board.outputs  # noqa: B018 - a period that is over displays what was committed
             while self.board.shown:
                 _, crc = self.board.shown.popleft()
                 self.whole[crc] = self.whole.get(crc, 0) + 1

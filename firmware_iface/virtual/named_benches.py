@@ -29,7 +29,9 @@ def _benches() -> dict[str, BenchDescription]:
             make("phase_response", gain=1.08, s_curvature=0.12),
         ),
     )
+    in_colour = replace(demo, name="colour_demo", channels=_RGB)
     benches = [BenchDescription("ideal"), demo, replace(demo.resized(144, 192, 18.0), name="small_demo")]
+    benches += [in_colour, replace(in_colour.resized(144, 192, 18.0), name="small_colour_demo")]
     benches += [BenchDescription(kind, defects=(make(kind),)) for kind in CATALOGUE_KINDS]
     benches += [
         BenchDescription("pair", defects=(make("phase_response"), make("pupil_aberration"))),

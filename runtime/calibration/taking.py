@@ -6,6 +6,7 @@ pictures of one pattern, and full scale is the top of the camera's bits.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -117,7 +118,7 @@ class Taker:
             if bright < 0.9 * room:
                 factor = AIM * room / max(bright, 1.0)
                 exposure = min(max(camera.exposure_ms * factor, SHORTEST_MS), LONGEST_MS)
-                if bright > 0.002 * room or exposure == camera.exposure_ms:
+                if bright > 0.002 * room or math.isclose(exposure, camera.exposure_ms, rel_tol=1e-3):
                     break
                 camera.exposure_ms = exposure
             else:
@@ -133,7 +134,7 @@ class Taker:
                 "the panel is on, and nothing stands in the way"
             )
         camera.exposure_ms = exposure
-        return float(exposure)
+        return float(camera.exposure_ms)
 
     def noise(self, gray: np.ndarray, black: float, floor: float) -> Noise:
         """The camera's noise, from two pictures of one pattern, whose brightness may differ a little.

@@ -17,7 +17,8 @@ DESCRIPTION = """Find out with the headset's own camera what has drifted, and pu
 Some thirty patterns a colour are shown and captured: dots (where the camera looks), a sweep of gratings (the panel's
 phase response), ten patterns of random grains (wavefront, beam and distance, refit together) and three that the fit
 does not see. The light path is replaced only if it predicts those three better, surely and by enough to matter. The
-folder holds the old bundle or the new one at every moment; the old one is kept as BUNDLE.previous.
+folder holds the old bundle or the new one at every moment; the old one is kept as BUNDLE.previous. Where the headset's
+configuration has fields in turn, each colour is lit in its own field alone.
 
 verdict: recalibrated (replaced), unchanged (it was as good as the camera can tell), not_explained (it is wrong, and
 refitting what drifts does not correct it: capture and diagnose on the workstation)."""
@@ -40,11 +41,13 @@ def options(parser: ArgumentParser) -> None:
 def run(args: Namespace, screen: Screen) -> Result:
     """Calibrate, report, and replace the bundle where that is right."""
     from runtime.bundle.bundle_folder import read_bundle
+    from runtime.bundle.light_path_arrays import bundle_channels
     from runtime.calibration.bundle_replacement import previous, replace_bundle, restore_bundle
     from runtime.calibration.calibration_report import write_report
     from runtime.calibration.self_calibration import calibrate
     from runtime.calibration.summary import numbers, sentence_of
-    from runtime.headset.open_devices import is_simulated, open_devices
+    from runtime.headset.colour_fields import open_colours
+    from runtime.headset.open_devices import is_simulated
 
     if args.restore:
         restore_bundle(args.bundle)
@@ -52,7 +55,11 @@ def run(args: Namespace, screen: Screen) -> Result:
     bundle = read_bundle(args.bundle)
     with screen.progress("calibrating") as progress:
         found = calibrate(
-            lambda: open_devices(args.headset, args.seed), bundle, args.plane, args.seed, progress
+            lambda: open_colours(args.headset, bundle_channels(bundle), args.seed),
+            bundle,
+            args.plane,
+            args.seed,
+            progress,
         )
     replaced = found.verdict == "recalibrated" and not args.check
     result: dict[str, Any] = {

@@ -18,8 +18,8 @@ DESCRIPTION = """Show a picture, look at it with the headset's camera, and make 
 Each capture moves the pattern, and draws the bundle's approximator towards what the camera saw. Every third one is held
 out; where those are predicted worse than before, the refinement stops and goes back to the best. The bundle is not
 changed. The laser is switched on before and off after, and is not touched in between; several take turns, one lit at a
-time and each at its own power throughout. For bundles that were exported with a network, and whose camera a
-calibration has seen."""
+time and each at its own power throughout. Where the headset's configuration has fields in turn, each is lit in its
+own field alone. For bundles that were exported with a network, and whose camera a calibration has seen."""
 
 
 def options(parser: ArgumentParser) -> None:
@@ -45,7 +45,8 @@ def run(args: Namespace, screen: Screen) -> Result:
     from runtime.bundle.light_path_arrays import bundle_channels, load_light_path
     from runtime.calibration.taking import Taker
     from runtime.camera.view import View, view_of
-    from runtime.headset.open_devices import is_simulated, open_devices
+    from runtime.headset.colour_fields import open_colours
+    from runtime.headset.open_devices import is_simulated
     from runtime.networks.onnx_approximator import approximator_of
     from runtime.refinement.panel_and_camera import PanelAndCamera
     from runtime.refinement.picture_refinement import Refinement, refine
@@ -68,7 +69,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     target = np.stack([targets[c] for c in channels])
     first = np.stack([solve(path, t).phase for path, t in zip(paths, target, strict=True)])
     opened = open(args.log, "a", encoding="utf-8") if args.log else nullcontext()  # noqa: SIM115 - closed below
-    with opened as log, open_devices(args.headset) as devices:
+    with opened as log, open_colours(args.headset, channels) as devices:
         view = view_of(bundle)
         if view is None and tuple(devices.camera.shape) == shape:
             view = View(shape)

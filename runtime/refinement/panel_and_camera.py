@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from runtime.camera.view import View, on_panel
+from runtime.headset.colour_fields import ColourPanel
 
 Turn = Callable[[], None]
 
@@ -18,7 +19,7 @@ class PanelAndCamera:
     Parameters
     ----------
     panel, camera
-        Devices of a headset.
+        Devices of a headset. A ColourPanel shows the patterns of all colours, each in its own field.
     view : View
         Where the camera sees the image plane, from a calibration.
     black : float
@@ -49,7 +50,10 @@ class PanelAndCamera:
         for colour, field in enumerate(gray):
             if self.turns is not None:
                 self.turns[colour]()
-            self.panel.show(field)
+            if isinstance(self.panel, ColourPanel):
+                self.panel.show_colours(gray)
+            else:
+                self.panel.show(field)
             counts = np.asarray(self.camera.capture(), np.float32) - np.float32(self.black)
             captured.append(on_panel(counts, self.view, field.shape))
         return np.stack(captured)

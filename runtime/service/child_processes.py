@@ -31,6 +31,9 @@ class ChildProcess:
         What the module gets after the descriptor of its end of the link.
     vocabulary : Vocabulary
         Messages that may pass over the link.
+    yields : bool
+        Whether it computes for long, on all cores: it is then scheduled below this process, whose heartbeat would wait
+        for it otherwise.
 
     Attributes
     ----------
@@ -38,8 +41,9 @@ class ChildProcess:
         The supervisor's end, non-blocking; None while the process is not running.
     """
 
-    def __init__(self, module: str, argument: str, vocabulary: Vocabulary) -> None:
+    def __init__(self, module: str, argument: str, vocabulary: Vocabulary, yields: bool = False) -> None:
         self.module, self.argument, self.vocabulary = module, argument, vocabulary
+        self._yields = yields
         self.link: MessageLink | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._pause_s = PAUSE_S
@@ -61,6 +65,8 @@ class ChildProcess:
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,  # Ctrl-C is for the supervisor, which darkens the lasers first
             )
+        if self._yields:
+            _schedule_below(self._process.pid)
         self._started_s = time.monotonic()
         self.link = MessageLink(ours, self.vocabulary)
         return self.link
@@ -80,6 +86,14 @@ class ChildProcess:
             self._pause_s = PAUSE_S
         self._next_start_s = now + self._pause_s
         self._pause_s = min(2 * self._pause_s, LONGEST_PAUSE_S)
+
+
+def _schedule_below(pid: int) -> None:
+    """Give a process that was just started the next lower real-time priority, where this one has one."""
+    policy, priority = os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
+    if policy in (os.SCHED_RR, os.SCHED_FIFO) and priority > 1:
+        with suppress(OSError):  # it has ended already
+            os.sched_setscheduler(pid, policy, os.sched_param(priority - 1))
 
 
 def child_link(fd: str, vocabulary: Vocabulary) -> MessageLink:

@@ -78,7 +78,7 @@ class SolverClient:
         events: SolverEvents,
     ) -> None:
         self.process = ChildProcess(
-            "runtime.service.solver_process", str(configuration.file), process_messages.SOLVER
+            "runtime.service.solver_process", str(configuration.file), process_messages.SOLVER, yields=True
         )
         self.shape: tuple[int, int, int] | None = None
         self.colours: tuple[str, ...] = ()

@@ -30,7 +30,7 @@ TimeoutStopSec=3
 KillMode=control-group
 RuntimeDirectory=hololoop
 RuntimeDirectoryPreserve=yes
-# The heartbeat must not wait for other processes: 20 ms of the 100 ms are its own.
+# The heartbeat must not wait for other processes: 20 ms of the 100 ms are its own. The solver gets one priority less.
 CPUSchedulingPolicy=rr
 CPUSchedulingPriority=10
 LimitMEMLOCK=infinity

@@ -36,12 +36,12 @@ def urgent() -> Iterator[None]:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
-BENCH = f"""
+BENCH = """
 [panel]
-height = {SHAPE[0]}
-width = {SHAPE[1]}
+height = {height}
+width = {width}
 [propagation]
-distance_mm = {DISTANCE_MM}
+distance_mm = {distance_mm}
 """
 
 COLOURS = {"red": 638.0, "green": 520.0, "blue": 450.0}  # wavelength, nm; in the order of the board's lasers
@@ -54,10 +54,10 @@ socket = "service.sock"
 refresh_hz = {refresh_hz}
 solve_ms = {solve_ms}
 stale_limit_ms = {stale_limit_ms}
+metrics_port = {metrics_port}
 [panel]
 bus = "virtual:{folder}/hardware.sock"
-refresh_hz = 1000.0
-{fields}[lasers]
+{panel}[lasers]
 bus = "virtual:{folder}/hardware.sock"
 power = {{ {power} }}
 [camera]
@@ -72,6 +72,8 @@ def write_configuration(
     stale_limit_ms: float = 400.0,
     oak: str | None = None,
     colours: bool = False,
+    shape: tuple[int, int] = SHAPE,
+    metrics_port: int = 0,
 ) -> Path:
     """A bundle, a bench and a configuration in `folder`; returns the configuration's path.
 
@@ -86,18 +88,30 @@ def write_configuration(
         Loopback address of an emulated OAK camera; None: the camera without a link.
     colours : bool
         Whether three colours are shown in turn.
+    shape : (int, int)
+        (H, W), pixels of the panel. Where it is not SHAPE, frames come at most 60 times a second, a transfer may take
+        as long as so many pixels need, and the camera gives the same picture again and again, since a simulated one
+        would take longer than a frame.
+    metrics_port : int
+        Of the service's metrics; 0: none.
     """
-    path = converted(ideal_path(SHAPE, DISTANCE_MM * 1e-3), np.float32)
+    small = shape == SHAPE
+    distance_mm = DISTANCE_MM * shape[0] / SHAPE[0]
+    path = converted(ideal_path(shape, distance_mm * 1e-3), np.float32)
     shown = COLOURS if colours else {"green": 520.0}
-    records, arrays = pack_light_paths([(name, DISTANCE_MM, nm, path) for name, nm in shown.items()])
-    write_bundle(folder / "bundle", arrays, {"paths": records, "distance_mm": DISTANCE_MM}, {})
+    records, arrays = pack_light_paths([(name, distance_mm, nm, path) for name, nm in shown.items()])
+    write_bundle(folder / "bundle", arrays, {"paths": records, "distance_mm": distance_mm}, {})
     channels = [f'[[channel]]\nname = "{name}"\nwavelength_nm = {nm}\n' for name, nm in shown.items()]
     coarse = "[simulation]\nsubpixels = 2\n" if colours else ""  # three colours take a third of the time each
-    (folder / "bench.toml").write_text(BENCH + "".join(channels) + coarse)
+    bench = BENCH.format(height=shape[0], width=shape[1], distance_mm=distance_mm)
+    (folder / "bench.toml").write_text(bench + "".join(channels) + coarse)
     file = folder / "headset.toml"
     camera = f'kind = "virtual"\nbus = "virtual:{folder}/hardware.sock"'
     if oak:
         camera = f'kind = "oak"\naddress = "{oak}"\nframes_per_s = 100.0'
+    elif not small:
+        camera = 'kind = "tests.campaigns.still_camera:still_camera"'
+    panel = "refresh_hz = 1000.0\n" if small else f"refresh_hz = {60 * len(shown)}\ntimeout_ms = 500\n"
     file.write_text(
         CONFIGURATION.format(
             folder=folder,
@@ -105,7 +119,8 @@ def write_configuration(
             solve_ms=solve_ms,
             stale_limit_ms=stale_limit_ms,
             camera=camera,
-            fields=f"fields = {len(shown)}\n" if colours else "",
+            panel=panel + (f"fields = {len(shown)}\n" if colours else ""),
+            metrics_port=metrics_port,
             power=", ".join(f"{name} = 0.5" for name in shown),
         )
     )

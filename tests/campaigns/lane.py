@@ -38,6 +38,8 @@ class Lane:
         Of pictures in one colour.
     colours : bool
         Whether it shows three colours in turn.
+    file : Path or None
+        A configuration that is in the folder already, from `write_configuration`; None: one is written.
 
     Attributes
     ----------
@@ -61,12 +63,13 @@ class Lane:
         oak: str | None = None,
         refresh_hz: float = REFRESH_HZ,
         colours: bool = False,
+        file: Path | None = None,
     ) -> None:
         self.folder, self.seed = folder, seed
         solve_ms = min(SOLVE_MS, 300 / refresh_hz)
         if colours:
             refresh_hz, solve_ms = COLOURS_HZ, COLOURS_MS
-        self.file = write_configuration(folder, refresh_hz, solve_ms, STALE_MS, oak, colours)
+        self.file = file or write_configuration(folder, refresh_hz, solve_ms, STALE_MS, oak, colours)
         self.accepted = self.shown = self.lost = 0
         self.outcomes: list[Shown | LostFrame] = []
         self.latest = self.stored = 0

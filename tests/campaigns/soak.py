@@ -1,24 +1,36 @@
 """A long run without faults: `python -m tests.campaigns.soak --frames 100000 [--json]`.
 
 One program shows pictures without pause. The report: frames shown, late and lost, latency from End to the
-panel, and the memory of each process over time.
+panel, the mean time of each stage, light in a wrong field, and the memory of each process over time.
+
+    python -m tests.campaigns.soak --size 1080x1920 --colours --refresh-hz 2 --solve-ms 400 --seconds 150
+
+is a headset of full size that shows three colours in turn. Its camera gives one picture again and again.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
+import os
+import re
+import socket
 import sys
 import tempfile
 import time
+import urllib.request
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from runtime.service.client import LostFrame
-from tests.campaigns.lane import Lane
+from tests.campaigns.headset import SHAPE, write_configuration
+from tests.campaigns.lane import STALE_MS, Lane
 
+STAGE = re.compile(r'hololoop_frame_stage_seconds_(sum|count)\{stage="(\w+)"\} (\S+)')
+LIGHT_WITHIN_S = 60.0
 SETTLED = 0.1  # of the frames, before memory counts
 SAMPLES = 50
 
@@ -31,18 +43,64 @@ def memory_mb(pid: int) -> float:
     return 0.0
 
 
-def soak(frames: int, refresh_hz: float) -> dict[str, Any]:
-    """Show `frames` frames; the results."""
+def cpu_s(pid: int) -> float:
+    """Processor time of a process so far, s; what it takes does not depend on other work of the machine."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def stage_ms(port: int) -> dict[str, float]:
+    """Mean time of a frame in each stage so far, from the service's metrics, ms."""
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=5) as answer:
+        found = {(stage, what): float(value) for what, stage, value in STAGE.findall(answer.read().decode())}
+    counts = {stage: count for (stage, what), count in found.items() if what == "count"}
+    return {stage: round(1000 * found[stage, "sum"] / max(count, 1), 2) for stage, count in counts.items()}
+
+
+def soak(
+    frames: int,
+    refresh_hz: float,
+    shape: tuple[int, int] = SHAPE,
+    colours: bool = False,
+    solve_ms: float | None = None,
+    seconds: float | None = None,
+) -> dict[str, Any]:
+    """Show `frames` frames, or for a time; the results.
+
+    Parameters
+    ----------
+    frames : int
+    refresh_hz : float, Hz
+        Of pictures.
+    shape : (int, int)
+        (H, W), pixels of the panel.
+    colours : bool
+        Whether three colours are shown in turn.
+    solve_ms : float or None, ms
+        Time for the patterns of a picture; None: a third of a period, 3 at most.
+    seconds : float or None, s
+        Ends after this time, however many frames were shown.
+    """
+    solve_ms = solve_ms or min(3.0, 300 / refresh_hz)
+    stale_ms = max(STALE_MS, 2 * solve_ms, 2000 / refresh_hz)  # lit until the next pattern is there
+    began_load = os.getloadavg()[0]
     latency_ms: list[float] = []
     grown: dict[str, list[tuple[int, float]]] = {"service": [], "solver": [], "camera": []}
     late = lost = 0
     with tempfile.TemporaryDirectory(prefix="hololoop-") as folder:
-        lane = Lane(Path(folder), 0, refresh_hz=refresh_hz)
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            port = free.getsockname()[1]
+        file = write_configuration(
+            Path(folder), refresh_hz, solve_ms, stale_ms, colours=colours, shape=shape, metrics_port=port
+        )
+        lane = Lane(Path(folder), 0, file=file)
         try:
-            lane.light_up()
+            lit_up = lane.light_up(LIGHT_WITHIN_S)
+            used = {name: cpu_s(pid) for name, pid in processes(lane).items()}
             sent: dict[int, float] = {}
             began = time.monotonic()
-            for k in range(frames):
+            k = 0
+            while (done := max(k / frames, (time.monotonic() - began) / (seconds or math.inf))) < 1:
                 lane.frame()
                 sent[lane.latest] = time.monotonic()
                 for outcome in lane.outcomes:
@@ -53,24 +111,29 @@ def soak(frames: int, refresh_hz: float) -> dict[str, Any]:
                     elif at is not None:
                         late += outcome.flags & 1
                         latency_ms.append((outcome.display_ns * 1e-9 - at) * 1e3)
-                if k % max(1, frames // SAMPLES) == 0:
-                    pids = {
-                        "service": lane.service.pid,
-                        "solver": lane.child("solver"),
-                        "camera": lane.child("camera"),
-                    }
-                    for name, pid in pids.items():
+                if done >= len(grown["service"]) / SAMPLES:
+                    for name, pid in processes(lane).items():
                         grown[name].append((k, memory_mb(pid)))
-            seconds = time.monotonic() - began
+                k += 1
+            took_s = time.monotonic() - began
+            frames, emitting = k, lane.lit()
+            used = {name: cpu_s(pid) - used[name] for name, pid in processes(lane).items()}
             unanswered = lane.unanswered()
             torn = lane.torn()
+            stages = stage_ms(port)
+            lit_fields, wrongly_lit = lane.lit_fields(), lane.wrongly_lit()
         finally:
             lane.close()
-    quantiles = np.percentile(latency_ms, [50, 95, 99, 99.9, 100])
+    quantiles = np.percentile(latency_ms or [-1.0], [50, 95, 99, 99.9, 100])  # -1: nothing was shown
     return {
         "frames": frames,
-        "seconds": round(seconds, 1),
+        "seconds": round(took_s, 1),
         "shown": len(latency_ms),
+        "frames_per_s": round(len(latency_ms) / took_s, 2),
+        "lit": lit_up and emitting,
+        "lit_fields": lit_fields,
+        "wrongly_lit_fields": wrongly_lit,
+        "load": [round(began_load, 1), round(os.getloadavg()[0], 1)],
         "late": late,
         "lost": lost,
         "lost_without_error": unanswered,
@@ -78,7 +141,18 @@ def soak(frames: int, refresh_hz: float) -> dict[str, Any]:
         "latency_ms": dict(
             zip(("p50", "p95", "p99", "p99_9", "worst"), quantiles.round(2).tolist(), strict=True)
         ),
+        "stage_ms": stages,
+        "cpu_ms_a_frame": {name: round(1000 * s / max(1, len(latency_ms)), 1) for name, s in used.items()},
         "memory_mb": {name: _growth(samples, frames) for name, samples in grown.items()},
+    }
+
+
+def processes(lane: Lane) -> dict[str, int]:
+    """The numbers of the service's processes, by name."""
+    return {
+        "service": lane.service.pid,
+        "solver": lane.child("solver"),
+        "camera": lane.child("camera"),
     }
 
 
@@ -99,16 +173,29 @@ def main() -> int:
     parser.add_argument("--frames", type=int, default=100000, help="frames to show (default 100000)")
     parser.add_argument("--refresh-hz", type=float, default=400.0, help="frames a second (default 400)")
     parser.add_argument(
+        "--size", type=_size, default=SHAPE, metavar="HxW", help="pixels of the panel (default 24x32)"
+    )
+    parser.add_argument("--colours", action="store_true", help="three colours in turn")
+    parser.add_argument("--solve-ms", type=float, help="time for a picture's patterns")
+    parser.add_argument("--seconds", type=float, help="end after so long")
+    parser.add_argument(
         "--json", action="store_true", help="print one JSON object on stdout and nothing else"
     )
     args = parser.parse_args()
-    found = soak(args.frames, args.refresh_hz)
+    found = soak(args.frames, args.refresh_hz, args.size, args.colours, args.solve_ms, args.seconds)
     if args.json:
         print(json.dumps(found))
     else:
         for key, value in found.items():
             print(f"{key}: {value}")
-    return 0 if found["lost"] == found["lost_without_error"] == found["torn_frames"] == 0 else 1
+    faults = ("lost", "lost_without_error", "torn_frames", "wrongly_lit_fields")
+    return 1 if any(found[fault] for fault in faults) else 0
+
+
+def _size(text: str) -> tuple[int, int]:
+    """(H, W) of "HxW"."""
+    height, width = text.lower().split("x")
+    return int(height), int(width)
 
 
 if __name__ == "__main__":

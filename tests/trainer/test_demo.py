@@ -9,9 +9,14 @@ import pytest
 from PIL import Image
 
 from firmware_iface.errors import InputError
+from firmware_iface.virtual import load_bench, open_headset
+from runtime.headset.open_devices import emulated
 from runtime.solver import quality
 from trainer.captures.capture_set import read_captures
+from trainer.captures.open_bench import nominal_bench
 from trainer.commands.demo import first_free
+from trainer.cycle import demo_run
+from trainer.cycle.demo_pictures import seen_by_camera, target_of
 from trainer.cycle.demo_run import run_demo
 from trainer.report.display_section import DisplayedPicture, display_section, with_display
 
@@ -52,6 +57,82 @@ def test_the_quick_demo(tmp_path: Path) -> None:
     assert "What the display shows" in page
     with Image.open(tmp_path / "demo" / "patterns" / "astronaut-after.png") as pattern:
         assert pattern.mode == "L"
+
+
+IN_COLOUR = """
+name = "three colours"
+[panel]
+height = 64
+width = 80
+[propagation]
+distance_mm = 8.0
+[[channel]]
+name = "red"
+wavelength_nm = 638.0
+[[channel]]
+name = "green"
+wavelength_nm = 520.0
+[[channel]]
+name = "blue"
+wavelength_nm = 450.0
+[[defect]]
+kind = "phase_response"
+gain = 1.1
+s_curvature = 0.15
+"""
+
+
+def test_the_camera_sees_each_colour_alone_in_the_frame_that_it_is_shown_in(tmp_path: Path) -> None:
+    """Against the bench's noise-free truth, each colour for a time in proportion to its brightness in the target."""
+    spec = str(tmp_path / "bench.toml")
+    Path(spec).write_text(IN_COLOUR)
+    truth = open_headset(spec)
+    bench = nominal_bench(truth)
+    channels = [c.name for c in bench.channels]
+    target = target_of("astronaut", channels, bench.panel.shape)
+    gray = np.random.default_rng(0).integers(0, 256, target.shape, dtype=np.uint8)
+    with emulated(spec, seed=2, fields=3) as devices:
+        seen = seen_by_camera(devices, bench, gray, target)
+    black = bench.camera.black_level
+    expected = np.stack([truth.expected_counts(g, c) - black for g, c in zip(gray, channels, strict=True)])
+    expected = expected * target.mean((1, 2), keepdims=True)
+    scale = np.vdot(expected, seen.light) / np.vdot(expected, expected)
+    for light, wanted in zip(seen.light, scale * expected, strict=True):
+        assert light.mean() == pytest.approx(wanted.mean(), rel=0.02)
+        assert np.corrcoef(light.ravel(), wanted.ravel())[0, 1] > 0.98
+    assert set(seen.by_channel) == set(channels)
+
+
+@pytest.mark.slow
+def test_the_demo_in_colour(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = tmp_path / "bench.toml"
+    spec.write_text(IN_COLOUR)
+    monkeypatch.setitem(demo_run.BENCHES, (True, True), str(spec))
+    result = run_demo(tmp_path / "demo", quick=True, colour=True)
+    assert "phase_response" in result["found"] and result["verdict"] == "complete"
+    assert set(result["channels"]) == {"red", "green", "blue"}
+    for of in [*result["channels"].values(), result["display"]]:
+        psnr = {which: numbers["psnr_db"] for which, numbers in of.items()}
+        assert psnr["after"] > psnr["before"] + 5, psnr
+        assert psnr["oracle"] > psnr["after"] - 0.5, psnr
+    assert "red" in result["sentence"] and "in turn" in result["sentence"]
+    (picture,) = result["pictures"]
+    assert picture["channels"] == result["channels"]
+    patterns = tmp_path / "demo" / "patterns"
+    for name in ("astronaut-target", "astronaut-before-seen", "astronaut-after-seen"):
+        with Image.open(patterns / f"{name}.png") as image:
+            assert image.mode == "RGB"
+    assert {p.name for p in patterns.glob("astronaut-after-*.png")} == {
+        f"astronaut-after-{what}.png" for what in ("red", "green", "blue", "seen")
+    }
+
+
+def test_the_benches_of_the_demo_in_colour_are_those_of_one_colour_with_two_more() -> None:
+    for quick in (False, True):
+        one, three = (load_bench(demo_run.BENCHES[quick, colour]) for colour in (False, True))
+        assert [c.name for c in three.channels] == ["red", "green", "blue"]
+        assert (three.panel, three.propagation, three.defects) == (one.panel, one.propagation, one.defects)
+        assert one.channels[0] == three.channel(one.channels[0].name)
 
 
 def test_a_demo_after_a_demo_gets_a_folder_of_its_own(tmp_path: Path) -> None:

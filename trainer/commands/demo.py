@@ -23,6 +23,7 @@ def options(parser: ArgumentParser) -> None:
         help="where the demo's files go (default: hololoop-demo, or if that is taken hololoop-demo-2 and so on)",
     )
     parser.add_argument("--quick", action="store_true", help="a smaller panel and fewer captures")
+    parser.add_argument("--colour", action="store_true", help="three colours, shown in turn")
     worker_options(parser, cluster=False)
 
 
@@ -41,7 +42,10 @@ def run(args: Namespace, screen: Screen) -> Result:
         emptied(folder)
     try:
         with screen.progress("demo") as progress:
-            return dict(run_demo(folder, quick=args.quick, workers=args.workers, progress=progress))
+            found = run_demo(
+                folder, quick=args.quick, workers=args.workers, progress=progress, colour=args.colour
+            )
+            return dict(found)
     except KeyboardInterrupt:
         raise Interrupted(_interrupted(folder)) from None
 
@@ -70,6 +74,14 @@ def first_free(folder: Path) -> Path:
 def show(result: Result, args: Namespace, screen: Screen) -> None:
     """What came out."""
     screen.say(str(result["sentence"]), style="bold")
+    if channels := result.get("channels"):
+        screen.table(
+            ("PSNR, dB", *channels, "together"),
+            [
+                (which, *(one[which]["psnr_db"] for one in channels.values()), together["psnr_db"])
+                for which, together in result["display"].items()
+            ],
+        )
     screen.facts({k: v for k, v in result.items() if k != "sentence"})
 
 
@@ -80,6 +92,6 @@ COMMAND = Command(
     run=run,
     show=show,
     outputs=outputs,
-    examples=("demo --quick",),
+    examples=("demo --quick", "demo --colour"),
     after="Do the same with your own captures: check captures/",
 )

@@ -3,18 +3,17 @@
 A headset with three hidden effects is captured and explained. Pictures are then shown with patterns for the ideal
 model, for the explained model, and by an oracle that knows the true bench, which gives the upper bound. They are shown
 through the drivers of a real headset, on emulated hardware: the panel over USB (pyusb), the lasers over I2C (smbus2,
-with safety controller and heartbeat), the camera over its link (depthai).
+with safety controller and heartbeat), the camera over its link (depthai). In full colour the panel shows the patterns
+of red, green and blue in turn, each lit by its own laser alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from firmware_iface.errors import InputError
 from firmware_iface.virtual import VirtualHeadset, open_headset
@@ -25,41 +24,32 @@ from runtime.headset.open_devices import Devices, emulated
 from runtime.program.progress import Progress, no_progress, part_of
 from runtime.solver import Quality, quality, solve
 from runtime.solver.pattern_files import write_pattern
-from runtime.solver.targets import encode_srgb, fit_area
 from trainer.captures.bench_file import Bench
 from trainer.captures.open_bench import nominal_bench
+from trainer.cycle.demo_pictures import seen_by_camera, target_of, write_picture
 from trainer.effects.effect_catalogue import catalogue
 from trainer.formatting import listed
 from trainer.model.bundle_export import export_bundle
 from trainer.model.model import Model
 from trainer.report.display_section import DisplayedPicture, with_display
-from trainer.training.photographs import photograph
 
-BENCH, QUICK_BENCH = "virtual:demo", "virtual:small_demo"
+BENCHES = {  # by whether it is quick, and in colour
+    (False, False): "virtual:demo",
+    (True, False): "virtual:small_demo",
+    (False, True): "virtual:colour_demo",
+    (True, True): "virtual:small_colour_demo",
+}
 PICTURES = ("astronaut", "coffee")  # not among those that are captured
 ITERATIONS, ORACLE_ITERATIONS = 100, 60
-SHOTS = 4  # pictures of the camera that are averaged
-SATURATED = 0.001  # share of pixels
-
-
-@dataclass(frozen=True)
-class CameraPicture:
-    """The camera's picture of a pattern.
-
-    Attributes
-    ----------
-    light : array [h, w], counts/ms
-        Above black.
-    quality : Quality
-        Against the target.
-    """
-
-    light: np.ndarray
-    quality: Quality
+QUICK_PATTERNS = {False: 9, True: 6}  # of each colour, by whether there are several
 
 
 def run_demo(
-    folder: Path, quick: bool = False, workers: int | None = None, progress: Progress | None = None
+    folder: Path,
+    quick: bool = False,
+    workers: int | None = None,
+    progress: Progress | None = None,
+    colour: bool = False,
 ) -> dict[str, Any]:
     """Run all steps and leave every file in `folder`.
 
@@ -73,12 +63,14 @@ def run_demo(
         Processes; None: one for each core.
     progress : callable or None
         Called with the share done and what is being done.
+    colour : bool
+        A bench of three colours, which are shown in turn.
 
     Returns
     -------
     dict
         Keys `sentence`, `found`, `verdict`, `steps`, `noise_nrmse`, `display`, `pictures`, `captures`, `model`,
-        `bundle` and `report` of `demo --json`.
+        `bundle` and `report` of `demo --json`; in colour `channels`, too.
 
     Raises
     ------
@@ -95,12 +87,12 @@ def run_demo(
 
     say = progress or no_progress
     _make_empty(folder)
-    spec = QUICK_BENCH if quick else BENCH
+    spec = BENCHES[quick, colour]
     headset = open_headset(spec, seed=1)
     bench = nominal_bench(headset)
     captures_folder, model_path, report_path = (folder / n for n in ("captures", "model.toml", "report.html"))
     acquire_captures(
-        headset, bench, captures_folder, patterns=9 if quick else None,
+        headset, bench, captures_folder, patterns=QUICK_PATTERNS[colour] if quick else None,
         progress=part_of(say, 0.0, 0.1, "capturing"),
     )  # fmt: skip
     captures = read_captures(captures_folder)
@@ -123,13 +115,15 @@ def run_demo(
     patterns = folder / "patterns"
     solved = _patterns(headset, captures.bench, bundles, pictures, patterns, part_of(say, 0.62, 0.87))
     say(0.88, "showing")
-    with emulated(spec, seed=2) as devices:
+    with emulated(spec, seed=2, fields=len(bench.channels)) as devices:
         shown = [_show(devices, captures.bench, *each, patterns) for each in solved]
 
     say(0.94, "writing the report")
     display = {name: _mean([p.qualities[name] for p in shown]) for name in ("before", "after", "oracle")}
+    channels = _by_channel([p.channels for p in shown])
+    in_turn = f", with {listed(list(channels))} in turn," if channels else ""
     sentence = (
-        f"Explained by {listed(found.model.names) or 'nothing'}: the picture shown goes from "
+        f"Explained by {listed(found.model.names) or 'nothing'}: the picture shown{in_turn} goes from "
         f"{display['before']['psnr_db']:.1f} to {display['after']['psnr_db']:.1f} dB (amplitude PSNR, seen "
         "by the camera); with the true bench known it is "
         f"{display['oracle']['psnr_db']:.1f} dB."
@@ -150,7 +144,8 @@ def run_demo(
         "steps": ladder["steps"],
         "noise_nrmse": ladder["noise_nrmse"],
         "display": display,
-        "pictures": [{"picture": p.name, **{k: _numbers(q) for k, q in p.qualities.items()}} for p in shown],
+        **({"channels": channels} if channels else {}),
+        "pictures": [_picture_numbers(p) for p in shown],
         "captures": str(captures_folder),
         "model": str(model_path),
         "bundle": str(bundles["after"]),
@@ -177,48 +172,56 @@ def _patterns(
     folder: Path,
     say: Progress,
 ) -> list[tuple[str, np.ndarray, dict[str, np.ndarray]]]:
-    """(name, target, gray levels by source) of every picture; sources are the bundles and the oracle on `headset`."""
-    channel = bench.channels[0].name
-    paths = {name: load_light_path(read_bundle(bundle), channel) for name, bundle in bundles.items()}
+    """(name, target [C, H, W], gray levels [C, H, W] by source) of every picture.
+
+    Sources are the bundles, and the oracle on `headset`.
+    """
+    channels = [c.name for c in bench.channels]
     folder.mkdir()
     found = []
     for number, name in enumerate(pictures):
-        begin, part = number / len(pictures), 1 / len(pictures)
-        target = _target(name, bench.panel.shape)
-        _write_picture(folder / f"{name}-target.png", target)
-        gray = {}
-        for k, (which, path) in enumerate(paths.items()):
-            say(begin + 0.1 * k * part, f"solving: {name}, {which}")
-            gray[which] = solve(path, target, ITERATIONS).gray
-        gray["oracle"] = _oracle(
-            headset, target, channel, gray["after"],
-            part_of(say, begin + 0.2 * part, begin + part, f"asking the oracle: {name}"),
-        )  # fmt: skip
-        for which, levels in gray.items():
-            write_pattern(folder / f"{name}-{which}.png", levels)
-        found.append((name, target, gray))
+        target = target_of(name, channels, bench.panel.shape)
+        write_picture(folder / f"{name}-target.png", target)
+        solved = []
+        for c, channel in enumerate(channels):
+            begin, part = number + c / len(channels), 1 / len(channels)
+            what = name if len(channels) == 1 else f"{name}, {channel}"
+            some = part_of(say, begin / len(pictures), (begin + part) / len(pictures), what)
+            solved.append(_solved(headset, bundles, channel, target[c], some))
+            for which, levels in solved[-1].items():
+                colour = "" if len(channels) == 1 else f"-{channel}"
+                write_pattern(folder / f"{name}-{which}{colour}.png", levels)
+        found.append((name, target, {which: np.stack([one[which] for one in solved]) for which in solved[0]}))
     return found
+
+
+def _solved(
+    headset: VirtualHeadset, bundles: dict[str, Path], channel: str, target: np.ndarray, say: Progress
+) -> dict[str, np.ndarray]:
+    """Gray levels [H, W] by source, for one colour's target [H, W]."""
+    gray = {}
+    for k, (which, bundle) in enumerate(bundles.items()):
+        say(0.1 * k, f"solving, {which}")
+        gray[which] = solve(load_light_path(read_bundle(bundle), channel), target, ITERATIONS).gray
+    asking = part_of(say, 0.2, 1.0, "asking the oracle")
+    gray["oracle"] = _oracle(headset, target, channel, gray["after"], asking)
+    return gray
 
 
 def _show(
     devices: Devices, bench: Bench, name: str, target: np.ndarray, gray: dict[str, np.ndarray], folder: Path
 ) -> DisplayedPicture:
     """A picture with each of its patterns, as the camera measures it."""
-    channel = bench.channels[0].name
-    camera = {which: _capture(devices, bench, channel, levels, target) for which, levels in gray.items()}
+    camera = {which: seen_by_camera(devices, bench, levels, target) for which, levels in gray.items()}
     for which, one in camera.items():
-        _write_picture(folder / f"{name}-{which}-seen.png", one.light)
+        write_picture(folder / f"{name}-{which}-seen.png", one.light)
     return DisplayedPicture(
         name,
         target,
         {which: one.light for which, one in camera.items()},
         {which: one.quality for which, one in camera.items()},
+        {which: one.by_channel for which, one in camera.items() if one.by_channel},
     )
-
-
-def _target(name: str, shape: tuple[int, int]) -> np.ndarray:
-    """A photograph's green part as linear irradiance [H, W]."""
-    return fit_area(photograph(name)[1], shape).astype(np.float32)
 
 
 def _oracle(
@@ -242,27 +245,22 @@ def _oracle(
     )
 
 
-def _capture(
-    devices: Devices, bench: Bench, channel: str, gray: np.ndarray, target: np.ndarray
-) -> CameraPicture:
-    """The camera's picture of a pattern at an exposure that does not saturate, mean of several shots."""
-    camera = devices.camera
-    black = bench.camera.black_level * 2.0 ** (camera.bit_depth - bench.camera.bit_depth)
-    devices.panel.show(gray)
-    devices.light(channel)
-    while (camera.capture() >= 2**camera.bit_depth - 1).mean() > SATURATED:
-        camera.exposure_ms = camera.exposure_ms * 0.7
-    shots = [camera.capture().astype(np.float64) - black for _ in range(SHOTS)]
-    devices.lasers.off()
-    light = np.mean(shots, axis=0) / camera.exposure_ms
-    return CameraPicture(light, quality(light, target))
+def _picture_numbers(p: DisplayedPicture) -> dict[str, Any]:
+    """A picture's entry in the JSON."""
+    channels = _by_channel([p.channels])
+    numbers = {k: _numbers(q) for k, q in p.qualities.items()}
+    return {"picture": p.name, **numbers, **({"channels": channels} if channels else {})}
 
 
-def _write_picture(path: Path, light: np.ndarray) -> None:
-    """Irradiance as an sRGB picture, its 99.8th percentile white."""
-    share = np.clip(light / max(float(np.percentile(light, 99.8)), 1e-12), 0, 1)
-    with whole_file(path) as file:
-        Image.fromarray(np.rint(255 * encode_srgb(share)).astype(np.uint8)).save(file, format="PNG")
+def _by_channel(
+    pictures: Sequence[Mapping[str, Mapping[str, Quality]]],
+) -> dict[str, dict[str, dict[str, float]]]:
+    """Mean quality over pictures by channel and source; empty for one colour."""
+    first = next(iter(pictures[0].values()), {})
+    return {
+        channel: {which: _mean([p[which][channel] for p in pictures]) for which in pictures[0]}
+        for channel in first
+    }
 
 
 def _numbers(q: Quality) -> dict[str, float]:

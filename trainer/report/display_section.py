@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from html import escape
 
 import numpy as np
@@ -28,18 +28,21 @@ class DisplayedPicture:
     ----------
     name : str
         Of the target.
-    target : array [H, W]
-        Irradiance.
-    lights : mapping of str to array [H, W]
+    target : array [H, W] or [C, H, W]
+        Irradiance of one colour, or of red, green and blue.
+    lights : mapping of str to array of the same kind
         The camera's picture of each pattern.
     qualities : mapping of str to Quality
         Of each pattern.
+    channels : mapping of str to mapping of str to Quality
+        Of each colour of each pattern, where there are several.
     """
 
     name: str
     target: np.ndarray
     lights: Mapping[str, np.ndarray]
     qualities: Mapping[str, Quality]
+    channels: Mapping[str, Mapping[str, Quality]] = field(default_factory=dict)
 
 
 def with_display(html: str, pictures: Sequence[DisplayedPicture], sentence: str) -> str:
@@ -64,11 +67,22 @@ def display_section(pictures: Sequence[DisplayedPicture], sentence: str) -> str:
     )
 
 
+def srgb_picture(light: np.ndarray) -> Image.Image:
+    """Irradiance [H, W] or [C, H, W], 1 is white, as an sRGB picture, gray for one colour."""
+    levels = np.rint(255 * encode_srgb(light)).astype(np.uint8)
+    if levels.ndim == 2 or len(levels) == 1:
+        return Image.fromarray(levels.reshape(levels.shape[-2:]))
+    return Image.fromarray(np.moveaxis(levels, 0, -1))
+
+
 def _row(one: DisplayedPicture) -> str:
     figures = [_figure("Target", one.target, one.target, "")]
     for which, light in one.lights.items():
         q = one.qualities[which]
         note = f"{q.psnr_db:.1f} dB, nrmse {q.nrmse:.3f}"
+        if which in one.channels:
+            each = ", ".join(f"{c} {of.psnr_db:.1f}" for c, of in one.channels[which].items())
+            note = f"{note} ({each} dB)"
         figures.append(_figure(TITLES.get(which, which), light / max(q.scale, 1e-30), one.target, note))
     columns = "display:grid;grid-template-columns:repeat(auto-fit,minmax(14rem,1fr));gap:1rem;margin:1rem 0"
     return f'<div style="{columns}">{"".join(figures)}</div>'
@@ -76,7 +90,7 @@ def _row(one: DisplayedPicture) -> str:
 
 def _figure(title: str, light: np.ndarray, target: np.ndarray, note: str) -> str:
     white = max(float(np.percentile(target, 99.8)), 1e-12)
-    picture = Image.fromarray(np.rint(255 * encode_srgb(light / white)).astype(np.uint8))
+    picture = srgb_picture(light / white)
     words = escape(f"{title}: {note}" if note else title)
     return (
         f'<figure><b>{escape(title)}</b><img style="width:100%" alt="{words}" '

@@ -55,6 +55,13 @@ def test_a_run_without_faults_loses_nothing_and_does_not_grow() -> None:
     assert all(memory["end"] - memory["settled"] < 3 for memory in found["memory_mb"].values())
 
 
+def test_a_run_in_three_colours_has_no_light_in_a_wrong_field_and_says_how_long_each_stage_takes() -> None:
+    found = soak(150, 50.0, colours=True)
+    assert found["lit_fields"] > 3 and found["wrongly_lit_fields"] == found["torn_frames"] == 0
+    stages = found["stage_ms"]
+    assert set(stages) == {"queue", "solve", "transfer", "total"} and stages["solve"] < stages["total"]
+
+
 def test_noise_in_the_dacs_memory_keeps_the_light_off_until_it_is_written_dark(tmp_path: Path) -> None:
     """As random bytes on the bus can write it. Opening the lasers refuses until a person has corrected it."""
     lane = Lane(tmp_path, 0)

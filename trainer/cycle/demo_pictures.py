@@ -1,0 +1,118 @@
+"""What the camera sees of the demo's patterns: in one colour, or in several that are shown in turn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from firmware_iface.panel.fields import colours_in_turn
+from runtime.bundle.whole_files import whole_file
+from runtime.headset.open_devices import Devices
+from runtime.solver import Quality, quality
+from runtime.solver.targets import CHANNELS, fit_area
+from trainer.captures.bench_file import Bench
+from trainer.report.display_section import srgb_picture
+from trainer.training.photographs import photograph
+
+SHOTS = 4  # pictures of the camera that are averaged
+SATURATED = 0.001  # share of pixels
+
+
+@dataclass(frozen=True)
+class CameraPicture:
+    """The camera's picture of a pattern, or of a pattern for each colour.
+
+    Attributes
+    ----------
+    light : array [C, h, w]
+        Above black; of one colour in counts/ms, of several in counts a frame.
+    quality : Quality
+        Against the target; several colours together, with one scale for all.
+    by_channel : mapping of str to Quality
+        Of each colour, with a scale of its own.
+    """
+
+    light: np.ndarray
+    quality: Quality
+    by_channel: Mapping[str, Quality] = field(default_factory=dict)
+
+
+def target_of(name: str, channels: Sequence[str], shape: tuple[int, int]) -> np.ndarray:
+    """A photograph as linear irradiance [C, H, W]: a part for each colour, and for a bench of one colour the green."""
+    wanted = channels if len(channels) > 1 else ("green",)
+    planes = photograph(name)[[CHANNELS.index(channel) for channel in wanted]]
+    return fit_area(planes, shape).astype(np.float32)
+
+
+def seen_by_camera(devices: Devices, bench: Bench, gray: np.ndarray, target: np.ndarray) -> CameraPicture:
+    """The camera's picture of gray levels [C, H, W], mean of several shots; several colours are shown in turn."""
+    channels = [c.name for c in bench.channels]
+    if len(channels) == 1:
+        return _in_one_colour(devices, bench, gray, target)
+    return _in_turn(devices, bench, gray, target)
+
+
+def _in_one_colour(devices: Devices, bench: Bench, gray: np.ndarray, target: np.ndarray) -> CameraPicture:
+    """At an exposure that does not saturate."""
+    camera = devices.camera
+    devices.panel.show(gray[0])
+    devices.light(bench.channels[0].name)
+    while _saturated(devices):
+        camera.exposure_ms = camera.exposure_ms * 0.7
+    light = _mean_light(devices, bench) / camera.exposure_ms
+    devices.lasers.off()
+    return CameraPicture(light[None], quality(light, target[0]))
+
+
+def _in_turn(devices: Devices, bench: Bench, gray: np.ndarray, target: np.ndarray) -> CameraPicture:
+    """All colours in turn, and then each of them alone in the same frame, since the camera sees their sum.
+
+    The exposure is of one frame. Each colour has light for a time in proportion to its brightness in the target: a
+    pattern puts all of its light into the picture. Where the sum saturates, all have less time.
+    """
+    channels = [c.name for c in bench.channels]
+    lasers = [devices.lasers.channels.index(channel) for channel in channels]
+    camera, field_us = devices.camera, devices.panel.field_us
+    camera.exposure_ms = min(1e-3 * field_us * len(channels), camera.longest_exposure_ms)
+    times = target.mean(axis=(1, 2))
+    times = times / times.max()
+
+    def show(times: np.ndarray) -> None:
+        devices.panel.show_fields(colours_in_turn(gray, lasers, times.tolist(), field_us))
+
+    show(times)
+    devices.light_all(channels)
+    while _saturated(devices):
+        times = times * 0.7
+        show(times)
+    light = []
+    for alone in np.diag(times):
+        show(alone)
+        light.append(_mean_light(devices, bench))
+    show(times)  # every gate is open when the lasers go off, so that their photodiodes see that they are dark
+    devices.lasers.off()
+    qualities = {c: quality(seen, t) for c, seen, t in zip(channels, light, target, strict=True)}
+    return CameraPicture(np.stack(light), quality(np.stack(light), target), qualities)
+
+
+def _saturated(devices: Devices) -> bool:
+    """Whether a picture of what is lit has too many pixels at the top."""
+    camera = devices.camera
+    return bool((camera.capture() >= 2**camera.bit_depth - 1).mean() > SATURATED)
+
+
+def _mean_light(devices: Devices, bench: Bench) -> np.ndarray:
+    """Counts above black of the picture that is lit, mean of several shots, float [h, w]."""
+    camera = devices.camera
+    black = bench.camera.black_level * 2.0 ** (camera.bit_depth - bench.camera.bit_depth)
+    return np.mean([camera.capture().astype(np.float64) - black for _ in range(SHOTS)], axis=0)
+
+
+def write_picture(path: Path, light: np.ndarray) -> None:
+    """Irradiance [C, h, w] as an sRGB picture, its 99.8th percentile white."""
+    share = np.clip(light / max(float(np.percentile(light, 99.8)), 1e-12), 0, 1)
+    with whole_file(path) as file:
+        srgb_picture(share).save(file, format="PNG")
