@@ -15,6 +15,7 @@ from trainer.captures.capture_table import Capture
 from trainer.captures.held_out import FIT_CAPTURES, CaptureRoles, capture_roles, scenes, split, with_stopping
 from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors, screen_candidates
 from trainer.diagnosis.learned_rest import LearnedRest, learn_rest
+from trainer.diagnosis.ranking import RankedEffect
 from trainer.diagnosis.screen import ScreenResult, screen_batches
 from trainer.diagnosis.together import explain_together, is_far
 from trainer.diagnosis.unnecessary import without_one
@@ -32,6 +33,7 @@ from trainer.model.model import EffectInstance, Model
 from trainer.model.parameters import json_values
 
 MOST_EFFECTS = 8  # an explanation longer than this explains nothing
+NEAR = 0.9  # of the excess that the best candidate removes: a candidate that removes so much is near
 
 
 @dataclass(frozen=True)
@@ -333,8 +335,7 @@ def explain(
                 save(model)
             continue
         report_share(0.9, f"adding {best.effect.name}")
-        candidate = add_from(roles, best.base, best.model.instance(best.effect.name))
-        after = evaluate_captures(captures, roles.held_out, candidate)
+        best, candidate, after = _added(roles, found)
         candidate, after = _with_maps_again(roles, candidate, after)
         further = gone_on(roles, candidate, best.effect.name, after, found.thresholds)
         candidate, after = further or (candidate, after)
@@ -360,6 +361,24 @@ def explain(
         model = rest.model
     report(1.0, "done")
     return Explanation(tuple(steps), model, diagnoses[-1], tuple(diagnoses), rest)
+
+
+def _added(roles: CaptureRoles, found: Diagnosis) -> tuple[RankedEffect, Model, PredictionErrors]:
+    """The effect to add, the model with it, everything refitted, and that model's held-out errors.
+
+    A candidate is ranked while present effects stay as they are, and these may have taken up a part of the right one.
+    So the next best, where it comes near, is fitted together with them, too.
+    """
+    best, *others = found.ranking
+    near = [r for r in others if r.worth_adding and r.removed.value > NEAR * best.removed.value]
+    fitted = []
+    for one in (best, *(near[:1] if found.model.present else [])):
+        model = add_from(roles, one.base, one.model.instance(one.effect.name))
+        fitted.append((one, model, evaluate_captures(roles.captures, roles.held_out, model)))
+    first, *second = fitted
+    if second and removed_excess(first[2], second[0][2]).interval()[0] > 0:
+        return second[0]
+    return first
 
 
 def _any_gone_on(
