@@ -17,11 +17,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.optimize import OptimizeResult, minimize
 
-from runtime.calibration.drift import Drift, amplitude_maps, axial_phase, drifted, wavefront_maps
+from runtime.calibration.drift import LOWEST_AMPLITUDE, LOWEST_WAVEFRONT, Drift, axial_phase, drifted
 from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, gain_of, predicted
+from runtime.calibration.misfit import Misfit
 from runtime.calibration.parameter_layout import STRETCH, VIEW, ParameterLayout
 from runtime.camera.view import TERMS, Sampler, View, sampler, sensitivity_maps
+from runtime.lightpath.legendre import legendre_map_by_map
 from runtime.lightpath.light_path import (
     filter_irradiance,
     image_field,
@@ -32,6 +36,7 @@ from runtime.lightpath.light_path import (
 from runtime.program.progress import Progress, no_progress, part_of
 
 SETTLED = 0.3  # a step that lowers chi squared by less, per parameter, is the last
+SAMPLE = 250_000  # pixels of a colour that the normal matrix is made from: thousands for each number
 
 
 @dataclass(frozen=True)
@@ -80,7 +85,7 @@ def fit(
     shots: Sequence[Shot],
     start: Estimate,
     orders: tuple[int, int],
-    iterations: int = 4,
+    iterations: int = 8,
     new_view: bool = False,
     progress: Progress | None = None,
 ) -> DriftFit:
@@ -107,25 +112,9 @@ def fit(
     """
     layout = ParameterLayout(tuple(bases), *orders, VIEW + STRETCH if new_view else VIEW)
     estimate = layout.widened(start)
-    cost = chi_squared(bases, shots, estimate) + layout.prior(estimate)
-    damping = 1e-3
-    for iteration in range(iterations):
-        share = _share_of(progress, iteration, iterations)
-        normal, gradient = _normal_equations(bases, shots, estimate, layout, share)
-        normal += np.diag(layout.precision)
-        gradient -= layout.precision * layout.numbers(estimate)
-        decrease = 0.0
-        for _ in range(6):
-            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
-            trial = layout.moved(estimate, step)
-            trial_cost = chi_squared(bases, shots, trial) + layout.prior(trial)
-            if trial_cost < cost:
-                estimate, decrease, cost = trial, cost - trial_cost, trial_cost
-                damping = max(damping / 10, 1e-8)
-                break
-            damping = max(10 * damping, 1e-3)
-        if decrease < SETTLED * len(step):
-            break
+    share = part_of(progress or no_progress, 0.0, 0.5)
+    normal = _normal_matrix(bases, shots, estimate, layout, share) + np.diag(layout.precision)
+    estimate, cost = _descended(bases, shots, estimate, layout, normal, iterations, progress or no_progress)
     pixels = sum(int(np.count_nonzero(s.weight)) for s in shots)
     chi2 = cost / max(pixels, 1)
     # a misfit widens the errors: residuals are then no longer the camera's noise
@@ -134,9 +123,59 @@ def fit(
     return DriftFit(estimate, layout.moved(zero, spread).drift, chi2)
 
 
-def _share_of(progress: Progress | None, iteration: int, iterations: int) -> Progress:
-    """Progress of one iteration as progress of the whole fit."""
-    return part_of(progress or no_progress, iteration / iterations, (iteration + 1) / iterations)
+def _descended(
+    bases: Mapping[str, ColourLightPath],
+    shots: Sequence[Shot],
+    start: Estimate,
+    layout: ParameterLayout,
+    normal: np.ndarray,
+    iterations: int,
+    progress: Progress,
+) -> tuple[Estimate, float]:
+    """The estimate of least cost, and that cost: BFGS on numbers that the normal matrix makes alike.
+
+    In those numbers the cost is nearly a sphere, and is scaled so that the first step is the Gauss-Newton step.
+    """
+    misfit = Misfit(bases, shots)
+    wavelengths = {c: b.wavelength_nm for c, b in bases.items()}
+    levers = layout.levers(start.view, next(iter(bases.values())).path.grid.shape)
+    upper = np.linalg.cholesky(normal).T
+
+    def cost_at(estimate: Estimate) -> tuple[float, np.ndarray]:
+        """Half the cost, and its gradient over the whitened numbers."""
+        chi2, slopes = misfit.at(estimate)
+        gradient = layout.gradient(slopes, wavelengths, levers) / 2
+        gradient += layout.precision * layout.numbers(estimate)
+        half = (chi2 + layout.prior(estimate)) / 2
+        return half, solve_triangular(upper, gradient, trans=1)
+
+    first, downhill = cost_at(start)
+    scale = max(float(np.linalg.norm(downhill)), 1e-30)
+    best = [first, start]
+    done, least = 0, first
+
+    def scaled(step: np.ndarray) -> tuple[float, np.ndarray]:
+        if not step.any():
+            return first / scale**2, downhill / scale
+        estimate = layout.moved(start, solve_triangular(upper, scale * step))
+        half, gradient = cost_at(estimate)
+        if half < best[0]:
+            best[:] = half, estimate
+        return half / scale**2, gradient / scale
+
+    def after_iteration(intermediate_result: OptimizeResult) -> None:
+        nonlocal done, least
+        done += 1
+        progress(0.5 + 0.5 * done / iterations)
+        decrease, least = least - best[0], best[0]
+        if 2 * decrease < SETTLED * len(downhill):
+            raise StopIteration
+
+    minimize(
+        scaled, np.zeros(len(downhill)), jac=True, method="L-BFGS-B", callback=after_iteration,
+        options={"maxiter": iterations, "maxfun": 2 * iterations, "maxcor": iterations, "ftol": 0, "gtol": 0},
+    )  # fmt: skip
+    return best[1], 2 * best[0]
 
 
 def _samplers(bases: Mapping[str, ColourLightPath], view: View, finer: int) -> dict[str, Sampler]:
@@ -148,34 +187,52 @@ def _samplers(bases: Mapping[str, ColourLightPath], view: View, finer: int) -> d
     return {name: made[base.path.grid] for name, base in bases.items()}
 
 
-def _normal_equations(
+def _normal_matrix(
     bases: Mapping[str, ColourLightPath],
     shots: Sequence[Shot],
     estimate: Estimate,
     layout: ParameterLayout,
     progress: Progress,
-) -> tuple[np.ndarray, np.ndarray]:
-    """The Fisher information matrix and the gradient of half chi squared, over the layout's numbers."""
+) -> np.ndarray:
+    """The Fisher information matrix over the layout's numbers, from a sample of the pixels."""
     count = int(layout.edges[-1])
-    normal, gradient = np.zeros((count, count)), np.zeros(count)
+    normal = np.zeros((count, count))
     samplers = _samplers(bases, estimate.view, 2)
     rough = _samplers(bases, estimate.view, 1)
     views = _stepped_views(bases, estimate.view, layout.view)
-    for number, shot in enumerate(shots):
+    chosen = _sample(shots)
+    for number, (shot, pixels, share) in enumerate(chosen):
         base = bases[shot.channel]
         light = predicted(base, shot, estimate, samplers[shot.channel])
-        gain, root = gain_of(shot, light), np.sqrt(shot.weight)
-        residual = (root * (shot.signal - gain * light)).ravel()
-        along = (root * light).ravel()
+        gain, root = gain_of(shot, light), np.sqrt(shot.weight).ravel()[pixels]
+        along = root * light.ravel()[pixels]
         along /= max(math.sqrt(float(np.vdot(along, along))), 1e-30)
-        rows = np.zeros((count, residual.size), np.float32)
+        rows = np.zeros((count, along.size), np.float32)
         for place, column in _columns(base, shot, estimate, layout, rough[shot.channel], views):
-            rows[place] = (root * gain * column).ravel()
+            rows[place] = root * gain * column.ravel()[pixels]
         rows -= np.outer(rows @ along, along)
-        normal += rows @ rows.T
-        gradient += rows @ residual
-        progress((number + 1) / len(shots))
-    return normal, gradient
+        normal += (rows @ rows.T) / share
+        progress((number + 1) / len(chosen))
+    return normal
+
+
+def _sample(shots: Sequence[Shot]) -> list[tuple[Shot, np.ndarray | slice, float]]:
+    """Shots with the pixels to sample of each (all, or chosen at random), and which share of the colour's all they are.
+
+    Every pixel of every pattern where there are few; else of as few patterns as will do, since each costs a propagation
+    a number.
+    """
+    chosen: list[tuple[Shot, np.ndarray | slice, float]] = []
+    rng = np.random.default_rng(0)
+    for channel in dict.fromkeys(shot.channel for shot in shots):
+        own = [shot for shot in shots if shot.channel == channel]
+        size = own[0].signal.size
+        some = own[: max(1, math.ceil(SAMPLE / size))]
+        each = min(size, math.ceil(SAMPLE / len(some)))
+        for shot in some:
+            pixels = slice(None) if each == size else np.sort(rng.choice(size, each, replace=False))
+            chosen.append((shot, pixels, len(some) * each / (len(own) * size)))
+    return chosen
 
 
 def _stepped_views(
@@ -226,11 +283,12 @@ def _columns(
 
     shape, place = path.grid.shape, int(layout.edges[1])
     if layout.wavefront:
-        for k, one in enumerate(wavefront_maps(shape, layout.orders[0])):
-            yield k, over_panel(2j * math.pi / base.wavelength_nm * one)
+        turn = np.complex64(2j * math.pi / base.wavelength_nm)
+        for k, one in enumerate(legendre_map_by_map(shape, layout.orders[0], LOWEST_WAVEFRONT)):
+            yield k, over_panel(turn * one)
     if layout.amplitude:
         place += layout.channels.index(shot.channel) * layout.amplitude
-        for k, one in enumerate(amplitude_maps(shape, layout.orders[1])):
+        for k, one in enumerate(legendre_map_by_map(shape, layout.orders[1], LOWEST_AMPLITUDE)):
             yield place + k, over_panel(one)
     place = int(layout.edges[2])
     turned = path.transfers * (1j * axial_phase(path, base.wavelength_nm)).astype(path.transfers.dtype)

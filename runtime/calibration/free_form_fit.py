@@ -16,11 +16,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import minimize
 
-from runtime.calibration.drift import drifted
-from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, gain_of, light_on_camera
-from runtime.camera.view import sampler_and_adjoint
-from runtime.lightpath.light_path import panel_phase
-from runtime.lightpath.light_path_adjoint import irradiance_and_pullback
+from runtime.calibration.estimate import ColourLightPath, Estimate, Shot
+from runtime.calibration.misfit import Misfit
 from runtime.lightpath.spline_maps import node_weights, nodes_over
 from runtime.program.progress import Progress
 
@@ -53,40 +50,28 @@ def fit_freeform(
     Estimate
         Its drift has one map of the wavefront for all colours, and one of the beam for each colour.
     """
-    grid = next(iter(bases.values())).path.grid
-    rows, columns = (node_weights(n, m) for n, m in zip(grid.shape, nodes_of(grid.shape), strict=True))
-    shape = (rows.shape[1], columns.shape[1])
+    shape = next(iter(bases.values())).path.grid.shape
+    rows, columns = (node_weights(n, m).astype(np.float32) for n, m in zip(shape, nodes_of(shape), strict=True))
+    nodes = (rows.shape[1], columns.shape[1])
     channels = tuple(bases)
-    readers = {g: sampler_and_adjoint(start.view, g) for g in {b.path.grid for b in bases.values()}}
-    even = start.view.evenness().astype(np.float32)
+    misfit = Misfit(bases, shots, motion=False)
     done = 0
 
     def with_maps(vector: np.ndarray) -> Estimate:
-        nm, *logs = vector.reshape(-1, *shape)
+        nm, *logs = vector.reshape(-1, *nodes)
         beams = {c: LIKELY_LOG * v for c, v in zip(channels, logs, strict=True)}
         return replace(
             start, drift=replace(start.drift, wavefront_nodes_nm=LIKELY_NM * nm, amplitude_nodes=beams)
         )
 
     def cost(vector: np.ndarray) -> tuple[float, np.ndarray]:
-        drift = with_maps(vector).drift
-        total, gradient = float(vector @ vector), 2 * vector.reshape(-1, *shape)
-        paths = {c: drifted(b.path, c, b.wavelength_nm, drift) for c, b in bases.items()}
-        for shot in shots:
-            path, (sample, back) = paths[shot.channel], readers[bases[shot.channel].path.grid]
-            phase = panel_phase(path, shot.gray.astype(np.int64))
-            image, pullback = irradiance_and_pullback(path, phase, factor=True)
-            light = light_on_camera(start.view, sample, image)
-            gain = gain_of(shot, light)
-            residual = shot.signal - gain * light
-            total += float(np.vdot(shot.weight * residual, residual))
-            slope = (-2 * gain) * shot.weight * residual
-            onto = slope * even + np.float32(start.view.stray * float(slope.mean()))
-            over = pullback(back(onto.astype(np.float32)))
-            turn = 2 * math.pi / bases[shot.channel].wavelength_nm * LIKELY_NM
+        chi2, slopes = misfit.at(with_maps(vector))
+        gradient = 2 * vector.reshape(-1, *nodes)
+        for number, (channel, over) in enumerate(slopes.over_panel.items(), 1):
+            turn = 2 * math.pi / bases[channel].wavelength_nm * LIKELY_NM
             gradient[0] += turn * (rows.T @ over.imag @ columns)
-            gradient[1 + channels.index(shot.channel)] += LIKELY_LOG * (rows.T @ over.real @ columns)
-        return total, gradient.ravel()
+            gradient[number] += LIKELY_LOG * (rows.T @ over.real @ columns)
+        return float(vector @ vector) + chi2, gradient.ravel()
 
     def count_iteration(_: np.ndarray) -> None:
         nonlocal done
@@ -94,7 +79,7 @@ def fit_freeform(
         if progress:
             progress(done / ITERATIONS)
 
-    drift, nothing = start.drift, np.zeros(shape)
+    drift, nothing = start.drift, np.zeros(nodes)
     begin = [drift.wavefront_nodes_nm / LIKELY_NM if drift.wavefront_nodes_nm.size else nothing]
     begin += [drift.amplitude_nodes.get(c, nothing) / LIKELY_LOG for c in channels]
     found = minimize(
