@@ -13,26 +13,19 @@ The trainer minimises the unweighted excess that it reports, by secants of effec
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.optimize import OptimizeResult, minimize
 
-from runtime.calibration.drift import LOWEST_AMPLITUDE, LOWEST_WAVEFRONT, Drift, axial_phase, drifted
-from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, gain_of, predicted
+from runtime.calibration.columns import Columns
+from runtime.calibration.drift import Drift
+from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, gain_of
 from runtime.calibration.misfit import Misfit
 from runtime.calibration.parameter_layout import STRETCH, VIEW, ParameterLayout
-from runtime.camera.view import TERMS, Sampler, View, sampler, sensitivity_maps
-from runtime.lightpath.legendre import legendre_map_by_map
-from runtime.lightpath.light_path import (
-    filter_irradiance,
-    image_field,
-    panel_phase,
-    panel_spectrum,
-    states,
-)
+from runtime.calibration.prediction import Predictor
 from runtime.program.progress import Progress, no_progress, part_of
 
 SETTLED = 0.3  # a step that lowers chi squared by less, per parameter, is the last
@@ -71,11 +64,17 @@ def chi_squared(
     finer : int
         Of the camera's `sampler`.
     """
+    predictor = Predictor(bases, finer)
+    predictor.take(estimate)
+    return predicted_chi_squared(predictor, shots)
+
+
+def predicted_chi_squared(predictor: Predictor, shots: Sequence[Shot]) -> float:
+    """`chi_squared` of what a predictor has taken."""
     total = 0.0
-    samplers = _samplers(bases, estimate.view, finer)
     for shot in shots:
-        light = predicted(bases[shot.channel], shot, estimate, samplers[shot.channel])
-        residual = shot.signal - gain_of(shot, light) * light
+        light = predictor.light(shot)
+        residual = shot.signal - np.float32(gain_of(shot, light)) * light
         total += float(np.vdot(shot.weight * residual, residual))
     return total
 
@@ -178,15 +177,6 @@ def _descended(
     return best[1], 2 * best[0]
 
 
-def _samplers(bases: Mapping[str, ColourLightPath], view: View, finer: int) -> dict[str, Sampler]:
-    """One for each colour; colours on one grid share theirs."""
-    made: dict[object, Sampler] = {}
-    for base in bases.values():
-        if base.path.grid not in made:
-            made[base.path.grid] = sampler(view, base.path.grid, finer)
-    return {name: made[base.path.grid] for name, base in bases.items()}
-
-
 def _normal_matrix(
     bases: Mapping[str, ColourLightPath],
     shots: Sequence[Shot],
@@ -197,19 +187,16 @@ def _normal_matrix(
     """The Fisher information matrix over the layout's numbers, from a sample of the pixels."""
     count = int(layout.edges[-1])
     normal = np.zeros((count, count))
-    samplers = _samplers(bases, estimate.view, 2)
-    rough = _samplers(bases, estimate.view, 1)
-    views = _stepped_views(bases, estimate.view, layout.view)
+    columns = Columns(bases, estimate, layout)
     chosen = _sample(shots)
     for number, (shot, pixels, share) in enumerate(chosen):
-        base = bases[shot.channel]
-        light = predicted(base, shot, estimate, samplers[shot.channel])
+        light = columns.predictor.light(shot)
         gain, root = gain_of(shot, light), np.sqrt(shot.weight).ravel()[pixels]
         along = root * light.ravel()[pixels]
         along /= max(math.sqrt(float(np.vdot(along, along))), 1e-30)
         rows = np.zeros((count, along.size), np.float32)
-        for place, column in _columns(base, shot, estimate, layout, rough[shot.channel], views):
-            rows[place] = root * gain * column.ravel()[pixels]
+        for place, column in columns.of(shot):
+            rows[place] = np.float32(gain) * root * column.ravel()[pixels]
         rows -= np.outer(rows @ along, along)
         normal += (rows @ rows.T) / share
         progress((number + 1) / len(chosen))
@@ -233,76 +220,3 @@ def _sample(shots: Sequence[Shot]) -> list[tuple[Shot, np.ndarray | slice, float
             pixels = slice(None) if each == size else np.sort(rng.choice(size, each, replace=False))
             chosen.append((shot, pixels, len(some) * each / (len(own) * size)))
     return chosen
-
-
-def _stepped_views(
-    bases: Mapping[str, ColourLightPath], view: View, steps: tuple[tuple[str, float], ...] = VIEW
-) -> list[tuple[float, dict[str, Sampler]]]:
-    """The step of each fitted field's secant, and the samplers after it; the first entry is without a step."""
-    moved = [replace(view, **{name: getattr(view, name) + step}) for name, step in steps]
-    return [(0.0, _samplers(bases, view, 1))] + [
-        (step, _samplers(bases, one, 1)) for (_, step), one in zip(steps, moved, strict=True)
-    ]
-
-
-def _columns(
-    base: ColourLightPath,
-    shot: Shot,
-    estimate: Estimate,
-    layout: ParameterLayout,
-    sample: Sampler,
-    views: list[tuple[float, dict[str, Sampler]]],
-) -> Iterator[tuple[int, np.ndarray]]:
-    """Derivatives of a prediction, [h, w], with the place of each in the vector."""
-    path = drifted(base.path, shot.channel, base.wavelength_nm, estimate.drift)
-    phase = panel_phase(path, shot.gray.astype(np.int64))
-    exposure = list(states(path))  # the panel's states, whose irradiances add
-    spectra = [panel_spectrum(state, phase) for state in exposure]
-    parts = [(k, m) for k in range(len(exposure)) for m in range(path.transfers.shape[0])]
-    weights = [float(exposure[k].weights[m]) for k, m in parts]
-    fields = [image_field(path, spectra[k], m) for k, m in parts]
-    even = estimate.view.evenness().astype(np.float32)
-
-    def change(moved: Callable[[int, int], np.ndarray]) -> np.ndarray:
-        """2 Re(z* dz) summed over states and modes, as the camera sees it; `moved` gives the dz of both."""
-        total = sum(
-            w * 2 * (z.real * d.real + z.imag * d.imag)
-            for w, z, d in ((w, z, moved(*part)) for w, z, part in zip(weights, fields, parts, strict=True))
-        )
-        light = sample(filter_irradiance(path, np.asarray(total)))
-        return light * even + estimate.view.stray * light.mean()
-
-    def over_panel(factor: np.ndarray) -> np.ndarray:
-        """For a relative change [H, W] of the field that leaves the panel."""
-        factor = factor.astype(path.source.dtype)
-        leak = None if path.leak is None else path.leak * factor
-        moved = [
-            panel_spectrum(replace(one, source=one.source * factor, leak=leak), phase) for one in exposure
-        ]
-        return change(lambda k, m: image_field(path, moved[k], m))
-
-    shape, place = path.grid.shape, int(layout.edges[1])
-    if layout.wavefront:
-        turn = np.complex64(2j * math.pi / base.wavelength_nm)
-        for k, one in enumerate(legendre_map_by_map(shape, layout.orders[0], LOWEST_WAVEFRONT)):
-            yield k, over_panel(turn * one)
-    if layout.amplitude:
-        place += layout.channels.index(shot.channel) * layout.amplitude
-        for k, one in enumerate(legendre_map_by_map(shape, layout.orders[1], LOWEST_AMPLITUDE)):
-            yield place + k, over_panel(one)
-    place = int(layout.edges[2])
-    turned = path.transfers * (1j * axial_phase(path, base.wavelength_nm)).astype(path.transfers.dtype)
-    away = replace(path, transfers=turned)
-    yield place, change(lambda k, m: image_field(away, spectra[k], m))
-
-    image = filter_irradiance(
-        path,
-        np.asarray(sum(w * np.abs(z) ** 2 for w, z in zip(weights, fields, strict=True)), np.float32),
-    )
-    place = int(layout.edges[3])
-    light = views[0][1][shot.channel](image)
-    for k, (step, samplers) in enumerate(views[1:]):
-        yield place + k, (samplers[shot.channel](image) - light) / step * even
-    for k, one in enumerate(sensitivity_maps(estimate.view.shape)):
-        yield place + len(layout.view) + k, light * even * one
-    yield place + len(layout.view) + TERMS, np.full(light.shape, light.mean(), np.float32)

@@ -9,15 +9,16 @@ import numpy as np
 
 from runtime.calibration.colour_captures import ColourCaptures, dot_spacing
 from runtime.calibration.drift import Drift
-from runtime.calibration.drift_fit import DriftFit, chi_squared, fit
+from runtime.calibration.drift_fit import DriftFit, fit, predicted_chi_squared
 from runtime.calibration.estimate import ColourLightPath, Estimate
 from runtime.calibration.free_form_fit import fit_freeform
 from runtime.calibration.held_out_errors import held_out_errors
+from runtime.calibration.prediction import Predictor
 from runtime.calibration.replacement_rule import is_certain
 from runtime.calibration.response import Sweep, fitted_response, measured_sweep
 from runtime.calibration.shown_patterns import GRAINS
 from runtime.camera.registration import dots_of, find_homography, panel_points
-from runtime.camera.view import View, sampler
+from runtime.camera.view import View
 from runtime.excess import removed_excess
 from runtime.program.progress import Progress, part_of
 
@@ -103,9 +104,10 @@ def refit(
     estimate = Estimate(Drift(), view)
     coarse = [t.fitted[GRAINS.index(size)] for t in captures.values() for size in sorted(GRAINS)[-2:]]
     say(0.0, "distance")
-    costs = {
-        mm: chi_squared(bases, coarse, replace(estimate, drift=Drift(distance_mm=mm)), 1) for mm in SCAN_MM
-    }
+    predictor, costs = Predictor(bases, 1), {}
+    for mm in SCAN_MM:
+        predictor.take(replace(estimate, drift=Drift(distance_mm=mm)))
+        costs[mm] = predicted_chi_squared(predictor, coarse)
     estimate = replace(estimate, drift=Drift(distance_mm=min(costs, key=lambda mm: costs[mm])))
     parts = len(ORDERS) + TURNS
     for number, orders in enumerate(ORDERS):
@@ -154,9 +156,10 @@ def _with_response(
 ) -> tuple[Estimate, dict[str, Sweep]]:
     """The estimate with each colour's response from its sweep, all else as it is."""
     sweeps, responses = {}, dict(estimate.drift.response)
+    predictor = Predictor(bases)
+    predictor.take(estimate)
     for channel, base in bases.items():
-        sample = sampler(estimate.view, base.path.grid)
-        sweeps[channel] = measured_sweep(base, captures[channel].sweep, estimate, sample)
+        sweeps[channel] = measured_sweep(predictor, captures[channel].sweep)
         believed = np.asarray(responses.get(channel, base.path.response), np.float64)
         responses[channel] = fitted_response(believed, sweeps[channel])
     return replace(estimate, drift=replace(estimate.drift, response=responses)), sweeps

@@ -78,13 +78,23 @@ class Reading:
         """
         fft.real_into(image, self.spectrum)
         self.spectrum *= self.transfer
+        return self._seen(1.0)
+
+    def _seen(self, factor: np.ndarray | float) -> np.ndarray:
+        """What the camera's pixels read of the spectrum times a factor."""
         columns = self.spectrum.shape[1]
         for here, there in self.halves:
-            self.wide[there, :columns] = self.spectrum[here]
+            part = factor[here] if isinstance(factor, np.ndarray) and len(factor) > 1 else factor
+            np.multiply(self.spectrum[here], part, out=self.wide[there, :columns])
         self.wide[self.gap] = 0
         self.wide[:, columns:] = 0
         fft.real_from(self.wide, self.fine)
         return np.asarray(self.matrices[0] @ self.fine.reshape(-1)).reshape(self.view.shape)
+
+    def blurred(self) -> tuple[np.ndarray, np.ndarray]:
+        """How what was last read changes with the variances of the lens's blur along y and x: two [h, w]."""
+        down, right = (self._seen((-2 * np.pi**2 * f**2).astype(np.float32)) for f in (self.fy, self.fx))
+        return down, right
 
     def motion(self) -> tuple[np.ndarray, np.ndarray]:
         """How what was last read changes where each pixel looks a panel pixel farther down, and right: two [h, w]."""

@@ -10,10 +10,11 @@ import pytest
 
 from firmware_iface.errors import InputError
 from firmware_iface.virtual.simulated_drive import Drive
+from runtime.calibration.columns import Columns
 from runtime.calibration.drift import Drift, drifted, wavefront_maps
-from runtime.calibration.drift_fit import _columns, _stepped_views
 from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, predicted
 from runtime.calibration.parameter_layout import ParameterLayout
+from runtime.calibration.prediction import Predictor
 from runtime.calibration.replacement_rule import replacement_verdict
 from runtime.calibration.response import (
     SWEEP,
@@ -110,11 +111,7 @@ def test_derivatives_are_what_differences_say() -> None:
         layout.nothing(Estimate(Drift(), View(SMALL))), 0.02 * rng.normal(size=int(layout.edges[-1]))
     )
     bases = {"green": one}
-    columns = dict(
-        _columns(
-            one, shot, start, layout, sampler(start.view, full.grid, 1), _stepped_views(bases, start.view)
-        )
-    )
+    columns = dict(Columns(bases, start, layout).of(shot))
     assert sorted(columns) == list(range(int(layout.edges[-1])))
     for place, column in columns.items():
         step = np.zeros(int(layout.edges[-1]))
@@ -144,7 +141,9 @@ def test_a_sweep_of_gratings_gives_a_hidden_response() -> None:
     sample = sampler(still.view, one.path.grid)
     period = best_period(one, "green", still, sample)
     shots = taker.shots("green", [grating(shape, period, g) for g in SWEEP], noise, "grating")
-    sweep = measured_sweep(one, shots, still, sample)
+    predictor = Predictor({"green": one})
+    predictor.take(still)
+    sweep = measured_sweep(predictor, shots)
     true = Drive(bench, WAVELENGTH_NM).magnitude(np.arange(256.0)[None])[0]
     assert np.abs(true - one.path.response).max() > 0.5
     assert np.abs(sweep.phase - true[sweep.gray]).max() < 0.03
