@@ -41,7 +41,7 @@ class Columns:
         self, bases: Mapping[str, ColourLightPath], estimate: Estimate, layout: ParameterLayout
     ) -> None:
         self.bases, self.estimate, self.layout = bases, estimate, layout
-        self.predictor = Predictor(bases, 1, True)  # that fine is enough for the direction of a step
+        self.predictor = Predictor(bases, 1)  # that fine is enough for the direction of a step
         self.predictor.take(estimate)
         panel = next(iter(bases.values())).path.grid.shape
         self.levers = layout.levers(estimate.view, panel)
@@ -54,7 +54,7 @@ class Columns:
         path, wavelength = predictor.paths[channel], self.bases[channel].wavelength_nm
         seen = reading.read(predictor.image(channel, phase))
         light, place = seen * predictor.even, int(layout.edges[3])
-        down, right = reading.motion()
+        down, right = reading.moved()
         blur = dict(zip(("blur_y_px2", "blur_x_px2"), reading.blurred(), strict=True))
         for k, (name, _) in enumerate(layout.view):
             if name in blur:
@@ -80,9 +80,7 @@ class Columns:
                 yield k, self._change(channel, phase, turn * one)
         if layout.amplitude:
             place = int(layout.edges[1]) + layout.channels.index(channel) * layout.amplitude
-            for k, one in enumerate(
-                legendre_map_by_map(path.grid.shape, layout.orders[1], LOWEST_AMPLITUDE)
-            ):
+            for k, one in enumerate(legendre_map_by_map(path.grid.shape, layout.orders[1], LOWEST_AMPLITUDE)):
                 yield place + k, self._change(channel, phase, one)
 
     def _change(self, channel: str, phase: np.ndarray, factor: np.ndarray | None = None) -> np.ndarray:
@@ -97,14 +95,15 @@ class Columns:
         image = predictor.images[path.grid]
         moved.irradiance(phase, image)
         still, plane = predictor.optics[channel].image_plane, moved.image_plane
-        pairs = zip(still.weights, still.fields, plane.fields, strict=True)
-        for number, (weight, z, dz) in enumerate(pairs):
-            change = z.real * dz.real
-            change += z.imag * dz.imag
-            change *= change.dtype.type(2 * weight)
-            if number == 0:
-                image[...] = change
-            else:
-                image += change
+        pairs = list(zip(still.weights, still.fields, plane.fields, strict=True))
+
+        def work(worker: int, rows: slice) -> None:
+            image[rows] = 0
+            for weight, z, dz in pairs:
+                both = np.conj(z[rows])
+                both *= dz[rows]
+                image[rows] += both.dtype.type(2 * weight).real * both.real
+
+        predictor.backend.over_rows(len(image), plane.strip, work)
         seen = predictor.readings[channel].read(image)
         return seen * predictor.even + np.float32(self.estimate.view.stray * float(seen.mean()))

@@ -12,7 +12,6 @@ The trainer minimises the unweighted excess that it reports, by secants of effec
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -20,16 +19,17 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.optimize import OptimizeResult, minimize
 
-from runtime.calibration.columns import Columns
 from runtime.calibration.drift import Drift
 from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, gain_of
+from runtime.calibration.information import Information, measured_information
 from runtime.calibration.misfit import Misfit
 from runtime.calibration.parameter_layout import STRETCH, VIEW, ParameterLayout
 from runtime.calibration.prediction import Predictor
 from runtime.program.progress import Progress, no_progress, part_of
 
 SETTLED = 0.3  # a step that lowers chi squared by less, per parameter, is the last
-SAMPLE = 250_000  # pixels of a colour that the normal matrix is made from: thousands for each number
+SETTLED_SHARE = 1e-3  # or by a smaller share
+ROUNDS = 3  # of descents: where one does not settle, the information is measured anew, nearer to the truth
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,14 @@ class DriftFit:
         Standard errors of the estimate's drift, in its own shape.
     chi2 : float
         Per pixel that counts; 1 is the camera's noise alone.
+    information : Information
+        That the fit went by.
     """
 
     estimate: Estimate
     errors: Drift
     chi2: float
+    information: Information
 
 
 def chi_squared(
@@ -84,9 +87,10 @@ def fit(
     shots: Sequence[Shot],
     start: Estimate,
     orders: tuple[int, int],
-    iterations: int = 8,
+    iterations: int = 6,
     new_view: bool = False,
     progress: Progress | None = None,
+    information: Information | None = None,
 ) -> DriftFit:
     """The estimate that explains the shots best. The response is held.
 
@@ -99,27 +103,43 @@ def fit(
     orders : (int, int)
         Highest Legendre orders of the wavefront and of the beam's amplitude; (0, 0) fits the camera's view alone.
     iterations : int
-        At most.
+        A round, at most.
     new_view : bool
         Whether the view's homography is only as good as dots are: its stretch is then fitted too.
     progress : callable, optional
         Called with the share done, 0 to 1.
+    information : Information, optional
+        Of an estimate like this one, of these orders or higher; None: it is measured at the start.
 
     Returns
     -------
     DriftFit
     """
-    layout = ParameterLayout(tuple(bases), *orders, VIEW + STRETCH if new_view else VIEW)
+    layout = layout_of(bases, orders, new_view)
     estimate = layout.widened(start)
-    share = part_of(progress or no_progress, 0.0, 0.5)
-    normal = _normal_matrix(bases, shots, estimate, layout, share) + np.diag(layout.precision)
-    estimate, cost = _descended(bases, shots, estimate, layout, normal, iterations, progress or no_progress)
+    progress = progress or no_progress
+    rounds = ROUNDS if information is None else 1
+    for number in range(rounds):
+        share = part_of(progress, number / rounds, (number + 1) / rounds)
+        if information is None or number > 0:
+            information = measured_information(bases, shots, estimate, layout, part_of(share, 0.0, 0.5))
+        normal = len(shots) * information.of(layout) + np.diag(layout.precision)
+        estimate, cost, settled = _descended(bases, shots, estimate, layout, normal, iterations, share)
+        if settled:
+            break
     pixels = sum(int(np.count_nonzero(s.weight)) for s in shots)
     chi2 = cost / max(pixels, 1)
     # a misfit widens the errors: residuals are then no longer the camera's noise
     spread = np.sqrt(np.diag(np.linalg.inv(normal)) * max(1.0, chi2))
     zero = layout.moved(layout.nothing(start), np.zeros(len(spread)))
-    return DriftFit(estimate, layout.moved(zero, spread).drift, chi2)
+    return DriftFit(estimate, layout.moved(zero, spread).drift, chi2, information)
+
+
+def layout_of(
+    bases: Mapping[str, ColourLightPath], orders: tuple[int, int], new_view: bool
+) -> ParameterLayout:
+    """The layout of a fit; the arguments are those of `fit`."""
+    return ParameterLayout(tuple(bases), *orders, VIEW + STRETCH if new_view else VIEW)
 
 
 def _descended(
@@ -130,8 +150,8 @@ def _descended(
     normal: np.ndarray,
     iterations: int,
     progress: Progress,
-) -> tuple[Estimate, float]:
-    """The estimate of least cost, and that cost: BFGS on numbers that the normal matrix makes alike.
+) -> tuple[Estimate, float, bool]:
+    """The estimate of least cost, that cost, and whether it has settled: BFGS on numbers that `normal` makes alike.
 
     In those numbers the cost is nearly a sphere, and is scaled so that the first step is the Gauss-Newton step.
     """
@@ -151,7 +171,7 @@ def _descended(
     first, downhill = cost_at(start)
     scale = max(float(np.linalg.norm(downhill)), 1e-30)
     best = [first, start]
-    done, least = 0, first
+    done, least, settled = 0, first, False
 
     def scaled(step: np.ndarray) -> tuple[float, np.ndarray]:
         if not step.any():
@@ -163,60 +183,16 @@ def _descended(
         return half / scale**2, gradient / scale
 
     def after_iteration(intermediate_result: OptimizeResult) -> None:
-        nonlocal done, least
+        nonlocal done, least, settled
         done += 1
         progress(0.5 + 0.5 * done / iterations)
         decrease, least = least - best[0], best[0]
-        if 2 * decrease < SETTLED * len(downhill):
+        settled = decrease < max(SETTLED * len(downhill) / 2, SETTLED_SHARE * least)
+        if settled:
             raise StopIteration
 
     minimize(
         scaled, np.zeros(len(downhill)), jac=True, method="L-BFGS-B", callback=after_iteration,
         options={"maxiter": iterations, "maxfun": 2 * iterations, "maxcor": iterations, "ftol": 0, "gtol": 0},
     )  # fmt: skip
-    return best[1], 2 * best[0]
-
-
-def _normal_matrix(
-    bases: Mapping[str, ColourLightPath],
-    shots: Sequence[Shot],
-    estimate: Estimate,
-    layout: ParameterLayout,
-    progress: Progress,
-) -> np.ndarray:
-    """The Fisher information matrix over the layout's numbers, from a sample of the pixels."""
-    count = int(layout.edges[-1])
-    normal = np.zeros((count, count))
-    columns = Columns(bases, estimate, layout)
-    chosen = _sample(shots)
-    for number, (shot, pixels, share) in enumerate(chosen):
-        light = columns.predictor.light(shot)
-        gain, root = gain_of(shot, light), np.sqrt(shot.weight).ravel()[pixels]
-        along = root * light.ravel()[pixels]
-        along /= max(math.sqrt(float(np.vdot(along, along))), 1e-30)
-        rows = np.zeros((count, along.size), np.float32)
-        for place, column in columns.of(shot):
-            rows[place] = np.float32(gain) * root * column.ravel()[pixels]
-        rows -= np.outer(rows @ along, along)
-        normal += (rows @ rows.T) / share
-        progress((number + 1) / len(chosen))
-    return normal
-
-
-def _sample(shots: Sequence[Shot]) -> list[tuple[Shot, np.ndarray | slice, float]]:
-    """Shots with the pixels to sample of each (all, or chosen at random), and which share of the colour's all they are.
-
-    Every pixel of every pattern where there are few; else of as few patterns as will do, since each costs a propagation
-    a number.
-    """
-    chosen: list[tuple[Shot, np.ndarray | slice, float]] = []
-    rng = np.random.default_rng(0)
-    for channel in dict.fromkeys(shot.channel for shot in shots):
-        own = [shot for shot in shots if shot.channel == channel]
-        size = own[0].signal.size
-        some = own[: max(1, math.ceil(SAMPLE / size))]
-        each = min(size, math.ceil(SAMPLE / len(some)))
-        for shot in some:
-            pixels = slice(None) if each == size else np.sort(rng.choice(size, each, replace=False))
-            chosen.append((shot, pixels, len(some) * each / (len(own) * size)))
-    return chosen
+    return best[1], 2 * best[0], settled

@@ -1,8 +1,8 @@
 """Free-form maps over the panel: what is left of wavefront and beam after the polynomials.
 
-A real panel and its beam have structure as fine as a few pixels. Maps of cubic B-splines with a node every few
-pixels are fitted to the same captures by L-BFGS (Liu and Nocedal 1989), with the light path's own adjoint. A capture
-gives one measurement a pixel, and a map has one number every NODE x NODE pixels, so ten patterns determine it
+A real panel and its beam have structure that polynomials do not follow. Maps of cubic B-splines are fitted to the same
+captures by L-BFGS (Liu and Nocedal 1989), with the light path's own adjoint, from coarse nodes to fine ones. A capture
+gives one measurement a pixel, and the finest map has one number every 4 x 4 pixels, so ten patterns determine it
 some 160 times over. A weak prior holds what no light shows, and few iterations keep the rest from following noise.
 Time and memory grow only with the number of pixels.
 """
@@ -14,17 +14,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import OptimizeResult, minimize
 
 from runtime.calibration.estimate import ColourLightPath, Estimate, Shot
 from runtime.calibration.misfit import Misfit
-from runtime.lightpath.spline_maps import node_weights, nodes_over
+from runtime.lightpath.spline_maps import node_weights, nodes_over, on_other_nodes
 from runtime.program.progress import Progress
 
-NODE = 4  # panel pixels
-MOST = (270, 480)  # nodes: larger panels get coarser maps
+FINEST = 4.0  # panel pixels between nodes
+COARSEST = 1 / 24  # of the panel's shorter side
 LIKELY_NM, LIKELY_LOG = 30.0, 0.3  # standard deviations of a node, before any capture
 ITERATIONS = 30
+SETTLED = 1e-4  # an iteration that lowers chi squared by a smaller share is the last
 MEMORY = 8  # steps that L-BFGS remembers
 
 
@@ -33,6 +34,7 @@ def fit_freeform(
     shots: Sequence[Shot],
     start: Estimate,
     progress: Progress | None = None,
+    spacing: float = FINEST,
 ) -> Estimate:
     """The estimate with maps of wavefront and beam that explain the shots best, all else held.
 
@@ -44,6 +46,8 @@ def fit_freeform(
     start : Estimate
     progress : callable, optional
         Called with the share done, 0 to 1.
+    spacing : float, panel pixels
+        Between nodes. What maps the start has on other nodes goes on on these.
 
     Returns
     -------
@@ -51,11 +55,11 @@ def fit_freeform(
         Its drift has one map of the wavefront for all colours, and one of the beam for each colour.
     """
     shape = next(iter(bases.values())).path.grid.shape
-    rows, columns = (node_weights(n, m).astype(np.float32) for n, m in zip(shape, nodes_of(shape), strict=True))
-    nodes = (rows.shape[1], columns.shape[1])
+    nodes = nodes_over(shape, spacing)
+    rows, columns = (node_weights(n, m).astype(np.float32) for n, m in zip(shape, nodes, strict=True))
     channels = tuple(bases)
     misfit = Misfit(bases, shots, motion=False)
-    done = 0
+    done, least = 0, math.inf
 
     def with_maps(vector: np.ndarray) -> Estimate:
         nm, *logs = vector.reshape(-1, *nodes)
@@ -73,23 +77,27 @@ def fit_freeform(
             gradient[number] += LIKELY_LOG * (rows.T @ over.real @ columns)
         return float(vector @ vector) + chi2, gradient.ravel()
 
-    def count_iteration(_: np.ndarray) -> None:
-        nonlocal done
+    def after_iteration(intermediate_result: OptimizeResult) -> None:
+        nonlocal done, least
         done += 1
         if progress:
             progress(done / ITERATIONS)
+        decrease, least = least - intermediate_result.fun, intermediate_result.fun
+        if decrease < SETTLED * least:
+            raise StopIteration
 
-    drift, nothing = start.drift, np.zeros(nodes)
-    begin = [drift.wavefront_nodes_nm / LIKELY_NM if drift.wavefront_nodes_nm.size else nothing]
-    begin += [drift.amplitude_nodes.get(c, nothing) / LIKELY_LOG for c in channels]
+    drift, none = start.drift, np.zeros((0, 0))
+    begin = [drift.wavefront_nodes_nm / LIKELY_NM]
+    begin += [drift.amplitude_nodes.get(c, none) / LIKELY_LOG for c in channels]
+    vector = np.ravel([on_other_nodes(m, nodes, shape) if m.size else np.zeros(nodes) for m in begin])
     found = minimize(
-        cost, np.ravel(begin), jac=True, method="L-BFGS-B", callback=count_iteration,
-        options={"maxiter": ITERATIONS, "maxfun": 2 * ITERATIONS, "maxcor": MEMORY, "ftol": 1e-7},
+        cost, vector, jac=True, method="L-BFGS-B", callback=after_iteration,
+        options={"maxiter": ITERATIONS, "maxfun": 2 * ITERATIONS, "maxcor": MEMORY, "ftol": 0},
     )  # fmt: skip
     return with_maps(found.x)
 
 
-def nodes_of(shape: tuple[int, int]) -> tuple[int, int]:
-    """Nodes of a map over a panel of that shape, (rows, columns)."""
-    rows, columns = (min(n, most) for n, most in zip(nodes_over(shape, NODE), MOST, strict=True))
-    return rows, columns
+def spacings(shape: tuple[int, int], turns: int) -> list[float]:
+    """Spacings of nodes (panel pixels) from coarse to fine, for a panel of that shape: each half the one before."""
+    coarsest = COARSEST * min(shape)
+    return [max(FINEST, coarsest / 2**turn) for turn in range(turns)]

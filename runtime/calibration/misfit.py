@@ -3,7 +3,7 @@
 The slopes over all that a fit moves come from one pass forward and one back a capture, by the adjoint of the light
 path and of the camera. They are kept as maps: over the field on the panel, from which the slopes over polynomials and
 over splines follow alike, and over where each pixel of the camera looks, from which those over its motion follow. So
-time and memory grow with the number of pixels alone. One capture at a time is worked on, in buffers that are used again.
+time and memory grow with the number of pixels alone. One capture at a time is worked on, in buffers used again.
 """
 
 from __future__ import annotations

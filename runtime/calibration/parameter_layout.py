@@ -69,6 +69,16 @@ class ParameterLayout:
         if not any(self.orders):
             self.precision[self.edges[2]] = HELD
 
+    def places_of(self, other: ParameterLayout) -> np.ndarray:
+        """Where the numbers of a layout of the same orders or lower stand in this one's vector."""
+        begin, names = self.edges, [name for name, _ in self.view]
+        beams = [
+            begin[1] + k * self.amplitude + np.arange(other.amplitude) for k in range(len(other.channels))
+        ]
+        view = [begin[3] + names.index(name) for name, _ in other.view]
+        rest = begin[3] + len(names) + np.arange(TERMS + 1)
+        return np.concatenate([np.arange(other.wavefront), *beams, [begin[2]], view, rest]).astype(int)
+
     def numbers(self, estimate: Estimate) -> np.ndarray:
         """The vector of an estimate."""
         drift, view = estimate.drift, estimate.view
@@ -129,9 +139,7 @@ class ParameterLayout:
             for name, _ in self.view
         ]
         sensitivity = legendre_moments(slopes.over_sensitivity, SENSITIVITY_ORDER)
-        return np.concatenate(
-            [wavefront, *beams, [slopes.distance], of_view, sensitivity, [slopes.stray]]
-        )
+        return np.concatenate([wavefront, *beams, [slopes.distance], of_view, sensitivity, [slopes.stray]])
 
     def levers(self, view: View, panel: tuple[int, int]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """How far each field that moves the view moves where its pixels look, (y, x): panel pixels a unit, [h, w]."""
@@ -139,7 +147,9 @@ class ParameterLayout:
         for name, step in self.view:
             if not name.startswith("blur"):
                 after = replace(view, **{name: getattr(view, name) + step}).positions(panel)
-                down, right = (((b - a) / step).astype(np.float32) for a, b in zip(before, after, strict=True))
+                down, right = (
+                    ((b - a) / step).astype(np.float32) for a, b in zip(before, after, strict=True)
+                )
                 found[name] = (down, right)
         return found
 

@@ -15,10 +15,13 @@ from runtime.calibration.drift import drifted
 from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, with_stray
 from runtime.camera.reading import Reading
 from runtime.camera.view import View
+from runtime.lightpath import fft
 from runtime.lightpath.grid import FINE, Grid
 from runtime.lightpath.light_path import LightPath, panel_phase
 from runtime.solver.array_backend import Backend
 from runtime.solver.in_place_path import Optics
+
+SMALL = 200_000  # panel pixels up to which threads wait for each other longer than they work
 
 
 class Predictor:
@@ -45,7 +48,8 @@ class Predictor:
 
     def __init__(self, bases: Mapping[str, ColourLightPath], finer: int = 2, slopes: bool = False) -> None:
         self.bases, self.finer, self.slopes = bases, finer, slopes
-        self.backend = Backend()
+        size = max(b.path.grid.shape[0] * b.path.grid.shape[1] for b in bases.values())
+        self.backend = Backend(fft.THREADS if size > SMALL else 1)
         self.optics = {c: Optics(b.path, FINE, True, self.backend) for c, b in bases.items()}
         self.paths: dict[str, LightPath] = {}
         self.readings: dict[str, Reading] = {}
@@ -67,7 +71,14 @@ class Predictor:
         for name, path in self.paths.items():
             key = (path.grid, None if path.irradiance_filter is None else name)
             if key not in made:
-                made[key] = Reading(self.view, path.grid, path.irradiance_filter, self.finer, self.slopes)
+                made[key] = Reading(
+                    self.view,
+                    path.grid,
+                    path.irradiance_filter,
+                    self.finer,
+                    self.slopes,
+                    self.backend.threads,
+                )
             self.readings[name] = made[key]
 
     def phase(self, shot: Shot, response: np.ndarray | None = None) -> np.ndarray:

@@ -113,9 +113,7 @@ def measured_sweep(predictor: Predictor, shots: Sequence[Shot]) -> Sweep:
     return Sweep(grays, unwrapped, errors, visibility)
 
 
-def _parts_of(
-    predictor: Predictor, shot: Shot, believed: np.ndarray, start: float
-) -> tuple[np.ndarray, ...]:
+def _parts_of(predictor: Predictor, shot: Shot, believed: np.ndarray, start: float) -> tuple[np.ndarray, ...]:
     """`_harmonics` of a grating about a phase `start` (rad) from gray 0 to its own gray level."""
     gray = int(shot.gray.max())
     response = believed.copy()

@@ -198,7 +198,7 @@ def _as_it_was(
     and a refit must be better than that before it replaces anything.
     """
     start = Estimate(Drift(), view)
-    rigid, scaled = (fit(bases, heldout, start, (0, 0), new_view=new).estimate for new in (False, True))
+    rigid, scaled = (fit(bases, heldout, start, (0, 0), 5, new_view=new).estimate for new in (False, True))
     errors = held_out_errors(bases, heldout, scaled)
     removed = removed_excess(held_out_errors(bases, heldout, rigid).errors, errors.errors)
     matters = is_certain(removed) and removed.value > LEAST_EXCESS

@@ -29,6 +29,7 @@ class Reading:
         As of `sampler`.
     slopes : bool
         Whether `motion` is wanted.
+    threads : int
     """
 
     def __init__(
@@ -38,8 +39,9 @@ class Reading:
         own_filter: np.ndarray | None = None,
         finer: int = 2,
         slopes: bool = False,
+        threads: int = fft.THREADS,
     ) -> None:
-        self.view, self.grid, self.finer = view, grid, finer
+        self.view, self.grid, self.finer, self.threads = view, grid, finer, threads
         y, x = view.positions(grid.shape)
         fy, fx = image_frequencies(grid, np.zeros((), np.float64))
         self.fy, self.fx = fy[:, None] * grid.pitch, fx[None, :] * grid.pitch  # cycles a panel pixel
@@ -76,7 +78,7 @@ class Reading:
         -------
         float32 array [h, w]
         """
-        fft.real_into(image, self.spectrum)
+        fft.real_into(image, self.spectrum, self.threads)
         self.spectrum *= self.transfer
         return self._seen(1.0)
 
@@ -88,8 +90,13 @@ class Reading:
             np.multiply(self.spectrum[here], part, out=self.wide[there, :columns])
         self.wide[self.gap] = 0
         self.wide[:, columns:] = 0
-        fft.real_from(self.wide, self.fine)
+        fft.real_from(self.wide, self.fine, self.threads)
         return np.asarray(self.matrices[0] @ self.fine.reshape(-1)).reshape(self.view.shape)
+
+    def moved(self) -> tuple[np.ndarray, np.ndarray]:
+        """`motion` from the spectrum: right for waves of any frequency, at the price of two more transforms."""
+        down, right = (self._seen((2j * np.pi * f).astype(np.complex64)) for f in (self.fy, self.fx))
+        return down, right
 
     def blurred(self) -> tuple[np.ndarray, np.ndarray]:
         """How what was last read changes with the variances of the lens's blur along y and x: two [h, w]."""
@@ -119,7 +126,7 @@ class Reading:
             The gradient over the variances of the lens's blur, along y and x.
         """
         flat = np.asarray(light, np.float32).reshape(-1)
-        fft.real_into((self.matrices[0].T @ flat).reshape(self.fine.shape), self.wide)
+        fft.real_into((self.matrices[0].T @ flat).reshape(self.fine.shape), self.wide, self.threads)
         columns, came = self.spectrum.shape[1], self.spectrum
         along_y, along_x = np.zeros(len(came)), np.zeros(columns)
         for here, there in self.halves:
@@ -130,6 +137,6 @@ class Reading:
             along_x += product.sum(0)
             np.multiply(part, np.conj(self.transfer[here]), out=came[here])
         along_x[1:] *= 2
-        fft.real_from(came, self.back)
+        fft.real_from(came, self.back, self.threads)
         blur = -2 * np.pi**2 * np.array([along_y @ self.fy[:, 0] ** 2, along_x @ self.fx[0] ** 2])
         return self.back, blur

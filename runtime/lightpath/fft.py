@@ -92,9 +92,7 @@ def real_into(image: np.ndarray, spectrum: np.ndarray, threads: int = THREADS) -
         spectrum[...] = _scipy.rfft2(image, workers=threads)
 
 
-def real_from(
-    spectrum: np.ndarray, image: np.ndarray, threads: int = THREADS, scaled: bool = False
-) -> None:
+def real_from(spectrum: np.ndarray, image: np.ndarray, threads: int = THREADS, scaled: bool = False) -> None:
     """Inverse DFT of half a spectrum [n, m//2 + 1], written to real `image` [n, m]; `scaled`: divided by n m."""
     if _ducc is not None:
         size, norm = image.shape[1], 2 if scaled else 0
