@@ -24,8 +24,11 @@ from runtime.program.progress import Progress
 FINEST = 4.0  # panel pixels between nodes
 COARSEST = 1 / 24  # of the panel's shorter side
 LIKELY_NM, LIKELY_LOG = 30.0, 0.3  # standard deviations of a node, before any capture
-ITERATIONS = 30
-SETTLED = 1e-4  # an iteration that lowers chi squared by a smaller share is the last
+ITERATIONS, FEWEST = 30, 10
+WORK = (
+    60_000_000  # pixels predicted in a fit: more iterations than that takes are made for small panels alone
+)
+SETTLED = 1e-6  # an iteration that lowers chi squared by a smaller share is the last
 MEMORY = 8  # steps that L-BFGS remembers
 
 
@@ -59,7 +62,7 @@ def fit_freeform(
     rows, columns = (node_weights(n, m).astype(np.float32) for n, m in zip(shape, nodes, strict=True))
     channels = tuple(bases)
     misfit = Misfit(bases, shots, motion=False)
-    done, least = 0, math.inf
+    done, least, iterations = 0, math.inf, iterations_over(shots)
 
     def with_maps(vector: np.ndarray) -> Estimate:
         nm, *logs = vector.reshape(-1, *nodes)
@@ -81,7 +84,7 @@ def fit_freeform(
         nonlocal done, least
         done += 1
         if progress:
-            progress(done / ITERATIONS)
+            progress(done / iterations)
         decrease, least = least - intermediate_result.fun, intermediate_result.fun
         if decrease < SETTLED * least:
             raise StopIteration
@@ -92,9 +95,14 @@ def fit_freeform(
     vector = np.ravel([on_other_nodes(m, nodes, shape) if m.size else np.zeros(nodes) for m in begin])
     found = minimize(
         cost, vector, jac=True, method="L-BFGS-B", callback=after_iteration,
-        options={"maxiter": ITERATIONS, "maxfun": 2 * ITERATIONS, "maxcor": MEMORY, "ftol": 0},
+        options={"maxiter": iterations, "maxfun": 2 * iterations, "maxcor": MEMORY, "ftol": 0},
     )  # fmt: skip
     return with_maps(found.x)
+
+
+def iterations_over(shots: Sequence[Shot]) -> int:
+    """Most iterations of a fit to some shots."""
+    return min(ITERATIONS, max(FEWEST, WORK // sum(shot.signal.size for shot in shots)))
 
 
 def spacings(shape: tuple[int, int], turns: int) -> list[float]:

@@ -12,7 +12,7 @@ from runtime.calibration.colour_captures import ColourCaptures, dot_spacing
 from runtime.calibration.drift import Drift
 from runtime.calibration.drift_fit import DriftFit, fit, predicted_chi_squared
 from runtime.calibration.estimate import ColourLightPath, Estimate, Shot
-from runtime.calibration.free_form_fit import fit_freeform, spacings
+from runtime.calibration.free_form_fit import ITERATIONS, fit_freeform, iterations_over, spacings
 from runtime.calibration.held_out_errors import held_out_errors
 from runtime.calibration.prediction import Predictor
 from runtime.calibration.replacement_rule import is_certain
@@ -153,9 +153,12 @@ def _with_maps(
         some = few(shots, PIXELS[-1], turn)
         estimate = fit_freeform(bases, some, found.estimate, progress, spacing)
         after = held_out_errors(bases, heldout, estimate)
-        if not is_certain(removed_excess(before.errors, after.errors)):
+        # What lies in corners without light, held-out patterns do not show: where it costs little, go on for it.
+        cheap = iterations_over(some) == ITERATIONS
+        if not (cheap and turn) and not is_certain(removed_excess(before.errors, after.errors)):
             break
-        found = fit(bases, some, estimate, ORDERS[-1], 4, new_view, information=found.information)
+        known = None if cheap else found.information
+        found = fit(bases, some, estimate, ORDERS[-1], 4, new_view, information=known)
         estimate, sweeps = _with_response(bases, captures, found.estimate)
         found, before = replace(found, estimate=estimate), held_out_errors(bases, heldout, estimate)
     return found, sweeps
