@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from runtime.lightpath.grid import band_frequencies
-from runtime.lightpath.legendre import edge_to_edge, legendre_maps, legendre_surface
+from runtime.lightpath.legendre import edge_to_edge, legendre_surface
 from runtime.lightpath.light_path import LightPath
 from runtime.lightpath.spline_maps import spline_surface
 
@@ -88,16 +88,6 @@ def axial_phase(path: LightPath, wavelength_nm: float) -> np.ndarray:
     fy, fx = band_frequencies(path.grid, np.zeros((), np.float64))
     sine2 = np.minimum((wavelength * fy[:, None]) ** 2 + (wavelength * fx[None, :]) ** 2, 1)
     return -2e-3 * math.pi / wavelength * sine2 / (1 + np.sqrt(1 - sine2))
-
-
-def wavefront_maps(shape: tuple[int, int], order: int) -> np.ndarray:
-    """The maps that `Drift.wavefront_nm` has a term for, up to an order: float64 [count, H, W]."""
-    return legendre_maps(*edge_to_edge(shape), order, LOWEST_WAVEFRONT)
-
-
-def amplitude_maps(shape: tuple[int, int], order: int) -> np.ndarray:
-    """The maps that `Drift.log_amplitude` has a term for, up to an order: float64 [count, H, W]."""
-    return legendre_maps(*edge_to_edge(shape), order, LOWEST_AMPLITUDE)
 
 
 def _legendre_surface(terms: np.ndarray, shape: tuple[int, int], lowest: int) -> np.ndarray:

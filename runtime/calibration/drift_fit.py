@@ -1,9 +1,9 @@
-"""The fit of what drifts to captures: damped Gauss-Newton on residuals weighted by the camera's noise.
+"""The fit of what drifts to captures, on residuals weighted by the camera's noise.
 
-Derivatives over wavefront, beam and distance are the light path's own linearisation, 2 Re(z* dz); those of
-the camera's view cost no propagation. Each capture's gain follows in closed form (its columns are taken with
-the gain projected out), so laser power may change while patterns are shown. Orders rise in steps: low ones
-find the way from far, high ones then need to go only a little.
+Its slopes come by the adjoint, from every pixel of every capture, for the price of one pass forward and one back a
+capture, however many numbers are fitted. A Gauss-Newton matrix from a sample of the pixels makes the numbers alike, and
+BFGS goes on from there. Each capture's gain follows in closed form, so laser power may change while patterns are shown.
+Orders rise in steps: low ones find the way from far, high ones then need to go only a little.
 
 The trainer has a Gauss-Newton fit of its own (`trainer/fitting/gauss_newton.py`). The two stay two on purpose.
 The headset has no torch; it weights residuals by the camera's noise and differentiates the bundle's baked arrays.
@@ -118,12 +118,12 @@ def fit(
     layout = layout_of(bases, orders, new_view)
     estimate = layout.widened(start)
     progress = progress or no_progress
-    rounds = ROUNDS if information is None else 1
+    rounds = 1 if information else ROUNDS
     for number in range(rounds):
         share = part_of(progress, number / rounds, (number + 1) / rounds)
-        if information is None or number > 0:
-            information = measured_information(bases, shots, estimate, layout, part_of(share, 0.0, 0.5))
-        normal = len(shots) * information.of(layout) + np.diag(layout.precision)
+        first_half = part_of(share, 0.0, 0.5)
+        used = information or measured_information(bases, shots, estimate, layout, first_half)
+        normal = len(shots) * used.of(layout) + np.diag(layout.precision)
         estimate, cost, settled = _descended(bases, shots, estimate, layout, normal, iterations, share)
         if settled:
             break
@@ -132,7 +132,7 @@ def fit(
     # a misfit widens the errors: residuals are then no longer the camera's noise
     spread = np.sqrt(np.diag(np.linalg.inv(normal)) * max(1.0, chi2))
     zero = layout.moved(layout.nothing(start), np.zeros(len(spread)))
-    return DriftFit(estimate, layout.moved(zero, spread).drift, chi2, information)
+    return DriftFit(estimate, layout.moved(zero, spread).drift, chi2, used)
 
 
 def layout_of(
@@ -170,23 +170,24 @@ def _descended(
 
     first, downhill = cost_at(start)
     scale = max(float(np.linalg.norm(downhill)), 1e-30)
-    best = [first, start]
+    lowest, best = first, start
     done, least, settled = 0, first, False
 
     def scaled(step: np.ndarray) -> tuple[float, np.ndarray]:
+        nonlocal lowest, best
         if not step.any():
             return first / scale**2, downhill / scale
         estimate = layout.moved(start, solve_triangular(upper, scale * step))
         half, gradient = cost_at(estimate)
-        if half < best[0]:
-            best[:] = half, estimate
+        if half < lowest:
+            lowest, best = half, estimate
         return half / scale**2, gradient / scale
 
     def after_iteration(intermediate_result: OptimizeResult) -> None:
         nonlocal done, least, settled
         done += 1
         progress(0.5 + 0.5 * done / iterations)
-        decrease, least = least - best[0], best[0]
+        decrease, least = least - lowest, lowest
         settled = decrease < max(SETTLED * len(downhill) / 2, SETTLED_SHARE * least)
         if settled:
             raise StopIteration
@@ -195,4 +196,4 @@ def _descended(
         scaled, np.zeros(len(downhill)), jac=True, method="L-BFGS-B", callback=after_iteration,
         options={"maxiter": iterations, "maxfun": 2 * iterations, "maxcor": iterations, "ftol": 0, "gtol": 0},
     )  # fmt: skip
-    return best[1], 2 * best[0], settled
+    return best, 2 * lowest, settled

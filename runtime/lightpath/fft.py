@@ -100,8 +100,8 @@ def real_from(spectrum: np.ndarray, image: np.ndarray, threads: int = THREADS, s
             spectrum, axes=(0, 1), lastsize=size, forward=False, inorm=norm, out=image, nthreads=threads
         )
     else:  # pragma: no cover
-        norm = "backward" if scaled else "forward"
-        image[...] = _scipy.irfft2(spectrum, s=image.shape, norm=norm, workers=threads)
+        way = "backward" if scaled else "forward"
+        image[...] = _scipy.irfft2(spectrum, s=image.shape, norm=way, workers=threads)
 
 
 def _on_host(x: Array) -> np.ndarray | None:

@@ -90,7 +90,7 @@ def legendre_moments(values: np.ndarray, order: int, lowest: int = 1) -> np.ndar
     -------
     float64 array [count]
     """
-    y, x = edge_to_edge(values.shape)  # type: ignore[arg-type]
+    y, x = edge_to_edge(values.shape)
     rows, columns = legendre_curve(y[:, 0], order + 1), legendre_curve(x[0, :], order + 1)
     table = (rows.astype(values.dtype) @ values).astype(np.float64) @ columns.T
     return np.array([table[i, j] for i, j in legendre_products(order, lowest)])

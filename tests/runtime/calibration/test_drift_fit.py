@@ -149,7 +149,9 @@ def test_the_truth_is_found_from_a_sample_in_little_memory(monkeypatch: pytest.M
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     error = without_tilt(found.estimate.drift.wavefront(shape) - drift.wavefront(shape))
-    assert without_tilt(drift.wavefront(shape)).std() > WAVELENGTH_NM / 40 and error.std() < WAVELENGTH_NM / 1500
+    assert (
+        without_tilt(drift.wavefront(shape)).std() > WAVELENGTH_NM / 40 and error.std() < WAVELENGTH_NM / 1500
+    )
     assert found.estimate.drift.distance_mm == pytest.approx(0.05, abs=5e-4)
     assert found.estimate.view.rotation_mrad == pytest.approx(0.3, abs=0.01)
     assert found.chi2 == pytest.approx(1, abs=0.05)

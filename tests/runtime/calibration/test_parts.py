@@ -11,7 +11,7 @@ import pytest
 from firmware_iface.errors import InputError
 from firmware_iface.virtual.simulated_drive import Drive
 from runtime.calibration.columns import Columns
-from runtime.calibration.drift import Drift, drifted, wavefront_maps
+from runtime.calibration.drift import LOWEST_WAVEFRONT, Drift, drifted
 from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, predicted
 from runtime.calibration.parameter_layout import ParameterLayout
 from runtime.calibration.prediction import Predictor
@@ -27,6 +27,7 @@ from runtime.calibration.shown_patterns import grains, grating
 from runtime.calibration.taking import Taker
 from runtime.camera.view import View, sampler
 from runtime.excess import PredictionErrors, is_complete
+from runtime.lightpath.legendre import edge_to_edge, legendre_maps
 from runtime.lightpath.light_path import irradiance, panel_phase, pixel_irradiance
 from tests.runtime.benches import PITCH, ideal_path, random_path
 from tests.runtime.calibration.drifting import WAVELENGTH_NM, base, devices, drifted_bench, headset
@@ -48,10 +49,11 @@ def test_a_distance_drift_is_a_light_path_to_another_plane() -> None:
 
 def test_a_wavefront_turns_source_and_leak_alike_and_in_nanometres() -> None:
     path = random_path(SMALL)
-    terms = np.zeros(len(wavefront_maps(SMALL, 3)))
+    maps = legendre_maps(*edge_to_edge(SMALL), 3, LOWEST_WAVEFRONT)
+    terms = np.zeros(len(maps))
     terms[1] = 65.0
     moved = drifted(path, "green", WAVELENGTH_NM, Drift(wavefront_nm=terms))
-    turn = np.exp(2j * np.pi * 65.0 / WAVELENGTH_NM * wavefront_maps(SMALL, 3)[1])
+    turn = np.exp(2j * np.pi * 65.0 / WAVELENGTH_NM * maps[1])
     np.testing.assert_allclose(moved.source, path.source * turn, rtol=1e-12)
     np.testing.assert_allclose(moved.leak, path.leak * turn, rtol=1e-12)
     np.testing.assert_array_equal(moved.transfers, path.transfers)
