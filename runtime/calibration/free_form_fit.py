@@ -25,9 +25,7 @@ FINEST = 4.0  # panel pixels between nodes
 COARSEST = 1 / 24  # of the panel's shorter side
 LIKELY_NM, LIKELY_LOG = 30.0, 0.3  # standard deviations of a node, before any capture
 ITERATIONS, FEWEST = 30, 10
-WORK = (
-    60_000_000  # pixels predicted in a fit: more iterations than that takes are made for small panels alone
-)
+WORK = 25_000_000  # pixels predicted in a fit: small panels alone get more iterations than that takes
 SETTLED = 1e-6  # an iteration that lowers chi squared by a smaller share is the last
 MEMORY = 8  # steps that L-BFGS remembers
 
