@@ -1,4 +1,4 @@
-"""The light path in place: forward and adjoint for the solver's inner loop, which allocates nothing.
+"""The light path in place: forward and adjoint for the solver's inner loop, which allocates nothing, and calibration.
 
 This is the one deliberate second copy of `runtime.lightpath.light_path`, which defines the mathematics and says what
 each array means; here it is arranged for speed. Rows that are dark and columns that the iris stops are not
