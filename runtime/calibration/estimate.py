@@ -86,8 +86,12 @@ def predicted(base: ColourLightPath, shot: Shot, estimate: Estimate, sample: Sam
 
 def light_on_camera(view: View, sample: Sampler, image: np.ndarray) -> np.ndarray:
     """What a camera makes of irradiance on the fine grid, up to a gain: float32 [h, w]."""
-    light = sample(image)
-    return (light * view.evenness() + view.stray * float(light.mean())).astype(np.float32)
+    return with_stray(view, view.evenness().astype(np.float32), sample(image))
+
+
+def with_stray(view: View, even: np.ndarray, light: np.ndarray) -> np.ndarray:
+    """Light on camera pixels [h, w] with a view's evenness [h, w] and stray light: float32 [h, w]."""
+    return (light * even + np.float32(view.stray * float(light.mean()))).astype(np.float32)
 
 
 def gain_of(shot: Shot, light: np.ndarray) -> float:

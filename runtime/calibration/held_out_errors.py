@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, gain_of, predicted
-from runtime.camera.view import sampler
+from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, gain_of
+from runtime.calibration.prediction import Predictor
 from runtime.excess import PredictionErrors, joined, prediction_errors
 
 
@@ -42,9 +42,10 @@ def held_out_errors(
     estimate : Estimate
     """
     parts, residuals = [], []
+    predictor = Predictor(bases)
+    predictor.take(estimate)
     for number, shot in enumerate(shots):
-        base = bases[shot.channel]
-        light = predicted(base, shot, estimate, sampler(estimate.view, base.path.grid))
+        light = predictor.light(shot)
         prediction = gain_of(shot, light) * light
         mask = shot.weight > 0
         noise = np.divide(1, shot.weight, out=np.zeros(shot.weight.shape, np.float64), where=mask)

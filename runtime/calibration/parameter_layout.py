@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from runtime.calibration.drift import Drift, amplitude_maps, wavefront_maps
+from runtime.calibration.drift import LOWEST_AMPLITUDE, LOWEST_WAVEFRONT, Drift
 from runtime.calibration.estimate import Estimate
-from runtime.camera.view import TERMS, View
+from runtime.calibration.misfit import Slopes
+from runtime.camera.view import SENSITIVITY_ORDER, TERMS, View
+from runtime.lightpath.legendre import legendre_count, legendre_moments
 
 # Standard deviations of what is possible before any capture; they hold what no light shows.
 LIKELY = {"wavefront": 1000.0, "amplitude": 1.0, "distance": 5.0, "view": 3.0}
@@ -53,11 +57,10 @@ class ParameterLayout:
         amplitude: int,
         view: tuple[tuple[str, float], ...] = VIEW,
     ) -> None:
-        shape = (1, 1)
         self.channels, self.view = channels, view
         self.orders = (wavefront, amplitude)
-        self.wavefront = len(wavefront_maps(shape, wavefront)) if wavefront >= 2 else 0
-        self.amplitude = len(amplitude_maps(shape, amplitude)) if amplitude >= 1 else 0
+        self.wavefront = legendre_count(wavefront, LOWEST_WAVEFRONT) if wavefront >= 2 else 0
+        self.amplitude = legendre_count(amplitude, LOWEST_AMPLITUDE) if amplitude >= 1 else 0
         sizes = [self.wavefront, self.amplitude * len(channels), 1, len(view) + TERMS + 1]
         self.edges = np.cumsum([0, *sizes])
         spread = [np.full(n, LIKELY[k]) for n, k in zip(sizes, LIKELY, strict=True)]
@@ -65,6 +68,16 @@ class ParameterLayout:
         self.precision[self.edges[3] + len(VIEW) :][: len(view) - len(VIEW)] = 1 / LIKELY_STRETCH**2
         if not any(self.orders):
             self.precision[self.edges[2]] = HELD
+
+    def places_of(self, other: ParameterLayout) -> np.ndarray:
+        """Where the numbers of a layout of the same orders or lower stand in this one's vector."""
+        begin, names = self.edges, [name for name, _ in self.view]
+        beams = [
+            begin[1] + k * self.amplitude + np.arange(other.amplitude) for k in range(len(other.channels))
+        ]
+        view = [begin[3] + names.index(name) for name, _ in other.view]
+        rest = begin[3] + len(names) + np.arange(TERMS + 1)
+        return np.concatenate([np.arange(other.wavefront), *beams, [begin[2]], view, rest]).astype(int)
 
     def numbers(self, estimate: Estimate) -> np.ndarray:
         """The vector of an estimate."""
@@ -93,6 +106,52 @@ class ParameterLayout:
         sensitivity = tuple(float(v) for v in of_view[len(self.view) : -1])
         view = replace(estimate.view, sensitivity=sensitivity, stray=float(of_view[-1]), **values)
         return Estimate(drift, view)
+
+    def gradient(
+        self,
+        slopes: Slopes,
+        wavelengths_nm: Mapping[str, float],
+        levers: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    ) -> np.ndarray:
+        """The gradient of chi squared over the vector.
+
+        Parameters
+        ----------
+        slopes : Slopes
+        wavelengths_nm : mapping of str to float, nm
+            Of each colour.
+        levers : mapping of str to (float32 array [h, w], float32 array [h, w])
+            As from `levers`.
+        """
+        wavefront, beams = np.zeros(self.wavefront), []
+        for channel in self.channels:
+            over = slopes.over_panel[channel]
+            if self.wavefront:
+                turn = 2 * math.pi / wavelengths_nm[channel]
+                wavefront += turn * legendre_moments(over.imag, self.orders[0], LOWEST_WAVEFRONT)
+            if self.amplitude:
+                beams.append(legendre_moments(over.real, self.orders[1], LOWEST_AMPLITUDE))
+        blur = dict(zip(("blur_y_px2", "blur_x_px2"), map(float, slopes.blur), strict=True))
+        of_view = [
+            blur[name]
+            if name in blur
+            else float(np.vdot(slopes.over_y, levers[name][0]) + np.vdot(slopes.over_x, levers[name][1]))
+            for name, _ in self.view
+        ]
+        sensitivity = legendre_moments(slopes.over_sensitivity, SENSITIVITY_ORDER)
+        return np.concatenate([wavefront, *beams, [slopes.distance], of_view, sensitivity, [slopes.stray]])
+
+    def levers(self, view: View, panel: tuple[int, int]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """How far each field that moves the view moves where its pixels look, (y, x): panel pixels a unit, [h, w]."""
+        before, found = view.positions(panel), {}
+        for name, step in self.view:
+            if not name.startswith("blur"):
+                after = replace(view, **{name: getattr(view, name) + step}).positions(panel)
+                down, right = (
+                    ((b - a) / step).astype(np.float32) for a, b in zip(before, after, strict=True)
+                )
+                found[name] = (down, right)
+        return found
 
     def widened(self, estimate: Estimate) -> Estimate:
         """An estimate with as many terms as are to be fitted: further ones 0."""

@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from runtime.calibration.colour_captures import ColourCaptures, dot_spacing
 from runtime.calibration.drift import Drift
-from runtime.calibration.drift_fit import DriftFit, chi_squared, fit
-from runtime.calibration.estimate import ColourLightPath, Estimate
-from runtime.calibration.free_form_fit import fit_freeform
+from runtime.calibration.drift_fit import DriftFit, fit, predicted_chi_squared
+from runtime.calibration.estimate import ColourLightPath, Estimate, Shot
+from runtime.calibration.free_form_fit import ITERATIONS, fit_freeform, iterations_over, spacings
 from runtime.calibration.held_out_errors import held_out_errors
+from runtime.calibration.prediction import Predictor
 from runtime.calibration.replacement_rule import is_certain
 from runtime.calibration.response import Sweep, fitted_response, measured_sweep
 from runtime.calibration.shown_patterns import GRAINS
 from runtime.camera.registration import dots_of, find_homography, panel_points
-from runtime.camera.view import View, sampler
+from runtime.camera.view import View
 from runtime.excess import removed_excess
 from runtime.program.progress import Progress, part_of
 
 ORDERS = ((4, 2), (8, 4), (12, 6))  # of wavefront and beam, one fit after the other
+PIXELS = (
+    1_000_000,
+    1_000_000,
+    8_000_000,
+)  # of a colour that each of these is fitted to: two patterns at least
 TURNS = 4  # of free-form maps, and all else around them
 SCAN_MM = (
     0.0,
@@ -103,21 +110,30 @@ def refit(
     estimate = Estimate(Drift(), view)
     coarse = [t.fitted[GRAINS.index(size)] for t in captures.values() for size in sorted(GRAINS)[-2:]]
     say(0.0, "distance")
-    costs = {
-        mm: chi_squared(bases, coarse, replace(estimate, drift=Drift(distance_mm=mm)), 1) for mm in SCAN_MM
-    }
-    estimate = replace(estimate, drift=Drift(distance_mm=min(costs, key=lambda mm: costs[mm])))
+    estimate = _nearest_distance(bases, coarse, estimate)
     parts = len(ORDERS) + TURNS
     for number, orders in enumerate(ORDERS):
         say(number / parts, "phase response")
         estimate, sweeps = _with_response(bases, captures, estimate)
         what = f"wavefront and beam to order {orders[0]}"
         progress = _part(say, number, parts, what)
-        found = fit(bases, shots, estimate, orders, new_view=new_view, progress=progress)
+        some = few(shots, PIXELS[number])
+        found = fit(bases, some, estimate, orders, new_view=new_view, progress=progress)
         estimate = found.estimate
     estimate, sweeps = _with_response(bases, captures, estimate)
     found = replace(found, estimate=estimate)
     return _with_maps(bases, captures, found, sweeps, new_view, say)
+
+
+def _nearest_distance(
+    bases: Mapping[str, ColourLightPath], shots: Sequence[Shot], estimate: Estimate
+) -> Estimate:
+    """The estimate with that distance of `SCAN_MM` which explains the shots best."""
+    predictor, costs = Predictor(bases, 1), {}
+    for mm in SCAN_MM:
+        predictor.take(replace(estimate, drift=Drift(distance_mm=mm)))
+        costs[mm] = predicted_chi_squared(predictor, shots)
+    return replace(estimate, drift=Drift(distance_mm=min(costs, key=lambda mm: costs[mm])))
 
 
 def _with_maps(
@@ -132,16 +148,30 @@ def _with_maps(
     shots = [shot for t in captures.values() for shot in t.fitted]
     heldout = [shot for t in captures.values() for shot in t.heldout]
     before = held_out_errors(bases, heldout, found.estimate)
-    for turn in range(TURNS):
+    for turn, spacing in enumerate(spacings(next(iter(bases.values())).path.grid.shape, TURNS)):
         progress = _part(say, len(ORDERS) + turn, len(ORDERS) + TURNS, "wavefront and beam, free-form")
-        estimate = fit_freeform(bases, shots, found.estimate, progress)
-        removed = removed_excess(before.errors, held_out_errors(bases, heldout, estimate).errors)
-        if turn == 0 and not is_certain(removed):
+        some = few(shots, PIXELS[-1], turn)
+        estimate = fit_freeform(bases, some, found.estimate, progress, spacing)
+        after = held_out_errors(bases, heldout, estimate)
+        # What lies in corners without light, held-out patterns do not show: where it costs little, go on for it.
+        cheap = iterations_over(some) == ITERATIONS
+        if not (cheap and turn) and not is_certain(removed_excess(before.errors, after.errors)):
             break
-        found = fit(bases, shots, estimate, ORDERS[-1], iterations=2, new_view=new_view)
+        known = None if cheap else found.information
+        found = fit(bases, some, estimate, ORDERS[-1], 4, new_view, information=known)
         estimate, sweeps = _with_response(bases, captures, found.estimate)
-        found = replace(found, estimate=estimate)
+        found, before = replace(found, estimate=estimate), held_out_errors(bases, heldout, estimate)
     return found, sweeps
+
+
+def few(shots: Sequence[Shot], pixels: int, turn: int = 0) -> list[Shot]:
+    """As many of each colour's shots as have a number of pixels, two at least; turn after turn the next ones."""
+    chosen: list[Shot] = []
+    for channel in dict.fromkeys(shot.channel for shot in shots):
+        own = [shot for shot in shots if shot.channel == channel]
+        count = min(max(2, math.ceil(pixels / own[0].signal.size)), len(own))
+        chosen += [own[(turn * count + k) % len(own)] for k in range(count)]
+    return chosen
 
 
 def _part(say: Progress, number: int, parts: int, what: str) -> Progress:
@@ -154,9 +184,10 @@ def _with_response(
 ) -> tuple[Estimate, dict[str, Sweep]]:
     """The estimate with each colour's response from its sweep, all else as it is."""
     sweeps, responses = {}, dict(estimate.drift.response)
+    predictor = Predictor(bases)
+    predictor.take(estimate)
     for channel, base in bases.items():
-        sample = sampler(estimate.view, base.path.grid)
-        sweeps[channel] = measured_sweep(base, captures[channel].sweep, estimate, sample)
+        sweeps[channel] = measured_sweep(predictor, captures[channel].sweep)
         believed = np.asarray(responses.get(channel, base.path.response), np.float64)
         responses[channel] = fitted_response(believed, sweeps[channel])
     return replace(estimate, drift=replace(estimate.drift, response=responses)), sweeps

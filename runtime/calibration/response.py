@@ -8,12 +8,13 @@ least squares over all pixels, and which of several turns it is from its neighbo
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, predicted
+from runtime.calibration.prediction import Predictor
 from runtime.calibration.shown_patterns import grating
 from runtime.camera.view import Sampler
 from runtime.lightpath.legendre import legendre_curve
@@ -21,6 +22,7 @@ from runtime.lightpath.legendre import legendre_curve
 SWEEP = (*range(16, 256, 16), 255)  # gray levels
 PERIODS = (4, 6, 8, 12, 16, 24)  # pixels
 TERMS = 6  # of the curve's deviation from what was believed
+SAMPLE = 400_000  # pixels of a picture that a phase is fitted to: then its error is far below a milliradian
 TRIALS = (0.0, 2 * math.pi / 3, -2 * math.pi / 3)
 
 
@@ -50,9 +52,16 @@ def best_period(base: ColourLightPath, channel: str, estimate: Estimate, sample:
 
     Gratings image themselves at some distances (the Talbot effect), and there a phase changes nothing.
     """
+    believed = np.asarray(estimate.drift.response.get(channel, base.path.response), float)
 
     def contrast(period: int) -> float:
-        _, cosine, sine = _harmonics(base, _blank(channel, base, period, 128), estimate, sample)
+        shot = _blank(channel, base, period, 128)
+
+        def predict(response: np.ndarray) -> np.ndarray:
+            drift = replace(estimate.drift, response={channel: response})
+            return predicted(base, shot, replace(estimate, drift=drift), sample)
+
+        _, cosine, sine = _harmonics(predict, believed, 128)
         return float(np.mean(cosine**2 + sine**2))
 
     return max(PERIODS, key=contrast)
@@ -64,53 +73,66 @@ def _blank(channel: str, base: ColourLightPath, period: int, gray: int) -> Shot:
     return Shot(channel, grating(base.path.grid.shape, period, gray), nothing, nothing)
 
 
-def measured_sweep(
-    base: ColourLightPath, shots: Sequence[Shot], estimate: Estimate, sample: Sampler
-) -> Sweep:
+def measured_sweep(predictor: Predictor, shots: Sequence[Shot]) -> Sweep:
     """The phase of each grating's brighter gray level from gray 0.
 
     Parameters
     ----------
-    base : ColourLightPath
+    predictor : Predictor
+        Of an estimate. All but the response is taken from it; its response says where the search starts.
     shots : sequence of Shot
         Of gratings of one colour.
-    estimate : Estimate
-        All but the response is taken from it; its response says where the search starts.
-    sample : Sampler
-        Of the estimate's view.
     """
-    believed = estimate.drift.response.get(shots[0].channel, base.path.response)
-    found = []
+    channel = shots[0].channel
+    path = predictor.paths[channel]
+    believed = np.asarray(path.response, float)
+    # Where the phase is all that a gray level changes, three pictures of one grating are those of all.
+    alike = path.crosstalk is None and path.modulation is None and path.gain is None
+    alike = alike and all(np.array_equal(s.gray > 0, shots[0].gray > 0) for s in shots)
+    every = math.ceil(shots[0].signal.size / SAMPLE)  # rows: along them a grating is the same
+    found, parts = [], None
     for shot in shots:
         gray = int(shot.gray.max())
         start = float(believed[gray] - believed[0])
-        model = np.stack([m.ravel() for m in _harmonics(base, shot, estimate, sample)], 1)
-        root = np.sqrt(shot.weight.ravel())
+        if parts is None or not alike:
+            parts = _parts_of(predictor, shot, believed, 0.0 if alike else start)
+        model = np.stack([m[::every].ravel() for m in parts], 1)
+        root = np.sqrt(shot.weight[::every].ravel())
         weighted = (model * root[:, None]).astype(np.float64)
         normal = weighted.T @ weighted
-        gain, cosine, sine = np.linalg.solve(normal, weighted.T @ (root * shot.signal.ravel()))
+        gain, cosine, sine = np.linalg.solve(normal, weighted.T @ (root * shot.signal[::every].ravel()))
         size2 = max(float(cosine**2 + sine**2), 1e-30)
         across = np.array([0.0, -sine, cosine]) / size2
         error = math.sqrt(float(across @ np.linalg.solve(normal, across)))
-        found.append((gray, start + math.atan2(sine, cosine), error, math.sqrt(size2) / max(gain, 1e-30)))
+        beyond = math.atan2(sine, cosine)
+        phase = beyond + 2 * math.pi * round((start - beyond) / (2 * math.pi)) if alike else start + beyond
+        found.append((gray, phase, error, math.sqrt(size2) / max(gain, 1e-30)))
     grays, phases, errors, visibility = (np.array(v) for v in zip(*sorted(found), strict=True))
     # one turn more or less than was believed is told by the neighbours: the sweep's steps are far below a turn
     unwrapped = np.unwrap(np.concatenate([[0.0], phases]))[1:]
     return Sweep(grays, unwrapped, errors, visibility)
 
 
-def _harmonics(
-    base: ColourLightPath, shot: Shot, estimate: Estimate, sample: Sampler
-) -> tuple[np.ndarray, ...]:
-    """A, B and C [h, w] of what the camera sees of a grating, for a phase d beyond what is believed."""
+def _parts_of(predictor: Predictor, shot: Shot, believed: np.ndarray, start: float) -> tuple[np.ndarray, ...]:
+    """`_harmonics` of a grating about a phase `start` (rad) from gray 0 to its own gray level."""
     gray = int(shot.gray.max())
-    believed = np.asarray(estimate.drift.response.get(shot.channel, base.path.response), float)
+    response = believed.copy()
+    response[gray] = believed[0] + start
+    return _harmonics(lambda r: predictor.light(shot, r), response, gray)
+
+
+def _harmonics(
+    predict: Callable[[np.ndarray], np.ndarray], believed: np.ndarray, gray: int
+) -> tuple[np.ndarray, ...]:
+    """A, B and C [h, w] of what the camera sees of a grating, for a phase d of its gray beyond what is believed.
+
+    `predict` gives what the camera sees with a response.
+    """
     trials = []
     for trial in TRIALS:
         response = believed.copy()
         response[gray] += trial
-        drift = replace(estimate.drift, response={**estimate.drift.response, shot.channel: response})
-        trials.append(predicted(base, shot, replace(estimate, drift=drift), sample))
+        trials.append(predict(response))
     mean = (trials[0] + trials[1] + trials[2]) / 3
     return mean, (2 * trials[0] - trials[1] - trials[2]) / 3, (trials[1] - trials[2]) / math.sqrt(3)
 

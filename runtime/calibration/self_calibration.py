@@ -26,14 +26,15 @@ from runtime.calibration.colour_captures import (
 )
 from runtime.calibration.drift import Drift
 from runtime.calibration.drift_fit import fit
-from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, gain_of, predicted
+from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, gain_of
 from runtime.calibration.held_out_errors import HeldOutErrors, held_out_errors
+from runtime.calibration.prediction import Predictor
 from runtime.calibration.refit import Progress, part_of, refit, start_view
 from runtime.calibration.replacement_rule import LEAST_EXCESS, Verdict, is_certain, replacement_verdict
 from runtime.calibration.response import SWEEP, Sweep
 from runtime.calibration.shown_patterns import GRAINS, HELD_OUT
 from runtime.calibration.taking import Taker
-from runtime.camera.view import View, sampler, view_of
+from runtime.camera.view import View, view_of
 from runtime.excess import is_complete, removed_excess
 from runtime.headset.open_devices import Devices
 from runtime.program.progress import no_progress
@@ -197,7 +198,7 @@ def _as_it_was(
     and a refit must be better than that before it replaces anything.
     """
     start = Estimate(Drift(), view)
-    rigid, scaled = (fit(bases, heldout, start, (0, 0), new_view=new).estimate for new in (False, True))
+    rigid, scaled = (fit(bases, heldout, start, (0, 0), 5, new_view=new).estimate for new in (False, True))
     errors = held_out_errors(bases, heldout, scaled)
     removed = removed_excess(held_out_errors(bases, heldout, rigid).errors, errors.errors)
     matters = is_certain(removed) and removed.value > LEAST_EXCESS
@@ -239,6 +240,8 @@ def _excess_before(bundle: Bundle) -> float:
 
 def _power(base: ColourLightPath, captures: ColourCaptures, estimate: Estimate) -> tuple[float, float]:
     """Counts a millisecond for irradiance 1 at the power used, mean over captures, and the relative spread."""
-    sample = sampler(estimate.view, base.path.grid)
-    gains = [gain_of(s, predicted(base, s, estimate, sample)) / captures.exposure_ms for s in captures.fitted]
+    channel = captures.fitted[0].channel
+    predictor = Predictor({channel: base})
+    predictor.take(estimate)
+    gains = [gain_of(s, predictor.light(s)) / captures.exposure_ms for s in captures.fitted]
     return float(np.mean(gains)), float(np.std(gains) / np.mean(gains))

@@ -216,12 +216,58 @@ def spline_matrix(y: np.ndarray, x: np.ndarray, shape: tuple[int, int]) -> csr_m
     -------
     sparse float32 matrix [h w, n m]
     """
-    (rows, wy), (columns, wx) = _taps(y.ravel(), shape[0]), _taps(x.ravel(), shape[1])
-    index = np.stack(rows)[:, None] * shape[1] + np.stack(columns)[None, :]
-    weight = np.stack(wy)[:, None] * np.stack(wx)[None, :]
+    return spline_matrices(y, x, shape, slopes=False)[0]
+
+
+def spline_matrices(
+    y: np.ndarray, x: np.ndarray, shape: tuple[int, int], slopes: bool = True
+) -> list[csr_matrix]:
+    """`spline_samples` at fixed places, and with `slopes` its derivatives over y and over x, a sample, as matrices.
+
+    Parameters
+    ----------
+    y, x : float arrays [h, w], samples
+    shape : (int, int)
+        (n, m), samples of the picture.
+    slopes : bool
+
+    Returns
+    -------
+    list of sparse float32 matrix [h w, n m]
+        They share their indices: a matrix has 16 values for each place, so at full size each copy counts.
+    """
+    kind = np.int32 if shape[0] * shape[1] < 2**31 else np.int64
+    of_y, of_x = _taps_and_slopes(y.ravel(), shape[0]), _taps_and_slopes(x.ravel(), shape[1])
     count = y.size
-    values, places = (a.reshape(16, count).T.ravel() for a in (weight.astype(np.float32), index))
-    return csr_matrix((values, places, 16 * np.arange(count + 1)), shape=(count, shape[0] * shape[1]))
+    places = np.empty((count, 16), kind)
+    for i in range(4):
+        for j in range(4):
+            np.add(of_y[0] * kind(shape[1]) + kind(i * shape[1] + j), of_x[0], out=places[:, 4 * i + j])
+    ends = np.arange(0, 16 * count + 1, 16, dtype=np.int32 if 16 * count < 2**31 else np.int64)
+    made = []
+    for down, across in ((1, 1), (2, 1), (1, 2)) if slopes else ((1, 1),):
+        values = np.empty((count, 16), np.float32)
+        for i in range(4):
+            for j in range(4):
+                np.multiply(of_y[down][i], of_x[across][j], out=values[:, 4 * i + j])
+        parts = (values.ravel(), places.ravel(), ends)
+        made.append(csr_matrix(parts, shape=(count, shape[0] * shape[1]), copy=False))
+    return made
+
+
+def _taps_and_slopes(place: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The first of four samples for each place, their weights [4, n], and the derivatives of those.
+
+    Where a place has not two samples on each side, the samples are the first four, and both are 0.
+    """
+    whole = np.floor(place)
+    inside = (whole >= 1) & (whole + 2 < count)
+    first = np.where(inside, whole, 1).astype(np.int32) - 1
+    t = (place - whole).astype(np.float32)
+    u = 1 - t
+    weights = np.stack([u**3, 3 * t**3 - 6 * t**2 + 4, 3 * u**3 - 6 * u**2 + 4, t**3]) / np.float32(6)
+    slopes = np.stack([-(u**2), 3 * t**2 - 4 * t, 4 * u - 3 * u**2, t**2]) / np.float32(2)
+    return first, weights * inside, slopes * inside
 
 
 def _taps(place: Array, count: int) -> tuple[list[Array], list[Array]]:

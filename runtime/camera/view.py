@@ -13,7 +13,6 @@ import numpy as np
 
 from firmware_iface.errors import InputError
 from runtime.bundle.bundle_folder import Bundle
-from runtime.camera.registration import panel_points
 from runtime.camera.sampling import (
     camera_places,
     finer_picture,
@@ -112,9 +111,9 @@ class View:
 
     def positions(self, panel: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
         """Where each camera pixel's centre looks on a panel of that shape: (y, x), each float64 [h, w]."""
-        y, x = np.mgrid[: self.shape[0], : self.shape[1]]
-        there = panel_points(self.matrix(panel), np.stack([x.ravel(), y.ravel()], 1))
-        return _bent(there[:, 1].reshape(self.shape), there[:, 0].reshape(self.shape), panel, self.distortion)
+        down, right = np.arange(self.shape[0])[:, None], np.arange(self.shape[1])
+        x, y, share = (m[0] * right + (m[1] * down + m[2]) for m in self.matrix(panel))
+        return _bent(y / share, x / share, panel, self.distortion)
 
 
 def view_of(bundle: Bundle) -> View | None:

@@ -79,15 +79,29 @@ def filter_into(image: np.ndarray, transfer: np.ndarray, spectrum: np.ndarray, t
         Room to work in.
     threads : int
     """
+    real_into(image, spectrum, threads)
+    np.multiply(spectrum, transfer, out=spectrum)
+    real_from(spectrum, image, threads, scaled=True)
+
+
+def real_into(image: np.ndarray, spectrum: np.ndarray, threads: int = THREADS) -> None:
+    """DFT of real `image` [n, m], not scaled, written to `spectrum` [n, m//2 + 1]."""
     if _ducc is not None:
         _ducc.r2c(image, axes=(0, 1), out=spectrum, nthreads=threads)
-        np.multiply(spectrum, transfer, out=spectrum)
-        size = image.shape[1]
-        _ducc.c2r(spectrum, axes=(0, 1), lastsize=size, forward=False, inorm=2, out=image, nthreads=threads)
     else:  # pragma: no cover
         spectrum[...] = _scipy.rfft2(image, workers=threads)
-        np.multiply(spectrum, transfer, out=spectrum)
-        image[...] = _scipy.irfft2(spectrum, s=image.shape, workers=threads)
+
+
+def real_from(spectrum: np.ndarray, image: np.ndarray, threads: int = THREADS, scaled: bool = False) -> None:
+    """Inverse DFT of half a spectrum [n, m//2 + 1], written to real `image` [n, m]; `scaled`: divided by n m."""
+    if _ducc is not None:
+        size, norm = image.shape[1], 2 if scaled else 0
+        _ducc.c2r(
+            spectrum, axes=(0, 1), lastsize=size, forward=False, inorm=norm, out=image, nthreads=threads
+        )
+    else:  # pragma: no cover
+        way = "backward" if scaled else "forward"
+        image[...] = _scipy.irfft2(spectrum, s=image.shape, norm=way, workers=threads)
 
 
 def _on_host(x: Array) -> np.ndarray | None:

@@ -6,6 +6,7 @@ panel or a picture, y and x run from -1 to 1 from edge to edge, at pixels' centr
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,14 @@ def legendre_maps(y: Array, x: Array, order: int, lowest: int = 1) -> Array:
     )
 
 
+def legendre_map_by_map(shape: tuple[int, int], order: int, lowest: int = 1) -> Iterator[np.ndarray]:
+    """`legendre_maps` over a panel or a picture, from edge to edge, one float32 map [H, W] at a time."""
+    y, x = edge_to_edge(shape)
+    rows, columns = (legendre_curve(t, order + 1).astype(np.float32) for t in (y[:, 0], x[0, :]))
+    for i, j in legendre_products(order, lowest):
+        yield rows[i, :, None] * columns[j]
+
+
 def legendre_surface(terms: Array, y: Array, x: Array, lowest: int = 1) -> Array:
     """Sum of `terms` times `legendre_maps`, as two small matrix products instead of a stack.
 
@@ -67,6 +76,24 @@ def legendre_surface(terms: Array, y: Array, x: Array, lowest: int = 1) -> Array
     table = xp.reshape(terms @ xp.asarray(pick, dtype=terms.dtype), (order + 1, order + 1))
     rows, columns = legendre_curve(y[:, 0], order + 1), legendre_curve(x[0, :], order + 1)
     return xp.matrix_transpose(rows) @ table @ columns
+
+
+def legendre_moments(values: np.ndarray, order: int, lowest: int = 1) -> np.ndarray:
+    """The sum over a map of its product with each of `legendre_maps`: the adjoint of `legendre_surface`.
+
+    Parameters
+    ----------
+    values : float array [H, W]
+    order, lowest : int
+
+    Returns
+    -------
+    float64 array [count]
+    """
+    y, x = edge_to_edge(values.shape)
+    rows, columns = legendre_curve(y[:, 0], order + 1), legendre_curve(x[0, :], order + 1)
+    table = (rows.astype(values.dtype) @ values).astype(np.float64) @ columns.T
+    return np.array([table[i, j] for i, j in legendre_products(order, lowest)])
 
 
 def legendre_order(count: int, lowest: int = 1) -> int:

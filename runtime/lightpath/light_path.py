@@ -1,7 +1,7 @@
 """The light path: from phase on the panel to irradiance in the image plane.
 
 Written against the array API: the headset runs it on NumPy arrays, the trainer differentiates it. Its adjoint is
-in `light_path_adjoint`. The one other copy, in place and for the solver alone, is `runtime.solver.in_place_path`.
+in `light_path_adjoint`. The one other copy, in place for solver and calibration, is `runtime.solver.in_place_path`.
 All that a bench does to the light is in the arrays of a `LightPath`, for one colour and one plane:
 
     phi = gain * response[gray]                     drive (and, finer than a pixel, `crosstalk`)

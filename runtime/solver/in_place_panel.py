@@ -37,10 +37,8 @@ class Panel:
         xp, grid = backend.xp, path.grid
         real, pair = path.response.dtype, path.source.dtype
         self.backend, self.rows, self.columns = backend, rows, columns
-        self.states, self.state = [_on(backend, state) for state in states(path)], 0
+        self.take(path)
         self.shape = height, width = grid.shape
-        self.source = None if np.all(path.source == 1) else xp.asarray(path.source)
-        self.leak = None if path.leak is None else xp.asarray(path.leak)
         self.strip = min(backend.strip_rows(grid.padded[1]), height)
         room = (self.strip, grid.padded[1])
         # source m(phase) exp(j phase); dark beyond the panel
@@ -53,6 +51,13 @@ class Panel:
         self.runs = rows.runs
         if self.crosstalk:  # in the band's own order, whose frequencies are each there once
             self.runs = tuple(Run(run.band, run.band, run.image, False) for run in rows.runs)
+
+    def take(self, path: LightPath) -> None:
+        """Go on with the source and leak of another path."""
+        xp = self.backend.xp
+        self.states, self.state = [_on(self.backend, state) for state in states(path)], 0
+        self.source = None if np.all(path.source == 1) else xp.asarray(path.source)
+        self.leak = None if path.leak is None else xp.asarray(path.leak)
 
     def forward(self, phase: Array, columns: bool = True, state: int = 0) -> None:
         """Fill `spectrum` from a phase.
@@ -113,6 +118,45 @@ class Panel:
                 self._rows_adjoint(mixing.columns, across, driven, mixing.one)
                 mixing.unmix_across(mixing.one, j, mixing.back)
             mixing.unmix_down(mixing.back, i, gradient)
+
+    def factor_adjoint(self, phase: Array, factor: Array) -> None:
+        """Add the gradient over a factor on the field that leaves the panel, from that over `spectrum`: it is used up.
+
+        Parameters
+        ----------
+        phase : float array [H, W], rad
+            That of the last `forward`.
+        factor : complex array [H, W]
+            Its real part is over the factor's logarithm, its imaginary part over its phase (rad).
+        """
+        mixing = self.crosstalk
+        if mixing is None:
+            self.backend.columns_fft(self.spectrum, False)
+            self._rows_factor(self.spectrum, None, factor)
+            return
+        for i, down in enumerate(mixing.down):
+            mixed = mixing.mix_down(phase, i)
+            mixing.columns[...] = 0
+            for run in self.rows.runs:
+                mixing.columns[run.panel] += self.spectrum[run.band] * down[run.band].conj()
+            self.backend.columns_fft(mixing.columns, False)
+            for j, across in enumerate(mixing.across):
+                self._light_all(mixing.mix_across(mixed, j))
+                self._rows_factor(mixing.columns, across, factor)
+
+    def _rows_factor(self, spectrum: Array, turned: Array | None, factor: Array) -> None:
+        """Add conj(field) times the field that came back along the rows."""
+        xp = self.backend.xp
+
+        def work(worker: int, rows: slice) -> None:
+            row = self._row_back(worker, rows, spectrum, turned)
+            left = self.lit[rows, : self.shape[1]]
+            if self.leak is not None:
+                left = left + self.leak[rows]
+            row *= xp.conj(left)
+            factor[rows] += row
+
+        self.backend.over_rows(self.shape[0], self.strip, work)
 
     def field_from_spectrum(self, field: Array, columns: bool = True) -> None:
         """Fill a field on the panel [H, W] with the adjoint (without crosstalk) of `spectrum`, which is used up."""

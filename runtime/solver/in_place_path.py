@@ -1,4 +1,4 @@
-"""The light path in place: forward and adjoint for the solver's inner loop, which allocates nothing.
+"""The light path in place: forward and adjoint for the solver's inner loop, which allocates nothing, and calibration.
 
 This is the one deliberate second copy of `runtime.lightpath.light_path`, which defines the mathematics and says what
 each array means; here it is arranged for speed. Rows that are dark and columns that the iris stops are not
@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from firmware_iface.errors import InputError
+from runtime.lightpath.grid import Grid
 from runtime.lightpath.light_path import LightPath
 from runtime.solver.array_backend import Backend
 from runtime.solver.in_place_image import ImagePlane, pixel_filter
@@ -65,14 +66,10 @@ class Optics:
             band(edge, n, fine * n) for edge, n in zip(grid.band, grid.padded, strict=True)
         )
         self.panel = Panel(path, self.rows, self.columns, backend)
-        transfers = path.transfers * (_aperture(path) / (grid.padded[0] * grid.padded[1]))
-        for axis, to in ((1, self.rows), (2, self.columns)):
-            transfers = folded(transfers, axis, grid.band[axis - 1], to)
-        self.transfers = [xp.asarray(t.astype(pair)) for t in transfers]
-        self.conjugates = [t.conj() for t in self.transfers]
+        self._take_pupil(path)
         self.strongest = int(np.argmax(path.weights))
         # Where one buffer can be both, the pupil multiplies in place.
-        self.in_place = fine == 1 and len(transfers) == 1 and path.crosstalk is None
+        self.in_place = fine == 1 and len(self.transfers) == 1 and path.crosstalk is None
         self.spectrum = self.panel.spectrum
         if not self.in_place:
             self.spectrum = xp.zeros((fine * grid.padded[0], len(self.columns.frequencies)), pair)
@@ -89,9 +86,35 @@ class Optics:
             self.image = xp.zeros(self.image_plane.shape, real)
             self.half_spectrum = xp.zeros(transfer.shape, pair)
 
+    def take(self, path: LightPath) -> None:
+        """Go on with another light path that differs from the one before in its source, leak and transfers alone."""
+        self.panel.take(path)
+        self._take_pupil(path)
+
+    def _take_pupil(self, path: LightPath) -> None:
+        xp, grid = self.backend.xp, path.grid
+        transfers = self.in_band_order(
+            path.transfers * (_aperture(path) / (grid.padded[0] * grid.padded[1])), grid
+        )
+        self.transfers = [xp.asarray(t.astype(path.source.dtype)) for t in transfers]
+        self.conjugates = [t.conj() for t in self.transfers]
+
+    def in_band_order(self, over_band: np.ndarray, grid: Grid) -> np.ndarray:
+        """Arrays over the band [M, n, m], lowest frequency first, in the order of this path's transfer functions."""
+        for axis, to in ((1, self.rows), (2, self.columns)):
+            over_band = folded(over_band, axis, grid.band[axis - 1], to)
+        return over_band
+
     def forward(self, phase: Array, light: Array) -> None:
         """Fill `light` [H, W] from phase (rad) [H, W]; the fields are kept for `adjoint`."""
         image = light if self.image is None else self.image
+        self.irradiance(phase, image)
+        if self.image is not None:
+            self.backend.filter(image, self.filter, self.half_spectrum)
+            light[...] = image[self.at_pixels]
+
+    def irradiance(self, phase: Array, image: Array) -> None:
+        """Fill irradiance at the image's own samples, before any filter; the fields are kept for `adjoint`."""
         for state in range(len(self.panel.states)):
             self.panel.forward(phase, not self.in_place, state)
             for mode in range(len(self.transfers)):
@@ -101,9 +124,61 @@ class Optics:
                     self._through_pupil(mode)
                     self.backend.columns_fft(self.spectrum, False)
                 self.image_plane.forward(state * len(self.transfers) + mode, image)
-        if self.image is not None:
-            self.backend.filter(image, self.filter, self.half_spectrum)
-            light[...] = image[self.at_pixels]
+
+    def factor_adjoint(self, phase: Array, slope: Array, factor: Array, axial: Array) -> float:
+        """Add to `factor` the gradient of a loss over a factor on the field that leaves the panel.
+
+        Parameters
+        ----------
+        phase : float array [H, W], rad
+            That of the last `irradiance`.
+        slope : float array
+            Gradient over irradiance at the image's own samples, before any filter.
+        factor : complex array [H, W]
+            Its real part is the gradient over the factor's logarithm, its imaginary part over its phase (rad).
+        axial : float array [rows, columns of the band]
+            A phase (rad) that each frequency gains in the pupil, as from `in_band_order`.
+
+        Returns
+        -------
+        float
+            The gradient over how many times the phase `axial` the pupil adds.
+        """
+        along = 0.0
+        for state in range(len(self.panel.states)):
+            if len(self.panel.states) > 1:
+                self.panel.forward(phase, True, state)
+            left = self.panel.spectrum.copy()
+            for mode in range(len(self.transfers)):
+                self.image_plane.adjoint(state * len(self.transfers) + mode, slope)
+                self._back_through_pupil(mode, again=mode > 0)
+                along += self._along(left, mode, axial)
+            self.panel.factor_adjoint(phase, factor)
+        return along
+
+    def _along(self, left: Array, mode: int, axial: Array) -> float:
+        """Gradient over how many times the pupil adds a phase, of one mode: Im(conj(transfer left) came) axial."""
+        total = 0.0
+        for run in self.panel.runs:
+            spectrum, transfer = left[run.panel], self.transfers[mode][run.band]
+            came, phase = self.spectrum[run.image], axial[run.band]
+
+            def work(
+                worker: int,
+                rows: slice,
+                spectrum: Array = spectrum,
+                transfer: Array = transfer,
+                came: Array = came,
+                phase: Array = phase,
+            ) -> tuple[float, ...]:
+                there = spectrum[rows] * transfer[rows]
+                turned = there.real * came[rows].imag
+                turned -= there.imag * came[rows].real
+                turned *= phase[rows]
+                return (float(turned.sum(dtype=np.float64)),)
+
+            total += self.backend.over_rows(len(came), self.strip, work)[0]
+        return total
 
     def adjoint(self, phase: Array, slope: Array, gradient: Array) -> None:
         """Fill the gradient of a loss over phase from its gradient over light.

@@ -74,5 +74,8 @@ def folded(transfer: np.ndarray, axis: int, edge: int, to: Band) -> np.ndarray:
     period = len(to.frequencies)
     result = np.zeros((period, *moved.shape[1:]), moved.dtype)
     place = np.arange(-edge, edge + 1) % period
-    np.add.at(result, place, moved)
+    if period == len(place):
+        result[place] = moved
+    else:
+        np.add.at(result, place, moved)
     return np.moveaxis(result, 0, axis)

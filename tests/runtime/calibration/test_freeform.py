@@ -11,11 +11,11 @@ from scipy.ndimage import gaussian_filter
 from runtime.calibration.drift import Drift, drifted
 from runtime.calibration.drift_fit import chi_squared
 from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, predicted
-from runtime.calibration.free_form_fit import fit_freeform, nodes_of
+from runtime.calibration.free_form_fit import fit_freeform
 from runtime.calibration.shown_patterns import grains
 from runtime.camera.view import View, sampler, sampler_and_adjoint
 from runtime.lightpath.light_path import LightPath, irradiance, panel_phase
-from runtime.lightpath.spline_maps import node_weights
+from runtime.lightpath.spline_maps import node_weights, nodes_over
 from tests.runtime.benches import ideal_path, random_path
 from tests.runtime.calibration.drifting import WAVELENGTH_NM, without_tilt
 
@@ -63,7 +63,7 @@ def test_fine_structure_is_found_in_wavefront_and_beam(make: object) -> None:
         noise = (0.005 * seen.mean()) ** 2
         shots.append(Shot("green", gray, seen, np.full(SHAPE, 1 / noise)))
     found = fit_freeform({"green": base}, shots, start)
-    assert found.drift.wavefront_nodes_nm.shape == nodes_of(SHAPE)
+    assert found.drift.wavefront_nodes_nm.shape == nodes_over(SHAPE, 4)
     error = without_tilt(found.drift.wavefront(SHAPE) - hidden_nm)[4:-4, 4:-4]
     beam = (np.log(found.drift.amplitude("green", SHAPE)) - hidden_log)[4:-4, 4:-4]
     assert error.std() < 0.1 * 15.0 and beam.std() < 0.2 * 0.08

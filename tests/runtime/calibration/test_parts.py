@@ -10,10 +10,11 @@ import pytest
 
 from firmware_iface.errors import InputError
 from firmware_iface.virtual.simulated_drive import Drive
-from runtime.calibration.drift import Drift, drifted, wavefront_maps
-from runtime.calibration.drift_fit import _columns, _stepped_views
+from runtime.calibration.columns import Columns
+from runtime.calibration.drift import LOWEST_WAVEFRONT, Drift, drifted
 from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, predicted
 from runtime.calibration.parameter_layout import ParameterLayout
+from runtime.calibration.prediction import Predictor
 from runtime.calibration.replacement_rule import replacement_verdict
 from runtime.calibration.response import (
     SWEEP,
@@ -26,6 +27,7 @@ from runtime.calibration.shown_patterns import grains, grating
 from runtime.calibration.taking import Taker
 from runtime.camera.view import View, sampler
 from runtime.excess import PredictionErrors, is_complete
+from runtime.lightpath.legendre import edge_to_edge, legendre_maps
 from runtime.lightpath.light_path import irradiance, panel_phase, pixel_irradiance
 from tests.runtime.benches import PITCH, ideal_path, random_path
 from tests.runtime.calibration.drifting import WAVELENGTH_NM, base, devices, drifted_bench, headset
@@ -47,10 +49,11 @@ def test_a_distance_drift_is_a_light_path_to_another_plane() -> None:
 
 def test_a_wavefront_turns_source_and_leak_alike_and_in_nanometres() -> None:
     path = random_path(SMALL)
-    terms = np.zeros(len(wavefront_maps(SMALL, 3)))
+    maps = legendre_maps(*edge_to_edge(SMALL), 3, LOWEST_WAVEFRONT)
+    terms = np.zeros(len(maps))
     terms[1] = 65.0
     moved = drifted(path, "green", WAVELENGTH_NM, Drift(wavefront_nm=terms))
-    turn = np.exp(2j * np.pi * 65.0 / WAVELENGTH_NM * wavefront_maps(SMALL, 3)[1])
+    turn = np.exp(2j * np.pi * 65.0 / WAVELENGTH_NM * maps[1])
     np.testing.assert_allclose(moved.source, path.source * turn, rtol=1e-12)
     np.testing.assert_allclose(moved.leak, path.leak * turn, rtol=1e-12)
     np.testing.assert_array_equal(moved.transfers, path.transfers)
@@ -110,11 +113,7 @@ def test_derivatives_are_what_differences_say() -> None:
         layout.nothing(Estimate(Drift(), View(SMALL))), 0.02 * rng.normal(size=int(layout.edges[-1]))
     )
     bases = {"green": one}
-    columns = dict(
-        _columns(
-            one, shot, start, layout, sampler(start.view, full.grid, 1), _stepped_views(bases, start.view)
-        )
-    )
+    columns = dict(Columns(bases, start, layout).of(shot))
     assert sorted(columns) == list(range(int(layout.edges[-1])))
     for place, column in columns.items():
         step = np.zeros(int(layout.edges[-1]))
@@ -144,7 +143,9 @@ def test_a_sweep_of_gratings_gives_a_hidden_response() -> None:
     sample = sampler(still.view, one.path.grid)
     period = best_period(one, "green", still, sample)
     shots = taker.shots("green", [grating(shape, period, g) for g in SWEEP], noise, "grating")
-    sweep = measured_sweep(one, shots, still, sample)
+    predictor = Predictor({"green": one})
+    predictor.take(still)
+    sweep = measured_sweep(predictor, shots)
     true = Drive(bench, WAVELENGTH_NM).magnitude(np.arange(256.0)[None])[0]
     assert np.abs(true - one.path.response).max() > 0.5
     assert np.abs(sweep.phase - true[sweep.gray]).max() < 0.03
