@@ -33,7 +33,7 @@ from trainer.model.model import EffectInstance, Model
 from trainer.model.parameters import json_values
 
 MOST_EFFECTS = 8  # an explanation longer than this explains nothing
-NEAR = 0.9  # of the excess that the best candidate removes: a candidate that removes so much is near
+NEAR = 0.7  # of the excess that the best candidate removes: a candidate that removes so much is near
 
 
 @dataclass(frozen=True)
