@@ -23,7 +23,9 @@ def options(parser: ArgumentParser) -> None:
         help="where the demo's files go (default: hololoop-demo, or if that is taken hololoop-demo-2 and so on)",
     )
     parser.add_argument("--quick", action="store_true", help="a smaller panel and fewer captures")
-    parser.add_argument("--colour", action="store_true", help="three colours, shown in turn, and the report in colour")
+    parser.add_argument(
+        "--colour", action="store_true", help="three colours, shown in turn, and the report in colour"
+    )
     worker_options(parser, cluster=False)
 
 
