@@ -107,10 +107,7 @@ class Panel:
         gradient[...] = 0
         for i, down in enumerate(mixing.down):
             mixed = mixing.mix_down(phase, i)
-            mixing.columns[...] = 0
-            for run in self.rows.runs:
-                mixing.columns[run.panel] += self.spectrum[run.band] * down[run.band].conj()
-            self.backend.columns_fft(mixing.columns, False)
+            self._back_to_columns(mixing, down)
             mixing.back[...] = 0
             for j, across in enumerate(mixing.across):
                 driven = mixing.mix_across(mixed, j)
@@ -136,13 +133,17 @@ class Panel:
             return
         for i, down in enumerate(mixing.down):
             mixed = mixing.mix_down(phase, i)
-            mixing.columns[...] = 0
-            for run in self.rows.runs:
-                mixing.columns[run.panel] += self.spectrum[run.band] * down[run.band].conj()
-            self.backend.columns_fft(mixing.columns, False)
+            self._back_to_columns(mixing, down)
             for j, across in enumerate(mixing.across):
                 self._light_all(mixing.mix_across(mixed, j))
                 self._rows_factor(mixing.columns, across, factor)
+
+    def _back_to_columns(self, mixing: Crosstalk, down: Array) -> None:
+        """Put into `mixing.columns` what came back of the sub-row of the pixels that has the spectrum `down`."""
+        mixing.columns[...] = 0
+        for run in self.rows.runs:
+            mixing.columns[run.panel] += self.spectrum[run.band] * down[run.band].conj()
+        self.backend.columns_fft(mixing.columns, False)
 
     def _rows_factor(self, spectrum: Array, turned: Array | None, factor: Array) -> None:
         """Add conj(field) times the field that came back along the rows."""
