@@ -1,6 +1,6 @@
 """How quick the studio is, in a real browser: first view, zoom at full size, a slider of the catalogue.
 
-    python tests/benchmarks/studio.py [--json] [--keep FOLDER]
+    python -m tests.benchmarks.studio [--json] [--keep FOLDER]
 
 Two sets of a simulated bench are captured first (minutes; `--keep` keeps them for the next time): 24 captures of
 240 x 320, and 6 of 1080 x 1920. All times end when the browser has painted what was asked for.
