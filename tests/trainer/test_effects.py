@@ -17,7 +17,7 @@ from runtime.lightpath.grid import FINE
 from runtime.lightpath.legendre import legendre_maps
 from trainer.captures.bench_file import Bench, read_bench
 from trainer.effects import catalogue
-from trainer.effects.zernike import zernike_maps
+from trainer.effects.zernike import zernike_count, zernike_surface
 from trainer.model.model import EffectInstance, Model, absent
 from trainer.model.model_stages import scene_for, stages_for
 from trainer.prediction.predict import counts, light_on_camera, light_path, trace
@@ -268,15 +268,21 @@ def test_the_iris_passes_what_its_half_width_and_place_say() -> None:
         assert (light.numpy()[outside > bin_width * 1.001] == 0).all()
 
 
+def _zernike_polynomials(y: torch.Tensor, without_defocus: bool) -> torch.Tensor:
+    """Polynomials up to n = 6 over a square grid, [count, n, n]."""
+    each = torch.eye(zernike_count(6, without_defocus), dtype=y.dtype)
+    return torch.stack([zernike_surface(one, y[:, None], y[None, :], 6, without_defocus) for one in each])
+
+
 def test_aberrations_are_orthonormal_on_the_disc() -> None:
     y = torch.linspace(-1, 1, 401, dtype=torch.float64)
-    maps = zernike_maps(y[:, None], y[None, :], 6)
+    maps = _zernike_polynomials(y, without_defocus=False)
     inside = (y[:, None] ** 2 + y[None, :] ** 2) <= 1
     on_disc = maps[:, inside]
     products = on_disc @ on_disc.T / on_disc.shape[1]
     assert float((products - torch.eye(len(maps))).abs().max()) < 0.03  # the disc's edge on a grid
     assert float(on_disc.mean(1).abs().max()) < 0.01  # no piston
-    without = zernike_maps(y[:, None], y[None, :], 6, without_defocus=True)
+    without = _zernike_polynomials(y, without_defocus=True)
     r2 = (y[:, None] ** 2 + y[None, :] ** 2)[inside]
     for one in without[:, inside]:
         for held in (

@@ -13,7 +13,7 @@ from trainer.effects.definition import Parameter, effect
 from trainer.effects.free_form import FreeForm
 from trainer.effects.starts import distance_starts, wavelength_starts
 from trainer.effects.term_names import aberration_terms
-from trainer.effects.zernike import zernike_count, zernike_maps
+from trainer.effects.zernike import zernike_count, zernike_surface
 from trainer.prediction.stages import Pupil
 
 LINES = 5  # nodes of the Gauss-Hermite rule that represents a laser line
@@ -124,8 +124,7 @@ def pupil_aberration(pupil: Pupil, zernike: Tensor, *, order: int) -> Pupil:
 
     Goodman, Introduction to Fourier Optics, section 6.4.
     """
-    maps = zernike_maps(pupil.v, pupil.u, order, without_defocus=True)
-    return _delayed(pupil, torch.tensordot(zernike, maps, dims=1))
+    return _delayed(pupil, zernike_surface(zernike, pupil.v, pupil.u, order, without_defocus=True))
 
 
 @effect(

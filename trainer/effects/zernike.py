@@ -1,8 +1,10 @@
-"""Zernike polynomials on a disc: dimensionless and of order one, lowest order first, a stack [count, ...]."""
+"""Zernike polynomials on a disc: dimensionless and of order one, lowest order first."""
 
 from __future__ import annotations
 
 import math
+from functools import lru_cache
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -19,14 +21,15 @@ def zernike_count(order: int, without_defocus: bool = False) -> int:
     return len(zernike_indices(order, without_defocus))
 
 
-def zernike_maps(y: Tensor, x: Tensor, order: int, without_defocus: bool = False) -> Tensor:
-    """Zernike polynomials over coordinates, rms 1 on the disc.
+def zernike_surface(terms: Tensor, y: Tensor, x: Tensor, order: int, without_defocus: bool = False) -> Tensor:
+    """Sum of `terms` times Zernike polynomials of rms 1 on the disc, as two small matrix products.
 
     Noll's normalisation, ordered by n, then m; sine terms have negative m.
 
     Parameters
     ----------
-    y, x : Tensor, pupil radii
+    terms : Tensor [count]
+    y, x : Tensor [n, 1] and [1, m], pupil radii
     order : int
         Highest n.
     without_defocus : bool
@@ -34,30 +37,33 @@ def zernike_maps(y: Tensor, x: Tensor, order: int, without_defocus: bool = False
 
     Returns
     -------
-    Tensor [count, ...]
+    Tensor [n, m]
 
     References
     ----------
     Noll 1976.
     """
-    y, x = torch.broadcast_tensors(y, x)
-    radius2 = y**2 + x**2
-    # r^|m| cos(m a) and sin(m a) as polynomials of x + j y: no angle, so no singular point at the centre.
-    power = [(torch.ones_like(x), torch.zeros_like(x))]
-    for _ in range(order):
-        real, imaginary = power[-1]
-        power.append((real * x - imaginary * y, real * y + imaginary * x))
-    maps = []
-    for n, m in zernike_indices(order, without_defocus):
+    table = torch.tensordot(terms, _monomials(order, without_defocus).to(terms), dims=1)
+    exponents = torch.arange(order + 1, device=y.device)
+    return y**exponents @ table @ (x.T**exponents).T
+
+
+@lru_cache(maxsize=8)
+def _monomials(order: int, without_defocus: bool) -> Tensor:
+    """Coefficient [count, i, j] of y^i x^j in each polynomial."""
+    indices = zernike_indices(order, without_defocus)
+    table = torch.zeros((len(indices), order + 1, order + 1), dtype=torch.float64)
+    for one, (n, m) in enumerate(indices):
         k = abs(m)
-        radial = torch.zeros_like(x)
-        for s in range((n - k) // 2 + 1):
-            weight = (
-                (-1) ** s
-                * math.factorial(n - s)
-                / (math.factorial(s) * math.factorial((n + k) // 2 - s) * math.factorial((n - k) // 2 - s))
-            )
-            radial = radial + weight * radius2 ** ((n - k) // 2 - s)
         norm = math.sqrt((n + 1) * (1 if m == 0 else 2))
-        maps.append(norm * radial * power[k][1 if m < 0 else 0])
-    return torch.stack(maps)
+        for s in range((n - k) // 2 + 1):
+            p = (n - k) // 2 - s
+            weight = (-1) ** s * math.factorial(n - s) * norm
+            weight /= math.factorial(s) * math.factorial((n + k) // 2 - s) * math.factorial(p)
+            # r^2p, and r^k cos(k a) or sin(k a) as the real or imaginary part of (x + j y)^k.
+            for q, t in product(range(p + 1), range(1 if m < 0 else 0, k + 1, 2)):
+                sign = (-1) ** (t // 2)
+                table[one, 2 * q + t, 2 * (p - q) + k - t] += (
+                    sign * weight * math.comb(p, q) * math.comb(k, t)
+                )
+    return table
