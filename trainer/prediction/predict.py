@@ -26,12 +26,11 @@ from runtime.lightpath.grid import FINE
 from runtime.lightpath.light_path import LightPath, mode_irradiance, panel_phase, panel_spectrum, states
 from runtime.lightpath.modulation import Modulation
 from runtime.lightpath.propagation import (
-    band_limit,
     far_field_matrix,
-    transfer_function,
 )
 from trainer.prediction.capture_motion import blurred_spectrum, displaced_spectrum
 from trainer.prediction.panel_gradient import has_panel_gradient, image_with_panel_gradient
+from trainer.prediction.pupil_modes import pupil_modes
 from trainer.prediction.samples_at import samples_at
 from trainer.prediction.scene import Scene, Stages, bare_stages
 from trainer.prediction.stages import Drive, Pupil, Sensor
@@ -146,90 +145,6 @@ def display_filter(stages: Stages) -> Tensor | None:
     if not parts:
         return None
     return parts[0] if len(parts) == 1 else parts[0] * parts[1]
-
-
-@lru_cache(maxsize=16)
-def _bare_modes(scene: Scene) -> tuple[Tensor, Tensor]:
-    return _modes(scene, bare_stages(scene).pupil)
-
-
-def pupil_modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
-    """The pupil's modes; cached where no effect changes the pupil.
-
-    Returns
-    -------
-    transfers : complex Tensor [M, n, m]
-        Transfer functions.
-    weights : Tensor [M]
-    """
-    return _bare_modes(scene) if pupil is bare_stages(scene).pupil else _modes(scene, pupil)
-
-
-def _modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
-    if pupil.lines is None:
-        offsets, weights = torch.zeros(1, dtype=scene.dtype), torch.ones(1, dtype=scene.dtype)
-    else:
-        offsets, weights = pupil.lines
-    opening = iris_opening(scene, pupil)
-    if pupil.transmission is not None:
-        opening = opening * pupil.transmission
-    grid = scene.grid
-    distance = float(pupil.distance.detach())
-    limits = tuple(band_limit(scene.wavelength, distance, n * grid.pitch) for n in grid.padded)
-    modes = []
-    for offset in offsets:
-        wavelength = scene.wavelength + offset
-        mode = opening
-        if scene.method != "fraunhofer":
-            mode = opening * transfer_function(
-                pupil.fy, pupil.fx, wavelength, pupil.distance, (limits[0], limits[1]), scene.method
-            )
-        if pupil.path_difference is not None:
-            angle = 2 * math.pi / wavelength * pupil.path_difference
-            mode = mode * torch.polar(torch.ones_like(angle), angle)
-        modes.append(mode)
-    return torch.stack(modes), weights
-
-
-def iris_opening(scene: Scene, pupil: Pupil) -> Tensor:
-    """What the iris passes of each frequency.
-
-    A frequency sample passes by the share of its width that lies inside. So the iris's size and place have gradients,
-    and the result does not depend on the padding. The edge lies half a frequency sample of the doubled panel,
-    1 / (4 N pitch), beyond the nominal one: a frequency on the edge passes.
-
-    Returns
-    -------
-    Tensor [n, m]
-        0 to 1.
-    """
-    panel = scene.bench.panel.shape
-    beyond = [1 / (2 * n) for n in panel]  # share of the band
-    bins = [2 / n for n in scene.grid.padded]  # width of a frequency sample, share of the band
-    v, u = pupil.v - pupil.centre[0], pupil.u - pupil.centre[1]
-    rows = pupil.half_width * (1 - pupil.stretch) + beyond[0]
-    columns = pupil.half_width * (1 + pupil.stretch) + beyond[1]
-    if not any(bool(x != 0) for x in (pupil.roundness, pupil.rotation, pupil.edge)):
-        passed = [
-            torch.clamp((side - torch.abs(f)) / width + 0.5, 0, 1)
-            for side, f, width in ((rows, v, bins[0]), (columns, u, bins[1]))
-        ]
-        return passed[0] * passed[1]
-    cosine, sine = torch.cos(pupil.rotation), torch.sin(pupil.rotation)
-    along, across = cosine * u + sine * v, cosine * v - sine * u
-    # Signed distance to a rounded square of half side 1, in units of the iris's own sides.
-    y, x = torch.abs(across) / rows, torch.abs(along) / columns
-    corner = torch.clamp(pupil.roundness, 1e-6, 1)
-    beyond_y, beyond_x = torch.clamp(y - 1 + corner, min=0), torch.clamp(x - 1 + corner, min=0)
-    reach = torch.sqrt(beyond_y**2 + beyond_x**2 + 1e-12)
-    inside = torch.clamp(torch.maximum(y, x) - 1 + corner, max=0)
-    outside = reach + inside - corner
-    # One unit is as long as the iris's half side where the nearest edge is, and a sample as wide as it is there.
-    slope_y = torch.where(reach > 2e-6, beyond_y / reach, (y > x).to(y.dtype))
-    slope_x = torch.where(reach > 2e-6, beyond_x / reach, (y <= x).to(y.dtype))
-    unit = 1 / torch.sqrt((slope_y / rows) ** 2 + (slope_x / columns) ** 2 + 1e-12)
-    width = torch.sqrt((slope_y * bins[0]) ** 2 + (slope_x * bins[1]) ** 2) + pupil.edge
-    return torch.clamp(0.5 - outside * unit / width, 0, 1)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,118 @@
+"""Transfer functions of the pupil: iris, free space, aberration and transmission, one for each line of the laser."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from runtime.lightpath.propagation import band_limit, transfer_function
+from trainer.prediction.scene import Scene, bare_stages
+from trainer.prediction.stages import Pupil
+
+
+def pupil_modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
+    """The pupil's modes; cached where no effect changes the pupil.
+
+    Returns
+    -------
+    transfers : complex Tensor [M, n, m]
+        Transfer functions.
+    weights : Tensor [M]
+    """
+    return _bare_modes(scene) if pupil is bare_stages(scene).pupil else _modes(scene, pupil)
+
+
+@lru_cache(maxsize=16)
+def _bare_modes(scene: Scene) -> tuple[Tensor, Tensor]:
+    return _modes(scene, bare_stages(scene).pupil)
+
+
+def _modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
+    if pupil.lines is None:
+        offsets, weights = torch.zeros(1, dtype=scene.dtype), torch.ones(1, dtype=scene.dtype)
+    else:
+        offsets, weights = pupil.lines
+    opening = iris_opening(scene, pupil)
+    if pupil.transmission is not None:
+        opening = opening * pupil.transmission
+    modes = []
+    for offset in offsets:
+        mode = opening
+        if scene.method != "fraunhofer":
+            mode = opening * _free_space(scene, pupil, offset)
+        if pupil.path_difference is not None:
+            angle = 2 * math.pi / (scene.wavelength + offset) * pupil.path_difference
+            mode = mode * torch.polar(torch.ones_like(angle), angle)
+        modes.append(mode)
+    return torch.stack(modes), weights
+
+
+def _free_space(scene: Scene, pupil: Pupil, offset: Tensor) -> Tensor:
+    """Transfer function from the pupil's place to its distance, for a laser line at an offset (m)."""
+    bare = bare_stages(scene).pupil
+    if (
+        pupil.distance.requires_grad
+        or offset.requires_grad
+        or pupil.fy is not bare.fy
+        or pupil.fx is not bare.fx
+    ):
+        return _transfer(scene, pupil, scene.wavelength + offset, pupil.distance)
+    return _known_transfer(scene, float(pupil.distance), float(offset))
+
+
+@lru_cache(maxsize=4)  # most effects change neither distance nor line
+def _known_transfer(scene: Scene, distance: float, offset: float) -> Tensor:
+    return _transfer(
+        scene, bare_stages(scene).pupil, scene.wavelength + offset, torch.tensor(distance, dtype=scene.dtype)
+    )
+
+
+def _transfer(scene: Scene, pupil: Pupil, wavelength: Any, distance: Tensor) -> Tensor:
+    grid = scene.grid
+    limits = [band_limit(scene.wavelength, float(distance.detach()), n * grid.pitch) for n in grid.padded]
+    return transfer_function(pupil.fy, pupil.fx, wavelength, distance, (limits[0], limits[1]), scene.method)
+
+
+def iris_opening(scene: Scene, pupil: Pupil) -> Tensor:
+    """What the iris passes of each frequency.
+
+    A frequency sample passes by the share of its width that lies inside. So the iris's size and place have gradients,
+    and the result does not depend on the padding. The edge lies half a frequency sample of the doubled panel,
+    1 / (4 N pitch), beyond the nominal one: a frequency on the edge passes.
+
+    Returns
+    -------
+    Tensor [n, m]
+        0 to 1.
+    """
+    panel = scene.bench.panel.shape
+    beyond = [1 / (2 * n) for n in panel]  # share of the band
+    bins = [2 / n for n in scene.grid.padded]  # width of a frequency sample, share of the band
+    v, u = pupil.v - pupil.centre[0], pupil.u - pupil.centre[1]
+    rows = pupil.half_width * (1 - pupil.stretch) + beyond[0]
+    columns = pupil.half_width * (1 + pupil.stretch) + beyond[1]
+    if not any(bool(x != 0) for x in (pupil.roundness, pupil.rotation, pupil.edge)):
+        passed = [
+            torch.clamp((side - torch.abs(f)) / width + 0.5, 0, 1)
+            for side, f, width in ((rows, v, bins[0]), (columns, u, bins[1]))
+        ]
+        return passed[0] * passed[1]
+    cosine, sine = torch.cos(pupil.rotation), torch.sin(pupil.rotation)
+    along, across = cosine * u + sine * v, cosine * v - sine * u
+    # Signed distance to a rounded square of half side 1, in units of the iris's own sides.
+    y, x = torch.abs(across) / rows, torch.abs(along) / columns
+    corner = torch.clamp(pupil.roundness, 1e-6, 1)
+    beyond_y, beyond_x = torch.clamp(y - 1 + corner, min=0), torch.clamp(x - 1 + corner, min=0)
+    reach = torch.sqrt(beyond_y**2 + beyond_x**2 + 1e-12)
+    inside = torch.clamp(torch.maximum(y, x) - 1 + corner, max=0)
+    outside = reach + inside - corner
+    # One unit is as long as the iris's half side where the nearest edge is, and a sample as wide as it is there.
+    slope_y = torch.where(reach > 2e-6, beyond_y / reach, (y > x).to(y.dtype))
+    slope_x = torch.where(reach > 2e-6, beyond_x / reach, (y <= x).to(y.dtype))
+    unit = 1 / torch.sqrt((slope_y / rows) ** 2 + (slope_x / columns) ** 2 + 1e-12)
+    width = torch.sqrt((slope_y * bins[0]) ** 2 + (slope_x * bins[1]) ** 2) + pupil.edge
+    return torch.clamp(0.5 - outside * unit / width, 0, 1)
