@@ -142,9 +142,12 @@ def _transform(given: Array, axis: int, n: int | None, forward: bool) -> Array:
         inside[axis] = slice(0, x.shape[axis])
         whole[tuple(inside)] = x
         x = whole
+    out = x if length != given.shape[axis] else None  # in place where it is our own
     if _ducc is None:  # pragma: no cover
         return (_scipy.fft if forward else _scipy.ifft)(x, axis=axis, workers=THREADS)
     return _as(
         given,
-        _ducc.c2c(x, axes=(axis,), forward=forward, inorm=0 if forward else 2, nthreads=_threads(given)),
+        _ducc.c2c(
+            x, axes=(axis,), forward=forward, inorm=0 if forward else 2, out=out, nthreads=_threads(given)
+        ),
     )

@@ -26,7 +26,7 @@ from trainer.effects.own_effect import measured_by
 from trainer.fitting.jacobian import keys_of, slopes_of, stepped, weighted_residuals
 from trainer.fitting.least_squares_gain import with_gain
 from trainer.fitting.many_numbers import ManySlopes, has_many
-from trainer.fitting.predictor import Predictor
+from trainer.fitting.predictor import Predictor, lights_of
 from trainer.model.model import Model, Values
 
 
@@ -92,7 +92,7 @@ def _fit(
     first = min((model.instance(n).effect.stage for n in free), key=STAGES.index, default="sensor")
     points = [p.trace(model) for p in predictors]
     if not model.gain or any(b.channel not in model.gain for b in batches):
-        model = with_gain(model, predictors, points)
+        model = with_gain(model, predictors, lights_of(model, predictors, points))
     channels = list(dict.fromkeys(b.channel for b in batches))
     slopes = slopes_of(model, keys, channels, predictors, points)
     residuals, errors = weighted_residuals(model, predictors, points)
@@ -147,7 +147,7 @@ def _fit_many(
     keys = keys_of(model, few)
     points = [p.trace(model) for p in predictors]
     if not model.gain or any(b.channel not in model.gain for b in batches):
-        model = with_gain(model, predictors, points)
+        model = with_gain(model, predictors, lights_of(model, predictors, points))
     channels = list(dict.fromkeys(b.channel for b in batches))
     residuals, errors = weighted_residuals(model, predictors, points)
     for iteration in range(iterations):

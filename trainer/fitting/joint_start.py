@@ -18,7 +18,7 @@ from trainer.effects.evidence import Evidence
 from trainer.effects.own_effect import starts_of
 from trainer.fitting.gauss_newton import FitResult, fit
 from trainer.fitting.least_squares_gain import with_gain
-from trainer.fitting.predictor import Predictor
+from trainer.fitting.predictor import Predictor, lights_of
 from trainer.fitting.start_points import start_cost
 from trainer.model.model import Model, absent, instance_with
 
@@ -70,10 +70,11 @@ def _best_start(model: Model, name: str, batches: Sequence[Batch]) -> Model:
         return model
     predictors = [Predictor(model, b) for b in batches]
     points = [p.trace(model) for p in predictors]
-    model = with_gain(model, predictors, points)
+    lights = lights_of(model, predictors, points)
+    model = with_gain(model, predictors, lights)
     evidence = [
-        Evidence(p.scene, p.batch, p.counts(model, p.light(model, t)))
-        for p, t in zip(predictors, points, strict=True)
+        Evidence(p.scene, p.batch, p.counts(model, light))
+        for p, light in zip(predictors, lights, strict=True)
     ]
     starts = [model.instance(name)]
     starts += [instance_with(effect, model.bench, values) for values in starts_of(effect, evidence)]

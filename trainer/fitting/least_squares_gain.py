@@ -6,19 +6,20 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from trainer.fitting.predictor import Predictor
 from trainer.model.model import Model
-from trainer.prediction.predict import Trace, counts
+from trainer.prediction.predict import counts
 
 
-def with_gain(model: Model, predictors: Sequence[Predictor], points: Sequence[Trace] | None = None) -> Model:
+def with_gain(model: Model, predictors: Sequence[Predictor], lights: Sequence[Tensor] | None = None) -> Model:
     """The model with each colour's gain by least squares, other parameters as they are.
 
     Parameters
     ----------
-    points : sequence of Trace, optional
-        The light of each predictor's batch under the model; computed where not given.
+    lights : sequence of Tensor [B, h, w], optional
+        Irradiance on the camera of each predictor's batch under the model; computed where not given.
     """
     sums: dict[str, list[float]] = {}
     for k, predictor in enumerate(predictors):
@@ -26,8 +27,7 @@ def with_gain(model: Model, predictors: Sequence[Predictor], points: Sequence[Tr
         unit = replace(model, gain={batch.channel: 1.0})
         stages = predictor.stages(unit)
         linear = replace(stages.sensor, offset=None, response=None, free_capture_gain=False)
-        point = predictor.trace(unit) if points is None else points[k]
-        light = predictor.light(unit, point)
+        light = predictor.light(unit, predictor.trace(unit)) if lights is None else lights[k]
         exposed = batch.exposure[:, None, None]
         one = batch.as_compared(counts(predictor.scene, replace(stages, sensor=linear), light, exposed, None))
         light_counts = batch.signal if stages.sensor.offset is None else batch.signal - stages.sensor.offset

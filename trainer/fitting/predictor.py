@@ -68,6 +68,11 @@ class Predictor:
         return self.counts(model, self.light(model, self.trace(model, start, before)))
 
 
+def lights_of(model: Model, predictors: Sequence[Predictor], points: Sequence[Trace]) -> list[Tensor]:
+    """Irradiance on the camera [B, h, w] of each predictor's batch."""
+    return [p.light(model, t) for p, t in zip(predictors, points, strict=True)]
+
+
 def evaluate_captures(captures: CaptureSet, rows: Sequence[Capture], model: Model) -> PredictionErrors:
     """Errors of a model on captures, one in memory at a time."""
     with torch.no_grad():

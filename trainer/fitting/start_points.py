@@ -12,7 +12,7 @@ from torch import Tensor
 from trainer.effects.definition import Effect
 from trainer.fitting.jacobian import keys_of, stepped
 from trainer.fitting.least_squares_gain import with_gain
-from trainer.fitting.predictor import Predictor
+from trainer.fitting.predictor import Predictor, lights_of
 from trainer.model.model import EffectInstance, Model, absent
 from trainer.prediction.predict import Trace
 
@@ -58,8 +58,9 @@ def start_cost(
     """Squared error of a model with an effect at a start, gains fitted."""
     trial = model.having(start)
     moved = [p.trace(trial, start.effect.stage, t) for p, t in zip(predictors, points, strict=True)]
-    trial = with_gain(trial, predictors, moved)
-    return sum(_cost(p, p.counts(trial, p.light(trial, t))) for p, t in zip(predictors, moved, strict=True))
+    lights = lights_of(trial, predictors, moved)
+    trial = with_gain(trial, predictors, lights)
+    return sum(_cost(p, p.counts(trial, light)) for p, light in zip(predictors, lights, strict=True))
 
 
 def _cost(predictor: Predictor, prediction: Tensor) -> float:
