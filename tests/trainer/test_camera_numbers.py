@@ -14,7 +14,9 @@ from tests.trainer.hidden import captured, ran
 from trainer.captures.bench_file import Camera
 from trainer.captures.camera_noise import compare_repeats
 from trainer.captures.camera_numbers import camera_by_repeats, photon_transfer
+from trainer.captures.capture_set import read_captures
 from trainer.cli import main
+from trainer.diagnosis.bench_facts import camera_facts
 from trainer.diagnosis.verdict import below_the_noise
 
 SHAPE = (120, 160)
@@ -118,6 +120,13 @@ def test_commands_measure_the_noise_and_say_so(old, new, says, tmp_path, capsys)
     assert abs(found["heldout"]["excess"]) < 1e-4
     assert found["camera"]["measured"]
     assert found["camera"]["full_well_e"] == pytest.approx(10500, rel=0.05)
+    facts = {f.fact: f for f in camera_facts(read_captures(captures))}
+    if new:
+        well, depth = facts["camera.full_well_e"], facts["camera.bit_depth"]
+        assert well.value == pytest.approx(10500, rel=0.05)
+        assert (well.stated, depth.value) in [(21000, 13), (5250, 11)]
+    else:  # nothing is stated that could be wrong
+        assert not facts
 
 
 def test_too_many_bits_show_at_the_top_count_and_in_the_noise(tmp_path, capsys) -> None:

@@ -152,8 +152,16 @@ def numbers_text(stated: Camera, used: Camera) -> str:
         f"camera.full_well_e = {stated.full_well_e:g} and read_noise_e = {stated.read_noise_e:g} do not fit the noise "
         f"of repeated pictures: these show {measured}, which are used"
     )
+    depth = equal_depth(stated, used)
+    return (
+        text
+        if depth is None
+        else f"{text}; bit_depth = {depth} instead of {stated.bit_depth} would explain it, too"
+    )
+
+
+def equal_depth(stated: Camera, used: Camera) -> int | None:
+    """The bit depth that would explain the noise as well as the full well that was measured; None where none would."""
     bits = math.log2(used.full_well_e / stated.full_well_e)
     depth = stated.bit_depth - round(bits)
-    if round(bits) and abs(bits - round(bits)) < 0.1 and 4 <= depth <= 16:
-        text += f"; bit_depth = {depth} instead of {stated.bit_depth} would explain it, too"
-    return text
+    return depth if round(bits) and abs(bits - round(bits)) < 0.1 and 4 <= depth <= 16 else None

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from trainer.captures.bench_file import Bench
+from trainer.captures.camera_numbers import equal_depth
 from trainer.captures.capture_set import CaptureSet
 from trainer.formatting import measured, number
 from trainer.model.model import Model
@@ -165,3 +166,16 @@ def _common_ratio(model: Model, captures: CaptureSet) -> float | None:
     errors = np.zeros(len(rows)) if present.errors is None else present.errors["offset"][rows] / stated
     spread = np.abs(ratios - ratios.mean())
     return float(ratios.mean()) if (spread <= ALIKE * errors + 1e-12).all() else None
+
+
+def camera_facts(captures: CaptureSet) -> tuple[EqualFact, ...]:
+    """Facts of bench.toml's camera that repeated captures contradict, each with the value that they show."""
+    stated, used = captures.bench.camera, captures.noise_camera()
+    if used == stated or not stated.noise_stated:
+        return ()
+    facts = [
+        EqualFact(f"camera.{key}", getattr(stated, key), getattr(used, key))
+        for key in ("full_well_e", "read_noise_e")
+    ]
+    depth = equal_depth(stated, used)
+    return (*facts, *([] if depth is None else [EqualFact("camera.bit_depth", stated.bit_depth, depth)]))

@@ -7,6 +7,8 @@ import multiprocessing
 import os
 import pickle
 import signal
+import socket
+import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import (
@@ -21,6 +23,8 @@ from concurrent.futures import (
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
+from multiprocessing import forkserver, resource_tracker
+from multiprocessing.context import BaseContext
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from firmware_iface.errors import InputError
@@ -32,7 +36,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-TASKS = "trainer.diagnosis.candidate_fits"  # what workers run
+TASKS = "trainer.diagnosis.diagnosis"  # what workers run is imported by it
 ANSWER_S = 5.0  # a Dask scheduler that has not answered by then is not there
 LOST = (
     "a process that was fitting has ended, as when memory runs out: "
@@ -134,9 +138,7 @@ def open_pool(workers: int | None = None, cluster: str | None = None) -> Iterato
     if count == 1:
         yield Pool(_ThisProcess(), 1, elsewhere=False)
         return
-    executor = _Processes(count, multiprocessing.get_context("spawn"), _single_threaded)
-    for _ in range(count):  # they import what they need while this process looks at the captures
-        executor.submit(_ready)
+    executor = _Processes(count, _beginning(), _single_threaded)
     try:
         yield Pool(executor, count)
     except BaseException:
@@ -161,7 +163,7 @@ def _cluster(address: str) -> Iterator[Pool]:
         client = Client(address, timeout=ANSWER_S, set_as_default=False)
     except Exception as error:  # whatever a stranger at that address may have said
         raise InputError(
-            f"no Dask scheduler answers at {address!r} ({_refusal(error)}): start one, or leave --cluster out"
+            f"no Dask scheduler answers at {address!r} ({_refusal(error, address)}): start one, or leave --cluster out"
         ) from error
     try:
         _prepare(client, address)
@@ -172,15 +174,16 @@ def _cluster(address: str) -> Iterator[Pool]:
         client.close(timeout=ANSWER_S)
 
 
-def _refusal(error: BaseException) -> str:
+def _refusal(error: BaseException, address: str) -> str:
     """Why there is no scheduler: nobody answers, or somebody else does."""
-    causes = []
-    cause: BaseException | None = error
-    while cause is not None and cause not in causes:
-        causes.append(cause)
-        cause = cause.__cause__ or cause.__context__
-    if any(isinstance(one, ConnectionRefusedError) or "refused" in str(one).lower() for one in causes):
+    from distributed.comm import get_address_host_port
+
+    try:  # Dask's last attempt may have ended with its time, before it was refused
+        socket.create_connection(get_address_host_port(address), ANSWER_S).close()
+    except ConnectionRefusedError:
         return "nobody answers there: the connection was refused"
+    except (OSError, ValueError):
+        pass  # `error` says more
     if isinstance(error, TimeoutError) and not str(error):
         return f"nobody answers there within {ANSWER_S:g} s"
     known = str(error) if isinstance(error, OSError | ValueError) else ""
@@ -242,13 +245,21 @@ class _Processes(ProcessPoolExecutor):
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
         """The future of a call; starts a process where one is missing."""
-        if not hasattr(signal, "pthread_sigmask"):  # Windows
+        with _without_ctrl_c():
             return super().submit(fn, *args, **kwargs)
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # processes inherit it
-        try:
-            return super().submit(fn, *args, **kwargs)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _without_ctrl_c() -> Iterator[None]:
+    """Processes that are started here do not hear Ctrl-C."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # processes inherit it
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _packed(task: bytes) -> bytes:
@@ -263,9 +274,19 @@ def _packed(task: bytes) -> bytes:
     return pickle.dumps(function(*arguments))
 
 
-def _ready() -> None:
-    """Imports what the first task needs."""
-    import_module(TASKS)
+def _beginning() -> BaseContext:
+    """How processes begin: as copies of one that imports what tasks need, while this one looks at the captures."""
+    if sys.platform != "linux":  # elsewhere a copy of a process that holds numerical libraries may fail
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([TASKS])
+    try:
+        resource_tracker.ensure_running()  # first, because its start lets Ctrl-C through again
+        with _without_ctrl_c():
+            forkserver.ensure_running()
+    except OSError:  # the path of the temporary folder is too long for a socket
+        return multiprocessing.get_context("spawn")
+    return context
 
 
 def _single_threaded() -> None:
