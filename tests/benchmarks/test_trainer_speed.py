@@ -26,7 +26,7 @@ from trainer.captures.acquire import acquire_from
 from trainer.captures.batches import load
 from trainer.captures.capture_set import read_captures
 from trainer.captures.held_out import capture_roles
-from trainer.diagnosis.explanation import add_from
+from trainer.diagnosis.addition import add_from
 from trainer.diagnosis.screen import screen_batches
 from trainer.effects import catalogue
 from trainer.fitting.gains import with_gains

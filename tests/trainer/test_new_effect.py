@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from firmware_iface.errors import InputError
-from trainer.diagnosis.explanation import add
+from trainer.diagnosis.addition import add
 from trainer.effects import effect_catalogue as registry
 from trainer.effects import testing
 from trainer.effects.definition import Effect

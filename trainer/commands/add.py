@@ -34,15 +34,15 @@ def run(args: Namespace, screen: Screen) -> Result:
     from trainer.effects.effect_catalogue import catalogue, find_effect
 
     effect = find_effect(catalogue(args.effects), args.effect)
-    captures, known, model = inputs_of(args)
+    captures, _, model = inputs_of(args)
     note_what_is_used(captures, screen)
     from trainer.captures.capture_origin import origin
-    from trainer.diagnosis.explanation import add
+    from trainer.diagnosis.addition import add
     from trainer.model.model_file import write_model
 
     use_every_core()
     with screen.progress(f"adding {effect.name}") as progress:
-        found = add(captures, model, effect, known, progress)
+        found = add(captures, model, effect, progress)
     write_model(args.out, found.model, origin(captures))
     return found.as_json()
 

@@ -42,12 +42,13 @@ def options(parser: ArgumentParser) -> None:
 def run(args: Namespace, screen: Screen) -> Result:
     """What is missing from a model."""
     thresholds = thresholds_of(args)
-    captures, known, model = inputs_of(args)
-    from trainer.diagnosis.diagnosis import diagnose
     from trainer.fitting.pool import open_pool
 
-    # First: a cluster that does not answer is known at once, before the pictures are looked at.
+    # First: a cluster that does not answer is known at once, and processes begin while this one reads.
     with open_pool(workers_of(args), args.cluster) as pool:
+        captures, known, model = inputs_of(args)
+        from trainer.diagnosis.diagnosis import diagnose
+
         note_what_is_used(captures, screen)
         refuse_misread(args.captures, screen)
         with screen.progress("diagnosing") as progress:

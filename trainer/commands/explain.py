@@ -31,6 +31,7 @@ from trainer.commands.workers import worker_options, workers_of
 
 if TYPE_CHECKING:
     from trainer.effects.effect_catalogue import Catalogue
+    from trainer.fitting.pool import Pool
     from trainer.model.model import Model
 
 
@@ -62,15 +63,26 @@ def run(args: Namespace, screen: Screen) -> Result:
     Interrupted
         After Ctrl-C, with a sentence on the model that is left.
     """
+    from trainer.fitting.pool import open_pool
+
+    added: list[list[str]] = []
+    try:
+        # First: a cluster that does not answer is known at once, and processes begin while this one reads.
+        with open_pool(workers_of(args), args.cluster) as pool:
+            return _explain_on(args, screen, pool, added)
+    except KeyboardInterrupt:
+        raise Interrupted(_interrupted(added, args)) from None
+
+
+def _explain_on(args: Namespace, screen: Screen, pool: Pool, added: list[list[str]]) -> Result:
+    """Each model that is written appends the names of its effects that were not there at the beginning to `added`."""
     thresholds = thresholds_of(args)
     captures, known, model = inputs_of(args)
     from trainer.captures.capture_origin import origin
     from trainer.diagnosis.explanation import explain
-    from trainer.fitting.pool import open_pool
     from trainer.model.model_file import write_model
 
     source = origin(captures)
-    saved: list[tuple[str, ...]] = []
     replaced = _excess_there(args, known)
 
     def save(better: Model, is_last: bool = False) -> None:
@@ -81,31 +93,26 @@ def run(args: Namespace, screen: Screen) -> Result:
             return
         with ctrl_c_waits():
             write_model(args.out, better, source)
-            saved.append(better.names)
+            added.append([name for name in better.names if name not in model.names])
 
-    try:
-        # First: a cluster that does not answer is known at once, before the pictures are looked at.
-        with open_pool(workers_of(args), args.cluster) as pool:
-            note_what_is_used(captures, screen)
-            refuse_misread(args.captures, screen)
-            with screen.progress("explaining") as progress:
-                found = explain(captures, model, known, pool, thresholds, save, progress, args.learn)
-        save(found.model, is_last=True)
-        if args.report:
-            from trainer.diagnosis.comparison import compare
-            from trainer.diagnosis.diagnosis import with_previews
-            from trainer.report import write_report
+    note_what_is_used(captures, screen)
+    refuse_misread(args.captures, screen)
+    with screen.progress("explaining") as progress:
+        found = explain(captures, model, known, pool, thresholds, save, progress, args.learn)
+    save(found.model, is_last=True)
+    if args.report:
+        from trainer.diagnosis.comparison import compare
+        from trainer.diagnosis.diagnosis import with_previews
+        from trainer.report import write_report
 
-            write_report(
-                args.report,
-                f"Explanation: {captures.folder.name}",
-                comparison=compare(captures, found.model),
-                diagnosis=with_previews(captures, found.diagnosis),
-                ladder=found.as_json(args.out),
-                model=found.model,
-            )
-    except KeyboardInterrupt:
-        raise Interrupted(_interrupted(saved, model.names, args)) from None
+        write_report(
+            args.report,
+            f"Explanation: {captures.folder.name}",
+            comparison=compare(captures, found.model),
+            diagnosis=with_previews(captures, found.diagnosis),
+            ladder=found.as_json(args.out),
+            model=found.model,
+        )
     return {**found.as_json(args.out), "effects": _sizes(found.model)}
 
 
@@ -138,14 +145,13 @@ def _excess_there(args: Namespace, known: Catalogue) -> float | None:
     return excess if isinstance(excess, float) else None
 
 
-def _interrupted(saved: list[tuple[str, ...]], before: tuple[str, ...], args: Namespace) -> str:
-    """What is left of an `explain` after Ctrl-C: `saved` are the effects of each model that was written."""
+def _interrupted(added: list[list[str]], args: Namespace) -> str:
+    """What is left of an `explain` after Ctrl-C: `added` are the new effects of each model that was written."""
     out = args.out
-    if not saved:
+    if not added:
         kept = f"{out} is as it was" if out.exists() else "nothing was written"
         return f"interrupted before anything was added; {kept}"
-    added = [name for name in saved[-1] if name not in before]
-    begin = f"interrupted after adding {', '.join(added)}" if added else "interrupted"
+    begin = f"interrupted after adding {', '.join(added[-1])}" if added[-1] else "interrupted"
     line = command_line("explain", args.captures, "--out", out, "--overwrite", args=args, model=out)
     return f"{begin}; the model so far is in {out}; go on with: {line}"
 

@@ -14,10 +14,11 @@ from trainer.captures.bench_file import Camera
 from trainer.captures.camera_numbers import camera_of_residual
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import CaptureRoles, capture_roles, scenes
-from trainer.diagnosis.bench_facts import EqualFact, EqualFacts, equal_facts
+from trainer.diagnosis.bench_facts import EqualFact, EqualFacts, camera_facts, equal_facts
+from trainer.diagnosis.candidate_fits import CandidateFit
 from trainer.diagnosis.previews import CandidatePreview, previews
 from trainer.diagnosis.probes import ProbeResult, probe
-from trainer.diagnosis.ranking import RankedEffect, rank, try_all, try_together_with_present
+from trainer.diagnosis.ranking import RankedEffect, raise_orders, rank, try_all, try_together_with_present
 from trainer.diagnosis.screen import ScreenResult, screen
 from trainer.diagnosis.separate import captures_that_separate
 from trainer.diagnosis.table_facts import DRIFT, exposure_facts, facts_sentence, plane_facts
@@ -32,6 +33,10 @@ from trainer.model.model import Model
 from trainer.model.parameters import describe
 
 FITTED_FIRST = 5  # candidates fitted after the screen; all of them when none of these explains anything
+# An explanation asks for no other candidate where one leaves at most this share of the excess: either nothing that is
+# worth adding, or enough for another look at all of them. At first it fits those that the screen expects to remove at
+# least this share of what the best one does.
+SETTLES, RIVALS = 0.1, 0.5
 
 
 @dataclass(frozen=True)
@@ -61,6 +66,8 @@ class Diagnosis:
         or wavelength does.
     table_facts : tuple of EqualFact
         Planes and exposures of captures.csv that the captures contradict, with what they should be.
+    camera_facts : tuple of EqualFact
+        Numbers of bench.toml's camera that repeated captures contradict.
     """
 
     model: Model
@@ -77,6 +84,7 @@ class Diagnosis:
     equal_facts: EqualFacts = field(default_factory=EqualFacts)
     previews: tuple[CandidatePreview, ...] = ()
     table_facts: tuple[EqualFact, ...] = ()
+    camera_facts: tuple[EqualFact, ...] = ()
 
     @property
     def best(self) -> RankedEffect | None:
@@ -128,7 +136,7 @@ class Diagnosis:
 
         Keys `heldout`, `held_out` (false where the captures hold one pattern), `verdict`, `stage`, `stages`,
         `ranking`, `suggested_captures`, `ideal_excess`, `thresholds`,
-        `screen`, `equal_facts`, `table_facts` and `sentence`.
+        `screen`, `equal_facts`, `table_facts`, `camera_facts` and `sentence`.
         """
         return {
             "heldout": self.held_out.as_json(),
@@ -143,6 +151,7 @@ class Diagnosis:
             "screen": [{"effect": s.effect, "excess_removed": s.removed_excess} for s in self.screened],
             "equal_facts": [f.as_json() for f in self.equal_facts.facts],
             "table_facts": [f.as_json() for f in self.table_facts],
+            "camera_facts": [f.as_json() for f in self.camera_facts],
             "sentence": self.sentence,
         }
 
@@ -194,8 +203,9 @@ def diagnose(
     ideal : PredictionErrors, optional
         The ideal model's held-out errors, where they are known.
     with_probes : bool
-        False leaves out what the verdict does not need: the stages' free-form probes unless nothing named fits, and
-        all of it for a complete model.
+        False leaves out what the next step of an explanation does not need: the stages' free-form probes and the
+        distances of single planes unless nothing named fits, candidates of which the screen says little where another
+        one leaves next to nothing, and all of it for a complete model.
     screened : sequence of ScreenResult, optional
         What `screen_candidates` says of this very model, where it was asked before.
     """
@@ -226,6 +236,7 @@ def diagnose(
             is_held_out=roles.is_held_out,
             equal_facts=same,
             table_facts=_exposures(roles, model, model.names),
+            camera_facts=camera_facts(captures),
         )
 
     if screened is None:
@@ -236,12 +247,28 @@ def diagnose(
     ] or order[:1]
     # The screen says little of an effect whose derivatives do not reach, or that shows from capture to capture only.
     blind = [s for s in order if known[s.effect].rugged or known[s.effect].measure]
-    first = promising + [s for s in blind if s not in promising]
-    fits = try_all(roles, model, before, first[:2] if little else first, pool, report, 0.3, 0.6)
+    unseen = [s for s in blind if s not in promising]
+    near = [s for s in promising if with_probes or s.removed_excess > RIVALS * order[0].removed_excess]
+    first = (promising + unseen)[:2] if little else near + (unseen if with_probes else [])
+
+    def settled(fits: Sequence[CandidateFit]) -> bool:
+        left = min((f.held_out.excess for f in fits), default=before.excess)
+        least, most = thresholds.least(ideal_excess), thresholds.complete_excess
+        return left < SETTLES * before.excess and not least < left < most
+
+    def raised(fits: Sequence[CandidateFit]) -> list[CandidateFit]:
+        return raise_orders(roles, model, before, fits, pool, lambda _: report(0.6, "raising orders"))
+
+    fits = try_all(roles, model, first, pool, report, 0.3, 0.5)
+    if not (little or settled(fits)):
+        second = [s for s in promising + unseen if s not in first]
+        fits += try_all(roles, model, second, pool, report, 0.5, 0.6)
+    if with_probes or not settled(fits):
+        fits = raised(fits)
     ranking = rank(before, fits, known, thresholds, ideal_excess, len(screened))
     if not complete and not any(r.worth_adding for r in ranking):
         rest = [s for s in order if s.effect not in {f.effect for f in fits}]
-        fits += try_all(roles, model, before, rest, pool, report, 0.6, 0.7)
+        fits += raised(try_all(roles, model, rest, pool, report, 0.6, 0.7))
         ranking = rank(before, fits, known, thresholds, ideal_excess, len(screened))
         if model.present and not any(r.worth_adding for r in ranking):
             report(0.7, "fitting candidates and present effects together")
@@ -261,7 +288,7 @@ def diagnose(
         telling = [p for p in probes if thresholds.worth_adding(p.removed, ideal_excess, len(probes))]
         stage = max(telling, key=lambda p: p.removed.value).stage if telling else None
     table: tuple[EqualFact, ...] = ()
-    if verdict != "complete":
+    if verdict == "outside_catalogue" or (with_probes and verdict == "missing"):
         best = min([before, *(f.held_out for f in fits)], key=lambda e: e.excess)
         table = plane_facts(roles, model, best, known, pool, thresholds, ideal_excess)
     drifts = [f.effect for f in fits if f.held_out.excess < before.excess]
@@ -283,6 +310,7 @@ def diagnose(
         roles.is_held_out,
         same,
         table_facts=table,
+        camera_facts=camera_facts(captures),
     )
 
 

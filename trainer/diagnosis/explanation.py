@@ -1,4 +1,4 @@
-"""Adding effects to a model: one that the user names, or one after the other until nothing more is worth adding."""
+"""An explanation of captures: effects added one after the other until nothing more is worth adding."""
 
 from __future__ import annotations
 
@@ -9,64 +9,26 @@ from typing import Any
 
 from runtime.excess import PredictionErrors, removed_excess
 from runtime.program.progress import Progress, no_progress, part_of
-from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet
-from trainer.captures.capture_table import Capture
-from trainer.captures.held_out import FIT_CAPTURES, CaptureRoles, capture_roles, scenes, split, with_stopping
+from trainer.captures.held_out import CaptureRoles, capture_roles
+from trainer.diagnosis.addition import add_from, gone_on, with_maps_again
 from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors, screen_candidates
 from trainer.diagnosis.learned_rest import LearnedRest, learn_rest
 from trainer.diagnosis.ranking import RankedEffect
-from trainer.diagnosis.screen import ScreenResult, screen_batches
 from trainer.diagnosis.together import explain_together, is_far
 from trainer.diagnosis.unnecessary import without_one
 from trainer.diagnosis.verdict import Thresholds, below_the_noise
-from trainer.effects.definition import Effect
 from trainer.effects.effect_catalogue import Catalogue
-from trainer.fitting.free_form_effects import can_go_on, refined, with_free_form
+from trainer.fitting.free_form_effects import can_go_on
 from trainer.fitting.gains import with_gains
-from trainer.fitting.gauss_newton import with_measured_values
 from trainer.fitting.pool import Pool
 from trainer.fitting.predictor import evaluate_captures
-from trainer.fitting.refit import fit_from, least_for_order, raise_order, settled
+from trainer.fitting.refit import next_order
 from trainer.model.history import recorded
-from trainer.model.model import EffectInstance, Model
-from trainer.model.parameters import json_values
+from trainer.model.model import Model
 
 MOST_EFFECTS = 8  # an explanation longer than this explains nothing
 NEAR = 0.7  # of the excess that the best candidate removes: a candidate that removes so much is near
-
-
-@dataclass(frozen=True)
-class Addition:
-    """An effect that was added to a model.
-
-    Attributes
-    ----------
-    effect : str
-        Name of the effect.
-    model : Model
-        With the effect, and everything refitted.
-    before, after : PredictionErrors
-        On the held-out captures, without and with the effect.
-    is_held_out : bool
-        False where there is only one pattern, so that what is judged is what was fitted.
-    """
-
-    effect: str
-    model: Model
-    before: PredictionErrors
-    after: PredictionErrors
-    is_held_out: bool = True
-
-    def as_json(self) -> dict[str, Any]:
-        """The object that `add --json` prints: keys `before`, `after`, `parameters` and `held_out`."""
-        present = self.model.instance(self.effect)
-        return {
-            "before": self.before.as_json(),
-            "after": self.after.as_json(),
-            "parameters": json_values(present, self.model.bench),
-            "held_out": self.is_held_out,
-        }
 
 
 @dataclass(frozen=True)
@@ -136,7 +98,8 @@ class Explanation:
         """The object that `explain --json` prints.
 
         Keys `steps`, `verdict`, `stage`, `noise_nrmse`, `model`, `sentence`, `held_out` (false where the captures
-        hold one pattern), `suggested_captures`, `equal_facts`, `table_facts`, and `learned` where that was asked for.
+        hold one pattern), `suggested_captures`, `equal_facts`, `table_facts`, `camera_facts`, and `learned` where that
+        was asked for.
         """
         return {
             "steps": [s.as_json() for s in self.steps],
@@ -151,99 +114,9 @@ class Explanation:
             ),
             "equal_facts": [f.as_json() for f in self.diagnosis.equal_facts.facts],
             "table_facts": [f.as_json() for f in self.diagnosis.table_facts],
+            "camera_facts": [f.as_json() for f in self.diagnosis.camera_facts],
             **({} if self.learned is None else {"learned": self.learned.as_json()}),
         }
-
-
-def add(
-    captures: CaptureSet,
-    model: Model,
-    effect: Effect,
-    known: Catalogue | None = None,
-    progress: Progress | None = None,
-) -> Addition:
-    """Add one effect to a model and refit all of its effects; an effect that is already there is refitted.
-
-    Parameters
-    ----------
-    progress : callable, optional
-        Called with the share that is done and what is being done.
-    """
-    report = progress or no_progress
-    roles = capture_roles(captures)
-    model = with_gains(captures, model, roles.fitted)
-    before = evaluate_captures(captures, roles.held_out, model)
-    report(0.1, f"finding where {effect.name} starts")
-    if effect.name in model.names:
-        start = model.instance(effect.name)
-    else:
-        screened: list[ScreenResult] = screen_batches(load(captures, roles.screened), model, (effect,))
-        start = screened[0].start
-    report(0.3, f"fitting {effect.name}")
-    added = add_from(roles, model, start)
-    after = evaluate_captures(captures, roles.held_out, added)
-    report(0.7, f"looking whether the map of {effect.name} goes on")
-    limits = Thresholds()
-    added, after = gone_on(roles, added, effect.name, after, limits) or (added, after)
-    added = recorded(added, effect.name, after)
-    report(1.0, "done")
-    return Addition(effect.name, added, before, after, roles.is_held_out)
-
-
-def add_from(roles: CaptureRoles, model: Model, start: EffectInstance) -> Model:
-    """The model with an effect fitted from a start, its order raised, and everything present refitted together."""
-    batches = load(roles.captures, roles.fitted)
-    name = start.effect.name
-    fitted = fit_from(model, start, batches)
-    fitted = raise_order(fitted, name, batches, least_for_order)
-    model = settled(fitted.model, batches).model if len(fitted.model.names) > 1 else fitted.model
-    by_pixel = [p.effect.name for p in model.present if any(q.per_pixel for q in p.effect.parameters)]
-    if by_pixel:  # a number for each pixel asks for all pictures that there are
-        model = with_measured_values(model, by_pixel, load(roles.captures, split(roles.captures).fitted))
-    return model
-
-
-def gone_on(
-    roles: CaptureRoles, model: Model, name: str, errors: PredictionErrors, thresholds: Thresholds
-) -> tuple[Model, PredictionErrors] | None:
-    """The model with an effect's map gone on in free form, and its held-out errors, where held-out captures say so.
-
-    Parameters
-    ----------
-    errors : PredictionErrors
-        Of `model` on the held-out captures.
-
-    Returns
-    -------
-    (Model, PredictionErrors) or None
-        None where the effect has no map, or where nothing is left that a map is worth.
-    """
-    present = model.instance(name)
-    if present.effect.free_form is None or present.nodes is not None or not roles.is_held_out:
-        return None
-    if thresholds.complete(errors.excess, errors.excess):
-        return None
-    first, last = with_stopping(_worst_first(roles, model), FIT_CAPTURES)
-    further = with_free_form(model, name, load(roles.captures, first), load(roles.captures, last))
-    if further is None:
-        return None
-    after = evaluate_captures(roles.captures, roles.held_out, further)
-    worth = thresholds.worth_adding(removed_excess(errors, after), errors.excess, 1)
-    return (further, after) if worth else None
-
-
-def _worst_first(roles: CaptureRoles, model: Model) -> list[Capture]:
-    """The probed captures, worst predicted ones first; the second worst of each colour and plane stands at the end.
-
-    A spot or a grating may say nothing of a map: what a map is fitted to, and what says when to stop, must.
-    """
-    ordered = []
-    for scene in scenes(roles.probed):
-        rows = [c for c in roles.probed if (c.channel, c.plane_mm) == scene]
-        excess = {c.capture: evaluate_captures(roles.captures, [c], model).excess for c in rows}
-        rows.sort(key=lambda c: -excess[c.capture])
-        ordered += rows[:1] + rows[2:] + rows[1:2]
-    return ordered
 
 
 def explain(
@@ -336,9 +209,11 @@ def explain(
             continue
         report_share(0.9, f"adding {best.effect.name}")
         best, candidate, after = _added(roles, found)
-        candidate, after = _with_maps_again(roles, candidate, after)
-        further = gone_on(roles, candidate, best.effect.name, after, found.thresholds)
-        candidate, after = further or (candidate, after)
+        candidate, after = with_maps_again(roles, candidate, after)
+        # A map whose next order did not help is looked at again only where nothing else fits.
+        if next_order(candidate.instance(best.effect.name)) is None:
+            further = gone_on(roles, candidate, best.effect.name, after, found.thresholds)
+            candidate, after = further or (candidate, after)
         if not found.thresholds.worth_adding(removed_excess(errors, after), ideal.excess, 1):
             break
         errors = after
@@ -391,15 +266,3 @@ def _any_gone_on(
         if further is not None:
             found.append((name, *further))
     return min(found, key=lambda one: one[2].excess, default=None)
-
-
-def _with_maps_again(
-    roles: CaptureRoles, model: Model, errors: PredictionErrors
-) -> tuple[Model, PredictionErrors]:
-    """The model with the maps that it has fitted again, next to a new effect: they give back what was not theirs."""
-    if all(p.nodes is None for p in model.present):
-        return model, errors
-    first, last = with_stopping(_worst_first(roles, model), FIT_CAPTURES)
-    again = refined(model, load(roles.captures, first), load(roles.captures, last))
-    after = evaluate_captures(roles.captures, roles.held_out, again)
-    return (again, after) if after.excess < errors.excess else (model, errors)

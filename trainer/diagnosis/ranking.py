@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -75,19 +75,16 @@ class RankedEffect:
 def try_all(
     roles: CaptureRoles,
     model: Model,
-    before: PredictionErrors,
     screened: Sequence[ScreenResult],
     pool: Pool,
     report: Progress,
     start: float,
     end: float,
 ) -> list[CandidateFit]:
-    """Fit candidates at their lowest order, then raise the order of those that do about as well as the best.
+    """Fit candidates at their lowest order.
 
     Parameters
     ----------
-    before : PredictionErrors
-        Held-out errors of `model`.
     report : callable
         Called with the share of the whole diagnosis that is done, and what is being done.
     start, end : float
@@ -102,9 +99,30 @@ def try_all(
         report(start + (end - start) * count / max(1, len(screened)), "fitting candidates")
 
     tasks = [(roles.folder, ids, held, model, s.start, False) for s in screened]
-    fits = pool.map(try_effect, tasks, fitted)
+    return pool.map(try_effect, tasks, fitted)
+
+
+def raise_orders(
+    roles: CaptureRoles,
+    model: Model,
+    before: PredictionErrors,
+    fits: Sequence[CandidateFit],
+    pool: Pool,
+    tick: Callable[[int], None],
+) -> list[CandidateFit]:
+    """Raise the order of the fitted candidates that do about as well as the best.
+
+    Parameters
+    ----------
+    before : PredictionErrors
+        Held-out errors of `model`.
+    tick : callable
+        Called with how many are done.
+    """
     if not fits:
         return []
+    ids = tuple(c.capture for c in roles.fitted)
+    held = tuple(c.capture for c in roles.held_out)
     least, most = min(f.held_out.excess for f in fits), before.excess
     again = [
         k
@@ -123,10 +141,8 @@ def try_all(
         )
         for k in again
     ]
-    raised = pool.map(try_effect, tasks, lambda count: report(end, "raising orders"))
-    for k, better in zip(again, raised, strict=True):
-        fits[k] = better
-    return fits
+    better = dict(zip(again, pool.map(try_effect, tasks, tick), strict=True))
+    return [better.get(k, f) for k, f in enumerate(fits)]
 
 
 def try_together_with_present(

@@ -22,7 +22,7 @@ from trainer.effects.own_effect import starts_of
 from trainer.fitting.jacobian import keys_of, slopes_of, weighted_residuals
 from trainer.fitting.least_squares_gain import with_gain
 from trainer.fitting.many_numbers import ManySlopes, has_many
-from trainer.fitting.predictor import Predictor
+from trainer.fitting.predictor import Predictor, lights_of
 from trainer.fitting.start_points import start_cost, start_points
 from trainer.model.model import EffectInstance, Model, absent, instance_with
 from trainer.prediction.predict import Trace
@@ -92,7 +92,7 @@ def screen_batches(batches: list[Batch], model: Model, effects: tuple[Effect, ..
         start = _start(effect, model, predictors, points)
         trial = model.having(start)
         moved = [p.trace(trial, effect.stage, t) for p, t in zip(predictors, points, strict=True)]
-        trial = with_gain(trial, predictors, moved)
+        trial = with_gain(trial, predictors, lights_of(trial, predictors, moved))
         if has_many(start):
             left = _remaining_of_many(trial, effect.name, predictors, moved, present)
         else:

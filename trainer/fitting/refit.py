@@ -43,6 +43,13 @@ def least_for_order(excess: float) -> float:
     return max(0.05 * excess, 1e-5)
 
 
+def next_order(present: EffectInstance) -> int | None:
+    """The order that an effect's map or curve is raised to next; None where there is none, or free form goes on."""
+    higher = [o for o in present.effect.orders if o > present.order]
+    ended = present.effect.free_form is not None and present.order >= POLYNOMIALS
+    return None if not higher or ended or present.nodes is not None else higher[0]
+
+
 def raise_order(
     fitted: FitResult,
     name: str,
@@ -65,11 +72,10 @@ def raise_order(
     """
     while True:
         present = fitted.model.instance(name)
-        higher = [o for o in present.effect.orders if o > present.order]
-        ended = present.effect.free_form is not None and present.order >= POLYNOMIALS
-        if not higher or ended or present.nodes is not None:
+        higher = next_order(present)
+        if higher is None:
             return fitted
-        trial = fitted.model.having(raised(present, fitted.model.bench, higher[0]))
+        trial = fitted.model.having(raised(present, fitted.model.bench, higher))
         better = fit(trial, free or [name], batches, iterations=8)
         if fitted.errors.excess - better.errors.excess < gain_needed(fitted.errors.excess):
             return fitted

@@ -20,11 +20,12 @@ from trainer.captures.capture_set import CaptureSet, chosen, opened
 from trainer.captures.check_set import check_captures
 from trainer.captures.held_out import capture_roles
 from trainer.captures.problems import Problem
+from trainer.diagnosis.addition import add
 from trainer.diagnosis.candidate_fits import try_effect
 from trainer.diagnosis.capture_errors import CaptureErrors, capture_errors
 from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors, with_previews
 from trainer.diagnosis.error_budget import error_budget
-from trainer.diagnosis.explanation import add, explain
+from trainer.diagnosis.explanation import explain
 from trainer.diagnosis.previews import CandidatePreview, previews
 from trainer.diagnosis.ranking import RankedEffect, rank
 from trainer.diagnosis.screen import screen_batches
@@ -146,7 +147,7 @@ def add_effect(
     """What `add` does; with the verdict where the model is then complete."""
     captures, known = _begin(folder, effects)
     model = _recorded_start(captures, model)
-    found = add(captures, model, find_effect(known, name), known, _progress(say, 0.9))
+    found = add(captures, model, find_effect(known, name), _progress(say, 0.9))
     return found.model, _complete(captures, found.model, effects)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from trainer.diagnosis.explanation import add
+from trainer.diagnosis.addition import add
 from trainer.effects import testing
 from trainer.effects.effect_catalogue import load_effects
 from trainer.model.model import Model

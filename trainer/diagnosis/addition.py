@@ -1,0 +1,159 @@
+"""Adding one effect to a model: fitted from a start, its order raised, its map gone on in free form where that pays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from runtime.excess import PredictionErrors, removed_excess
+from runtime.program.progress import Progress, no_progress
+from trainer.captures.batches import load
+from trainer.captures.capture_set import CaptureSet
+from trainer.captures.capture_table import Capture
+from trainer.captures.held_out import FIT_CAPTURES, CaptureRoles, capture_roles, scenes, split, with_stopping
+from trainer.diagnosis.screen import ScreenResult, screen_batches
+from trainer.diagnosis.verdict import Thresholds
+from trainer.effects.definition import Effect
+from trainer.fitting.free_form_effects import refined, with_free_form
+from trainer.fitting.gains import with_gains
+from trainer.fitting.gauss_newton import with_measured_values
+from trainer.fitting.predictor import evaluate_captures
+from trainer.fitting.refit import fit_from, least_for_order, raise_order, settled
+from trainer.model.history import recorded
+from trainer.model.model import EffectInstance, Model
+from trainer.model.parameters import json_values
+
+
+@dataclass(frozen=True)
+class Addition:
+    """An effect that was added to a model.
+
+    Attributes
+    ----------
+    effect : str
+        Name of the effect.
+    model : Model
+        With the effect, and everything refitted.
+    before, after : PredictionErrors
+        On the held-out captures, without and with the effect.
+    is_held_out : bool
+        False where there is only one pattern, so that what is judged is what was fitted.
+    """
+
+    effect: str
+    model: Model
+    before: PredictionErrors
+    after: PredictionErrors
+    is_held_out: bool = True
+
+    def as_json(self) -> dict[str, Any]:
+        """The object that `add --json` prints: keys `before`, `after`, `parameters` and `held_out`."""
+        present = self.model.instance(self.effect)
+        return {
+            "before": self.before.as_json(),
+            "after": self.after.as_json(),
+            "parameters": json_values(present, self.model.bench),
+            "held_out": self.is_held_out,
+        }
+
+
+def add(
+    captures: CaptureSet,
+    model: Model,
+    effect: Effect,
+    progress: Progress | None = None,
+) -> Addition:
+    """Add one effect to a model and refit all of its effects; an effect that is already there is refitted.
+
+    Parameters
+    ----------
+    progress : callable, optional
+        Called with the share that is done and what is being done.
+    """
+    report = progress or no_progress
+    roles = capture_roles(captures)
+    model = with_gains(captures, model, roles.fitted)
+    before = evaluate_captures(captures, roles.held_out, model)
+    report(0.1, f"finding where {effect.name} starts")
+    if effect.name in model.names:
+        start = model.instance(effect.name)
+    else:
+        screened: list[ScreenResult] = screen_batches(load(captures, roles.screened), model, (effect,))
+        start = screened[0].start
+    report(0.3, f"fitting {effect.name}")
+    added = add_from(roles, model, start)
+    after = evaluate_captures(captures, roles.held_out, added)
+    report(0.7, f"looking whether the map of {effect.name} goes on")
+    limits = Thresholds()
+    added, after = gone_on(roles, added, effect.name, after, limits) or (added, after)
+    added = recorded(added, effect.name, after)
+    report(1.0, "done")
+    return Addition(effect.name, added, before, after, roles.is_held_out)
+
+
+def add_from(roles: CaptureRoles, model: Model, start: EffectInstance) -> Model:
+    """The model with an effect fitted from a start, its order raised, and everything present refitted together."""
+    batches = load(roles.captures, roles.fitted)
+    name = start.effect.name
+    fitted = fit_from(model, start, batches)
+    fitted = raise_order(fitted, name, batches, least_for_order)
+    model = settled(fitted.model, batches).model if len(fitted.model.names) > 1 else fitted.model
+    by_pixel = [p.effect.name for p in model.present if any(q.per_pixel for q in p.effect.parameters)]
+    if by_pixel:  # a number for each pixel asks for all pictures that there are
+        model = with_measured_values(model, by_pixel, load(roles.captures, split(roles.captures).fitted))
+    return model
+
+
+def gone_on(
+    roles: CaptureRoles, model: Model, name: str, errors: PredictionErrors, thresholds: Thresholds
+) -> tuple[Model, PredictionErrors] | None:
+    """The model with an effect's map gone on in free form, and its held-out errors, where held-out captures say so.
+
+    Parameters
+    ----------
+    errors : PredictionErrors
+        Of `model` on the held-out captures.
+
+    Returns
+    -------
+    (Model, PredictionErrors) or None
+        None where the effect has no map, or where nothing is left that a map is worth.
+    """
+    present = model.instance(name)
+    if present.effect.free_form is None or present.nodes is not None or not roles.is_held_out:
+        return None
+    if thresholds.complete(errors.excess, errors.excess):
+        return None
+    first, last = with_stopping(_worst_first(roles, model), FIT_CAPTURES)
+    further = with_free_form(model, name, load(roles.captures, first), load(roles.captures, last))
+    if further is None:
+        return None
+    after = evaluate_captures(roles.captures, roles.held_out, further)
+    worth = thresholds.worth_adding(removed_excess(errors, after), errors.excess, 1)
+    return (further, after) if worth else None
+
+
+def _worst_first(roles: CaptureRoles, model: Model) -> list[Capture]:
+    """The probed captures, worst predicted ones first; the second worst of each colour and plane stands at the end.
+
+    A spot or a grating may say nothing of a map: what a map is fitted to, and what says when to stop, must.
+    """
+    ordered = []
+    for scene in scenes(roles.probed):
+        rows = [c for c in roles.probed if (c.channel, c.plane_mm) == scene]
+        excess = {c.capture: evaluate_captures(roles.captures, [c], model).excess for c in rows}
+        rows.sort(key=lambda c: -excess[c.capture])
+        ordered += rows[:1] + rows[2:] + rows[1:2]
+    return ordered
+
+
+def with_maps_again(
+    roles: CaptureRoles, model: Model, errors: PredictionErrors
+) -> tuple[Model, PredictionErrors]:
+    """The model with the maps that it has fitted again, next to a new effect: they give back what was not theirs."""
+    if all(p.nodes is None for p in model.present):
+        return model, errors
+    first, last = with_stopping(_worst_first(roles, model), FIT_CAPTURES)
+    again = refined(model, load(roles.captures, first), load(roles.captures, last))
+    after = evaluate_captures(roles.captures, roles.held_out, again)
+    return (again, after) if after.excess < errors.excess else (model, errors)
