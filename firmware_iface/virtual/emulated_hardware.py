@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
 from firmware_iface.virtual.bench_loading import load_bench
+from firmware_iface.virtual.bench_process import bench_process
 from firmware_iface.virtual.fault_injection import Faults
 from firmware_iface.virtual.i2c import LaserBoard
 from firmware_iface.virtual.oak import OakModel, expose_bench
 from firmware_iface.virtual.usb.panel_board import BoardModel, LitPattern
 from firmware_iface.virtual.virtual_devices import LitField
-from firmware_iface.virtual.virtual_headset import VirtualHeadset
 
 TICK_S = 0.001
 REMEMBERED = 20000  # changes of light
@@ -40,8 +40,8 @@ class EmulatedHardware:
 
     Attributes
     ----------
-    headset : VirtualHeadset
-        The simulated bench.
+    bench : BenchDescription
+        The simulated one.
     board : BoardModel
         The panel's.
     lasers : LaserBoard
@@ -58,8 +58,10 @@ class EmulatedHardware:
     """
 
     def __init__(self, bench: str, seed: int = 0) -> None:
-        self.headset = VirtualHeadset(load_bench(bench), seed)
-        self.board = BoardModel(self.headset.panel.shape)
+        self.bench = load_bench(bench)
+        self._expose = bench_process(self.bench, seed)
+        self._channels = tuple(c.name for c in self.bench.channels)
+        self.board = BoardModel((self.bench.panel.height, self.bench.panel.width))
         self.light: deque[tuple[float, float]] = deque([(time.monotonic(), 0.0)], REMEMBERED)
         self.whole: dict[int, int] = {}
         self.lit: dict[tuple[int, int], int] = {}
@@ -123,12 +125,8 @@ class EmulatedHardware:
         """One picture of the camera without its faults, uint16 counts [h, w]."""
         with self._lock:
             emitted = self.lasers.emitted_uw
-            self.headset.panel.fields = self._lit_fields(exposure_ms * 1e-3)
-            for channel in self.headset.lasers.channels:
-                share = emitted.get(channel, 0.0) / self._full_uw.get(channel, 1.0)
-                self.headset.lasers.set_power(channel, min(1.0, share))
-            self.headset.camera.exposure_ms = exposure_ms
-            return self.headset.camera.capture()
+            power = {c: min(1.0, emitted.get(c, 0.0) / self._full_uw.get(c, 1.0)) for c in self._channels}
+            return self._expose(self._lit_fields(exposure_ms * 1e-3), power, exposure_ms)
 
     def _lit_fields(self, exposure_s: float) -> tuple[LitField, ...]:
         """The patterns on the panel, with the share of an exposure that begins now in which each is lit."""
@@ -139,7 +137,7 @@ class EmulatedHardware:
                 pattern.gray,
                 sum(
                     1 << k
-                    for k, channel in enumerate(self.headset.lasers.channels)
+                    for k, channel in enumerate(self._channels)
                     if channel in names and pattern.outputs >> names.index(channel) & 1
                 ),
                 _lit_s(pattern, frame_s, into_s, into_s + exposure_s) / exposure_s,
@@ -177,8 +175,8 @@ class EmulatedHardware:
     def attach_oak(self, address: str) -> None:
         """Emulate an OAK camera in front of the bench, at a loopback address; its faults are the camera's."""
         self.oak = OakModel(
-            expose_bench(self.exposed, self.headset.description.camera),
-            self.headset.camera.shape,
+            expose_bench(self.exposed, self.bench.camera),
+            (self.bench.camera.height, self.bench.camera.width),
             address,
             frames_per_s=120.0,
             faults=self.faults["camera"],

@@ -35,7 +35,8 @@ def answer(hardware: EmulatedHardware, request: dict[str, Any], data: bytes) -> 
         case {"usb": method}:
             return _usb(hardware.board, method, request, data)
         case {"camera": "shape"}:
-            return [*hardware.headset.camera.shape, hardware.headset.camera.bit_depth], b""
+            camera = hardware.bench.camera
+            return [camera.height, camera.width, camera.bit_depth], b""
         case {"camera": "capture", "exposure_ms": exposure_ms}:
             return None, hardware.capture(exposure_ms).tobytes()
         case {"do": "break", "part": part, "kind": kind, "count": count, "after": after}:
