@@ -242,18 +242,30 @@ def _added(roles: CaptureRoles, found: Diagnosis) -> tuple[RankedEffect, Model, 
     """The effect to add, the model with it, everything refitted, and that model's held-out errors.
 
     A candidate is ranked while present effects stay as they are, and these may have taken up a part of the right one.
-    So the next best, where it comes near, is fitted together with them, too.
+    So its closest rival is fitted together with them, too.
     """
-    best, *others = found.ranking
-    near = [r for r in others if r.worth_adding and r.removed.value > NEAR * best.removed.value]
+    rival = _rival(found) if found.model.present else None
     fitted = []
-    for one in (best, *(near[:1] if found.model.present else [])):
-        model = add_from(roles, one.base, one.model.instance(one.effect.name))
-        fitted.append((one, model, evaluate_captures(roles.captures, roles.held_out, model)))
+    for one in (found.ranking[0], rival):
+        if one is not None:
+            model = add_from(roles, one.base, one.model.instance(one.effect.name))
+            fitted.append((one, model, evaluate_captures(roles.captures, roles.held_out, model)))
     first, *second = fitted
     if second and removed_excess(first[2], second[0][2]).interval()[0] > 0:
         return second[0]
     return first
+
+
+def _rival(found: Diagnosis) -> RankedEffect | None:
+    """The candidate that may be right instead of the best one.
+
+    It is the one that the screen, which lets present effects move, expects most of; or the next best, where it is near.
+    """
+    best, *others = (r for r in found.ranking if r.worth_adding)
+    expected = found.screened[0].effect if found.screened else best.effect.name
+    if expected != best.effect.name:
+        return next((r for r in others if r.effect.name == expected), None)
+    return next((r for r in others if r.removed.value > NEAR * best.removed.value), None)
 
 
 def _any_gone_on(
