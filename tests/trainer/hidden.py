@@ -9,6 +9,8 @@ from typing import Any
 import pytest
 
 from trainer.cli import main
+from trainer.effects import effect_catalogue
+from trainer.effects.effect_catalogue import Catalogue
 
 BENCH = """
 name = "bench"
@@ -72,3 +74,13 @@ def captured(
     where = folder / "captures"
     ran(capsys, "capture", "--bench", bench_file(folder, *defects, **sizes), "--out", where, *options)
     return where
+
+
+def with_few_effects(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
+    """Let commands know some effects of the catalogue only, for tests of what all of them would only make longer."""
+    known = effect_catalogue.catalogue
+
+    def few(*given: Any) -> Catalogue:
+        return {name: effect for name, effect in known(*given).items() if name in names}
+
+    monkeypatch.setattr(effect_catalogue, "catalogue", few)

@@ -9,9 +9,18 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.trainer.hidden import LARGER, bench_file, captured, ran
+from tests.trainer.hidden import LARGER, bench_file, captured, ran, with_few_effects
 from trainer.cli import main
 
+RIVALS = (
+    "distance",
+    "wavelength",
+    "panel_wavefront",
+    "spatial_coherence",
+    "sensor_blur",
+    "stray_light",
+    "laser_drift",
+)
 TWO_PLANES = ("--planes", "10,18", "--patterns", 6)
 
 
@@ -104,7 +113,8 @@ def test_images_moved_far_are_not_taken_for_the_wrong_ones(tmp_path, capsys) -> 
     assert "-31 rows and -44 columns" in problems[-1]["message"]
 
 
-def test_a_plane_that_is_misread_is_a_fact_of_the_table(tmp_path, capsys) -> None:
+def test_a_plane_that_is_misread_is_a_fact_of_the_table(tmp_path, capsys, monkeypatch) -> None:
+    with_few_effects(monkeypatch, *RIVALS)
     captures = captured(capsys, tmp_path, options=TWO_PLANES)
     table = captures / "captures.csv"
     assert ",18.0," in table.read_text()
@@ -116,14 +126,16 @@ def test_a_plane_that_is_misread_is_a_fact_of_the_table(tmp_path, capsys) -> Non
     assert "captures.csv" in found["sentence"] and "17.4" in found["sentence"]
 
 
-def test_a_distance_that_is_off_alike_is_no_fact_of_the_table(tmp_path, capsys) -> None:
+def test_a_distance_that_is_off_alike_is_no_fact_of_the_table(tmp_path, capsys, monkeypatch) -> None:
+    with_few_effects(monkeypatch, *RIVALS)
     captures = captured(capsys, tmp_path, 'kind = "distance"\noffset_mm = 0.5', options=TWO_PLANES)
     found = ran(capsys, "diagnose", captures, "--workers", 1)
     assert found["ranking"][0]["effect"] == "distance" and found["table_facts"] == []
 
 
 @pytest.mark.parametrize("drifts", [False, True])
-def test_an_exposure_that_is_misread_is_a_fact_of_the_table(drifts, tmp_path, capsys) -> None:
+def test_an_exposure_that_is_misread_is_a_fact_of_the_table(drifts, tmp_path, capsys, monkeypatch) -> None:
+    with_few_effects(monkeypatch, *RIVALS)
     secrets = ('kind = "laser_drift"',) if drifts else ()
     captures = captured(capsys, tmp_path, *secrets)
     table = captures / "captures.csv"

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tests.trainer.hidden import bench_file
+from tests.trainer.hidden import bench_file, with_few_effects
 from trainer.captures.acquire import acquire_from
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.cli import main
@@ -54,6 +54,7 @@ def interrupted_after(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     def put(added: int) -> None:
         monkeypatch.undo()
         monkeypatch.setattr("trainer.fitting.pool.cores", lambda: 1)
+        with_few_effects(monkeypatch, "distance", "zero_order", "ghost", "sensor_blur", "phase_response")
         real, calls, real_diagnose = ladder.add_from, [], ladder.diagnose
 
         def diagnose_ideal_once(captures: CaptureSet, model: Model, *given: Any, **named: Any) -> Diagnosis:
