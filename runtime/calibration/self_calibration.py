@@ -25,11 +25,12 @@ from runtime.calibration.colour_captures import (
     proof_pictures,
 )
 from runtime.calibration.drift import Drift
-from runtime.calibration.drift_fit import fit
+from runtime.calibration.drift_fit import fit, layout_of
 from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, gain_of
 from runtime.calibration.held_out_errors import HeldOutErrors, held_out_errors
+from runtime.calibration.information import measured_information
 from runtime.calibration.prediction import Predictor
-from runtime.calibration.refit import Progress, part_of, refit, start_view
+from runtime.calibration.refit import PIXELS, Progress, few, part_of, refit, start_view
 from runtime.calibration.replacement_rule import LEAST_EXCESS, Verdict, is_certain, replacement_verdict
 from runtime.calibration.response import SWEEP, Sweep
 from runtime.calibration.shown_patterns import GRAINS, HELD_OUT
@@ -197,8 +198,10 @@ def _as_it_was(
     (the rays' matrices are the same). So the old light path is checked with the scale of the camera that suits it best,
     and a refit must be better than that before it replaces anything.
     """
-    start = Estimate(Drift(), view)
-    rigid, scaled = (fit(bases, heldout, start, (0, 0), 5, new_view=new).estimate for new in (False, True))
+    some, start, layout = few(heldout, PIXELS[0]), Estimate(Drift(), view), layout_of(bases, (0, 0), True)
+    known = measured_information(bases, some, layout.widened(start), layout, no_progress)
+    rigid = fit(bases, some, start, (0, 0), 5, information=known).estimate
+    scaled = fit(bases, some, rigid, (0, 0), 5, new_view=True, information=known).estimate
     errors = held_out_errors(bases, heldout, scaled)
     removed = removed_excess(held_out_errors(bases, heldout, rigid).errors, errors.errors)
     matters = is_certain(removed) and removed.value > LEAST_EXCESS
