@@ -10,7 +10,14 @@ import numpy as np
 
 from runtime.calibration.colour_captures import ColourCaptures, dot_spacing
 from runtime.calibration.drift import Drift
-from runtime.calibration.drift_fit import ROUNDS, SETTLED_SHARE, DriftFit, fit, layout_of, predicted_chi_squared
+from runtime.calibration.drift_fit import (
+    ROUNDS,
+    SETTLED_SHARE,
+    DriftFit,
+    fit,
+    layout_of,
+    predicted_chi_squared,
+)
 from runtime.calibration.estimate import ColourLightPath, Estimate, Shot
 from runtime.calibration.free_form_fit import ITERATIONS, fit_freeform, iterations_over, spacings
 from runtime.calibration.held_out_errors import held_out_errors
@@ -29,7 +36,7 @@ PIXELS = (
     1_000_000,
     1_000_000,
     8_000_000,
-)  # of a colour that each of these is fitted to: two patterns at least
+)  # of all colours that each of these is fitted to: two patterns at least, and one of each colour
 NEARLY_SETTLED = 0.05  # share of chi squared by which all but the highest orders' last iteration lowers it
 TURNS = 4  # of free-form maps, and all else around them
 SCAN_MM = (
@@ -110,9 +117,10 @@ def refit(
     """
     shots = [shot for t in captures.values() for shot in t.fitted]
     estimate = Estimate(Drift(), view)
-    coarse = [t.fitted[GRAINS.index(size)] for t in captures.values() for size in sorted(GRAINS)[-2:]]
+    first = next(iter(bases))  # the distance is that of all colours
+    coarse = [captures[first].fitted[GRAINS.index(size)] for size in sorted(GRAINS)[-2:]]
     say(0.0, "distance")
-    estimate = _nearest_distance(bases, coarse, estimate)
+    estimate = _nearest_distance({first: bases[first]}, coarse, estimate)
     parts, known = len(ORDERS) + TURNS, None
     for number, orders in enumerate(ORDERS):
         say(number / parts, "phase response")
@@ -183,11 +191,13 @@ def _with_maps(
 
 
 def few(shots: Sequence[Shot], pixels: int, turn: int = 0) -> list[Shot]:
-    """As many of each colour's shots as have a number of pixels, two at least; turn after turn the next ones."""
+    """As many shots as have a number of pixels, two at least, of each colour as many; turn after turn the next ones."""
     chosen: list[Shot] = []
-    for channel in dict.fromkeys(shot.channel for shot in shots):
+    channels = list(dict.fromkeys(shot.channel for shot in shots))
+    for channel in channels:
         own = [shot for shot in shots if shot.channel == channel]
-        count = min(max(2, math.ceil(pixels / own[0].signal.size)), len(own))
+        count = max(2, math.ceil(pixels / own[0].signal.size))
+        count = min(math.ceil(count / len(channels)), len(own))
         chosen += [own[(turn * count + k) % len(own)] for k in range(count)]
     return chosen
 
