@@ -164,7 +164,8 @@ def _with_maps(
     """A fit with free-form maps and all else in turn, where held-out patterns certainly get better by them.
 
     A turn over a large panel takes a minute. It is taken only where what is left matters: an excess of 0.0003 is an
-    error of the phase of about 0.03 rad, a 200th of a wave. It is the last where it has removed next to nothing.
+    error of a 170th of a wave where it is smooth, of a 400th where it is as rough as maps can hold. It is the last
+    where it has removed next to nothing.
     """
     shots = [shot for t in captures.values() for shot in t.fitted]
     heldout = [shot for t in captures.values() for shot in t.heldout]
