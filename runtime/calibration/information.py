@@ -65,11 +65,11 @@ def measured_information(
     """
     count = int(layout.edges[-1])
     by_colour = {channel: np.zeros((count, count)) for channel in bases}
-    columns = Columns(bases, estimate, layout)
     # Where one pattern is enough, one colour is too: the others' matrices follow from its own.
     first = next(iter(bases))
     enough = len(bases) > 1 and shots[0].signal.size >= SAMPLE
     chosen = _sample([shot for shot in shots if shot.channel == first] if enough else shots)
+    columns = Columns({c: bases[c] for c in dict.fromkeys(s.channel for s, *_ in chosen)}, estimate, layout)
     for number, (shot, pixels, share) in enumerate(chosen):
         matrix = by_colour[shot.channel]
         light = columns.predictor.light(shot)
