@@ -73,7 +73,9 @@ class Predictor:
         self.readings = {}  # first let the old ones' memory go
         made: dict[object, Reading] = {}
         for name, path in self.paths.items():
-            key = (path.grid, None if path.irradiance_filter is None else name)
+            # Colours differ in their room for light to spread, which no camera sees.
+            seen = (path.grid.shape, path.grid.margin, path.grid.pitch)
+            key = (seen, None if path.irradiance_filter is None else name)
             if key not in made:
                 made[key] = Reading(
                     self.view,
