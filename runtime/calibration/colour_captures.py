@@ -8,7 +8,7 @@ import numpy as np
 
 from runtime.calibration.drift import Drift, drifted
 from runtime.calibration.estimate import ColourLightPath, Estimate, Shot
-from runtime.calibration.response import SWEEP, best_period
+from runtime.calibration.response import SWEEP, best_period, thinned
 from runtime.calibration.shown_patterns import GRAINS, HELD_OUT, grains, grating, proof_picture
 from runtime.calibration.taking import Noise, Taker
 from runtime.camera.registration import dot_pattern
@@ -48,7 +48,7 @@ class ColourCaptures:
     ----------
     dots : Shot
     sweep, fitted, heldout : lists of Shot
-        Of the gratings, the random grains, and the held-out patterns.
+        Of the gratings (of their pictures the rows that are used), the random grains, and the held-out patterns.
     exposure_ms : float, ms
     noise : Noise
         The camera's.
@@ -101,7 +101,7 @@ def colour_captures(
     noise = taker.noise(patterns.fitted[0], black, floor)
     return ColourCaptures(
         taker.shot(channel, patterns.dots, noise, f"{channel}, dots"),
-        taker.shots(channel, patterns.gratings, noise, f"{channel}, grating"),
+        taker.shots(channel, patterns.gratings, noise, f"{channel}, grating", thinned),
         taker.shots(channel, patterns.fitted, noise, f"{channel}, pattern"),
         taker.shots(channel, patterns.heldout, noise, f"{channel}, held-out pattern"),
         exposure,

@@ -67,6 +67,7 @@ class Columns:
         yield place + len(layout.view) + TERMS, np.full(light.shape, seen.mean(), np.float32)
 
         if channel not in self.moved:
+            self.moved.clear()  # a colour's buffers at a time
             self.moved[channel] = Optics(path, FINE, True, predictor.backend)
         moved = self.moved[channel]
         moved.take(path)

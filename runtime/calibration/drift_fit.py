@@ -91,6 +91,8 @@ def fit(
     new_view: bool = False,
     progress: Progress | None = None,
     information: Information | None = None,
+    rounds: int = ROUNDS,
+    settled_share: float = SETTLED_SHARE,
 ) -> DriftFit:
     """The estimate that explains the shots best. The response is held.
 
@@ -109,7 +111,11 @@ def fit(
     progress : callable, optional
         Called with the share done, 0 to 1.
     information : Information, optional
-        Of an estimate like this one, of these orders or higher; None: it is measured at the start.
+        Of an estimate like this one, of these orders or higher, for the first round; None: it is measured at the start.
+    rounds : int
+        At most.
+    settled_share : float
+        An iteration that lowers the cost by a smaller share is the last.
 
     Returns
     -------
@@ -118,13 +124,15 @@ def fit(
     layout = layout_of(bases, orders, new_view)
     estimate = layout.widened(start)
     progress = progress or no_progress
-    rounds = 1 if information else ROUNDS
     for number in range(rounds):
         share = part_of(progress, number / rounds, (number + 1) / rounds)
         first_half = part_of(share, 0.0, 0.5)
-        used = information or measured_information(bases, shots, estimate, layout, first_half)
+        known = information if number == 0 else None
+        used = known or measured_information(bases, shots, estimate, layout, first_half)
         normal = len(shots) * used.of(layout) + np.diag(layout.precision)
-        estimate, cost, settled = _descended(bases, shots, estimate, layout, normal, iterations, share)
+        estimate, cost, settled = _descended(
+            bases, shots, estimate, layout, normal, iterations, settled_share, share
+        )
         if settled:
             break
     pixels = sum(int(np.count_nonzero(s.weight)) for s in shots)
@@ -149,13 +157,14 @@ def _descended(
     layout: ParameterLayout,
     normal: np.ndarray,
     iterations: int,
+    settled_share: float,
     progress: Progress,
 ) -> tuple[Estimate, float, bool]:
     """The estimate of least cost, that cost, and whether it has settled: BFGS on numbers that `normal` makes alike.
 
     In those numbers the cost is nearly a sphere, and is scaled so that the first step is the Gauss-Newton step.
     """
-    misfit = Misfit(bases, shots)
+    misfit = Misfit(bases, shots, light=any(layout.orders))
     wavelengths = {c: b.wavelength_nm for c, b in bases.items()}
     levers = layout.levers(start.view, next(iter(bases.values())).path.grid.shape)
     upper = np.linalg.cholesky(normal).T
@@ -188,7 +197,7 @@ def _descended(
         done += 1
         progress(0.5 + 0.5 * done / iterations)
         decrease, least = least - lowest, lowest
-        settled = decrease < max(SETTLED * len(downhill) / 2, SETTLED_SHARE * least)
+        settled = decrease < max(SETTLED * len(downhill) / 2, settled_share * least)
         if settled:
             raise StopIteration
 

@@ -64,10 +64,14 @@ def measured_information(
         Called with the share done, 0 to 1.
     """
     count = int(layout.edges[-1])
-    matrix = np.zeros((count, count))
-    columns = Columns(bases, estimate, layout)
-    chosen = _sample(shots)
+    by_colour = {channel: np.zeros((count, count)) for channel in bases}
+    # Where one pattern is enough, one colour is too: the others' matrices follow from its own.
+    first = next(iter(bases))
+    enough = len(bases) > 1 and shots[0].signal.size >= SAMPLE
+    chosen = _sample([shot for shot in shots if shot.channel == first] if enough else shots)
+    columns = Columns({c: bases[c] for c in dict.fromkeys(s.channel for s, *_ in chosen)}, estimate, layout)
     for number, (shot, pixels, share) in enumerate(chosen):
+        matrix = by_colour[shot.channel]
         light = columns.predictor.light(shot)
         gain, root = gain_of(shot, light), np.sqrt(shot.weight).ravel()[pixels]
         along = root * light.ravel()[pixels]
@@ -80,7 +84,38 @@ def measured_information(
         for begin in range(0, along.size, BLOCK):
             block = rows[:, begin : begin + BLOCK].astype(np.float64)
             matrix += block @ block.T / share
-    return Information(layout, matrix / len(shots))
+    if enough:
+        for channel in list(bases)[1:]:
+            by_colour[channel] = _of_another_colour(by_colour[first], layout, bases, first, channel)
+    return Information(layout, np.sum(list(by_colour.values()), 0) / len(shots))
+
+
+def _of_another_colour(
+    matrix: np.ndarray,
+    layout: ParameterLayout,
+    bases: Mapping[str, ColourLightPath],
+    known: str,
+    channel: str,
+) -> np.ndarray:
+    """The information of a colour's captures, from that of as many of another colour's.
+
+    Both show like patterns at like exposures. A path difference turns the phase by its share of a wavelength, and a
+    distance turns it, at each frequency, the more the longer the wavelength.
+    """
+    ratio = bases[channel].wavelength_nm / bases[known].wavelength_nm
+    waves, beams, end = int(layout.edges[1]), int(layout.edges[2]), int(layout.edges[4])
+
+    def places(name: str) -> np.ndarray:
+        beam = waves + layout.channels.index(name) * layout.amplitude
+        return np.r_[0:waves, beam : beam + layout.amplitude, beams:end]
+
+    scale = np.ones(end)
+    scale[:waves], scale[beams] = 1 / ratio, ratio
+    scale, found = scale[places(channel)], np.zeros_like(matrix)
+    found[np.ix_(places(channel), places(channel))] = (
+        scale[:, None] * matrix[np.ix_(places(known), places(known))] * scale
+    )
+    return found
 
 
 def _sample(shots: Sequence[Shot]) -> list[tuple[Shot, np.ndarray | slice, float]]:

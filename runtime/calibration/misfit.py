@@ -58,6 +58,9 @@ class Misfit:
         Of the camera's `sampler`.
     motion : bool
         Whether slopes over the camera's motion are wanted; without, those maps are 0.
+    light : bool
+        Whether slopes over the light path are wanted; without, those are 0, the light path stays that of the first
+        estimate, and each shot's irradiance is computed once.
     """
 
     def __init__(
@@ -66,8 +69,10 @@ class Misfit:
         shots: Sequence[Shot],
         finer: int = 2,
         motion: bool = True,
+        light: bool = True,
     ) -> None:
-        self.shots, self.motion = shots, motion
+        self.shots, self.motion, self.light = shots, motion, light
+        self.images: list[np.ndarray] = []  # of each shot, where the light path stays
         self.predictor = Predictor(bases, finer, motion)
         self.axial: dict[str, np.ndarray] = {}
         for name, base in bases.items():
@@ -78,15 +83,19 @@ class Misfit:
     def at(self, estimate: Estimate) -> tuple[float, Slopes]:
         """Chi squared of an estimate, and its slopes."""
         predictor, view = self.predictor, estimate.view
-        predictor.take(estimate)
+        if self.light:
+            predictor.take(estimate)
+        else:
+            self._stay(estimate)
         over_panel = {c: np.zeros(p.grid.shape, np.complex64) for c, p in predictor.paths.items()}
         maps = np.zeros((3, *view.shape), np.float32)
         blur, total, distance, stray = np.zeros(2), 0.0, 0.0, 0.0
-        for shot in self.shots:
+        for number, shot in enumerate(self.shots):
             channel = shot.channel
             optics, reading = predictor.optics[channel], predictor.readings[channel]
-            phase = predictor.phase(shot)
-            seen = reading.read(predictor.image(channel, phase))
+            phase = predictor.phase(shot) if self.light else None
+            image = self.images[number] if phase is None else predictor.image(channel, phase)
+            seen = reading.read(image)
             light = with_stray(view, predictor.even, seen)
             gain = gain_of(shot, light)
             residual = shot.signal - np.float32(gain) * light
@@ -104,5 +113,15 @@ class Misfit:
             slope += mean
             back, of_blur = reading.adjoint(slope)
             blur += of_blur
-            distance += optics.factor_adjoint(phase, back, over_panel[channel], self.axial[channel])
+            if phase is not None:
+                distance += optics.factor_adjoint(phase, back, over_panel[channel], self.axial[channel])
         return total, Slopes(over_panel, distance, maps[0], maps[1], maps[2], blur, stray)
+
+    def _stay(self, estimate: Estimate) -> None:
+        """Keep the light path, and take an estimate's view alone."""
+        if self.images:
+            self.predictor.look(estimate.view)
+            return
+        self.predictor.take(estimate)
+        for shot in self.shots:
+            self.images.append(self.predictor.image(shot.channel, self.predictor.phase(shot)).copy())

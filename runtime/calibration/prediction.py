@@ -63,13 +63,19 @@ class Predictor:
             path = drifted(base.path, name, base.wavelength_nm, estimate.drift)
             self.optics[name].take(path)
             self.paths[name] = path
-        if estimate.view == self.view:
+        self.look(estimate.view)
+
+    def look(self, view: View) -> None:
+        """Predict by another view of the camera from now on, and the same light."""
+        if view == self.view:
             return
-        self.view, self.even = estimate.view, estimate.view.evenness().astype(np.float32)
+        self.view, self.even = view, view.evenness().astype(np.float32)
         self.readings = {}  # first let the old ones' memory go
         made: dict[object, Reading] = {}
         for name, path in self.paths.items():
-            key = (path.grid, None if path.irradiance_filter is None else name)
+            # Colours differ in their room for light to spread, which no camera sees.
+            seen = (path.grid.shape, path.grid.margin, path.grid.pitch)
+            key = (seen, None if path.irradiance_filter is None else name)
             if key not in made:
                 made[key] = Reading(
                     self.view,

@@ -81,15 +81,16 @@ def measured_sweep(predictor: Predictor, shots: Sequence[Shot]) -> Sweep:
     predictor : Predictor
         Of an estimate. All but the response is taken from it; its response says where the search starts.
     shots : sequence of Shot
-        Of gratings of one colour.
+        Of gratings of one colour, of each as many rows as `rows_apart` says.
     """
     channel = shots[0].channel
+    assert predictor.view is not None
+    every = rows_apart(predictor.view.shape)
     path = predictor.paths[channel]
     believed = np.asarray(path.response, float)
     # Where the phase is all that a gray level changes, three pictures of one grating are those of all.
     alike = path.crosstalk is None and path.modulation is None and path.gain is None
     alike = alike and all(np.array_equal(s.gray > 0, shots[0].gray > 0) for s in shots)
-    every = math.ceil(shots[0].signal.size / SAMPLE)  # rows: along them a grating is the same
     found, parts = [], None
     for shot in shots:
         gray = int(shot.gray.max())
@@ -97,10 +98,10 @@ def measured_sweep(predictor: Predictor, shots: Sequence[Shot]) -> Sweep:
         if parts is None or not alike:
             parts = _parts_of(predictor, shot, believed, 0.0 if alike else start)
         model = np.stack([m[::every].ravel() for m in parts], 1)
-        root = np.sqrt(shot.weight[::every].ravel())
+        root = np.sqrt(shot.weight.ravel())
         weighted = (model * root[:, None]).astype(np.float64)
         normal = weighted.T @ weighted
-        gain, cosine, sine = np.linalg.solve(normal, weighted.T @ (root * shot.signal[::every].ravel()))
+        gain, cosine, sine = np.linalg.solve(normal, weighted.T @ (root * shot.signal.ravel()))
         size2 = max(float(cosine**2 + sine**2), 1e-30)
         across = np.array([0.0, -sine, cosine]) / size2
         error = math.sqrt(float(across @ np.linalg.solve(normal, across)))
@@ -111,6 +112,17 @@ def measured_sweep(predictor: Predictor, shots: Sequence[Shot]) -> Sweep:
     # one turn more or less than was believed is told by the neighbours: the sweep's steps are far below a turn
     unwrapped = np.unwrap(np.concatenate([[0.0], phases]))[1:]
     return Sweep(grays, unwrapped, errors, visibility)
+
+
+def rows_apart(camera: tuple[int, int]) -> int:
+    """Of how many rows of a grating's picture (h, w) one is used: along its lines it is the same."""
+    return math.ceil(camera[0] * camera[1] / SAMPLE)
+
+
+def thinned(shot: Shot) -> Shot:
+    """A capture of a grating with the rows that are used: sixteen whole ones would be half of all captures."""
+    every = rows_apart(shot.signal.shape)
+    return replace(shot, signal=shot.signal[::every].copy(), weight=shot.weight[::every].copy())
 
 
 def _parts_of(predictor: Predictor, shot: Shot, believed: np.ndarray, start: float) -> tuple[np.ndarray, ...]:

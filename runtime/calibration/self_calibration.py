@@ -25,11 +25,12 @@ from runtime.calibration.colour_captures import (
     proof_pictures,
 )
 from runtime.calibration.drift import Drift
-from runtime.calibration.drift_fit import fit
+from runtime.calibration.drift_fit import fit, layout_of
 from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, gain_of
 from runtime.calibration.held_out_errors import HeldOutErrors, held_out_errors
+from runtime.calibration.information import measured_information
 from runtime.calibration.prediction import Predictor
-from runtime.calibration.refit import Progress, part_of, refit, start_view
+from runtime.calibration.refit import PIXELS, Progress, few, part_of, refit, start_view
 from runtime.calibration.replacement_rule import LEAST_EXCESS, Verdict, is_certain, replacement_verdict
 from runtime.calibration.response import SWEEP, Sweep
 from runtime.calibration.shown_patterns import GRAINS, HELD_OUT
@@ -156,7 +157,8 @@ def calibrate(
     found, sweeps = refit(bases, captures, view, new, part_of(say, 0.25, 0.85, "fitting"))
     say(0.86, "checking against held-out patterns")
     heldout = [shot for one in captures.values() for shot in one.heldout]
-    before, scale = _as_it_was(bases, heldout, found.estimate.view)
+    rigid, scaled = _as_it_was(bases, heldout, found.estimate.view)
+    before = held_out_errors(bases, heldout, scaled)
     after = held_out_errors(bases, heldout, found.estimate)
     say(0.92, "solving the picture again")
     better = {c: proof_pattern(bases[c], c, found.estimate.drift) for c in channels}
@@ -184,25 +186,40 @@ def calibrate(
         taker.taken,
         {"capturing": captured - started, "fitting": done - captured},
         (bundle.description.get("camera") or {}).get("counts_per_ms") or {},
-        scale if verdict == "unchanged" else None,
+        _camera_scale(bases, heldout, rigid, scaled, before) if verdict == "unchanged" else None,
     )
 
 
 def _as_it_was(
     bases: Mapping[str, ColourLightPath], heldout: Sequence[Shot], view: View
-) -> tuple[HeldOutErrors, float | None]:
-    """Errors of the light path as it was, and the camera's scale (relative, less 1) where that matters to it.
+) -> tuple[Estimate, Estimate]:
+    """The light path as it was, before a camera that has moved, and before one whose scale is off as well.
 
     At one plane, defocus and distance together do what a camera of another scale does: no pattern tells them apart
     (the rays' matrices are the same). So the old light path is checked with the scale of the camera that suits it best,
     and a refit must be better than that before it replaces anything.
     """
-    start = Estimate(Drift(), view)
-    rigid, scaled = (fit(bases, heldout, start, (0, 0), 5, new_view=new).estimate for new in (False, True))
-    errors = held_out_errors(bases, heldout, scaled)
+    some, start, layout = few(heldout, PIXELS[0]), Estimate(Drift(), view), layout_of(bases, (0, 0), True)
+    known = measured_information(bases, some, layout.widened(start), layout, no_progress)
+    rigid = fit(bases, some, start, (0, 0), 5, information=known).estimate
+    scaled = fit(bases, some, rigid, (0, 0), 5, new_view=True, information=known).estimate
+    return rigid, scaled
+
+
+def _camera_scale(
+    bases: Mapping[str, ColourLightPath],
+    heldout: Sequence[Shot],
+    rigid: Estimate,
+    scaled: Estimate,
+    errors: HeldOutErrors,
+) -> float | None:
+    """The camera's scale (relative, less 1), where it matters to the light path as it was.
+
+    `errors` are those of `scaled`.
+    """
     removed = removed_excess(held_out_errors(bases, heldout, rigid).errors, errors.errors)
     matters = is_certain(removed) and removed.value > LEAST_EXCESS
-    return errors, scaled.view.magnification if matters else None
+    return scaled.view.magnification if matters else None
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from runtime.calibration.response import SWEEP
 from runtime.calibration.self_calibration import Calibration
 from runtime.calibration.shown_patterns import GRAINS, HELD_OUT
 from runtime.excess import removed_excess
-from runtime.lightpath.legendre import edge_to_edge, legendre_maps, legendre_order
+from runtime.lightpath.legendre import edge_to_edge, legendre_curve, legendre_order, legendre_products
 
 
 def numbers(found: Calibration) -> dict[str, Any]:
@@ -120,5 +120,10 @@ def sentence_of(found: dict[str, Any], replaced: bool) -> str:
 
 def _rms_error(errors: np.ndarray, shape: tuple[int, int], lowest: int) -> float:
     """Root mean square over the panel of a map's standard error, its terms' errors taken as independent."""
-    maps = legendre_maps(*edge_to_edge(shape), legendre_order(len(errors), lowest), lowest)
-    return math.sqrt(float(np.sum(np.asarray(errors) ** 2 * (maps**2).mean((1, 2)))))
+    order = legendre_order(len(errors), lowest)
+    y, x = edge_to_edge(shape)
+    down, across = ((legendre_curve(t, order + 1) ** 2).mean(1) for t in (y[:, 0], x[0]))
+    squares = (
+        e**2 * down[i] * across[j] for e, (i, j) in zip(errors, legendre_products(order, lowest), strict=True)
+    )
+    return math.sqrt(float(sum(squares)))

@@ -165,10 +165,17 @@ class Taker:
         weight = np.where(counts >= noise.top, 0, 1 / noise.variance(_softened(signal)))
         return Shot(channel, gray, signal, weight.astype(np.float32))
 
-    def shots(self, channel: str, grays: Sequence[np.ndarray], noise: Noise, what: str) -> list[Shot]:
-        """One capture of each pattern."""
+    def shots(
+        self,
+        channel: str,
+        grays: Sequence[np.ndarray],
+        noise: Noise,
+        what: str,
+        kept: Callable[[Shot], Shot] = lambda shot: shot,
+    ) -> list[Shot]:
+        """One capture of each pattern, or what is to be `kept` of it."""
         return [
-            self.shot(channel, gray, noise, f"{what} {number} of {len(grays)}")
+            kept(self.shot(channel, gray, noise, f"{what} {number} of {len(grays)}"))
             for number, gray in enumerate(grays, 1)
         ]
 

@@ -20,6 +20,7 @@ from runtime.lightpath.fft import irfft2
 from runtime.lightpath.grid import FINE, Grid
 
 Array = Any
+PLACES = 1 << 16  # whose splines are worked out at a time: what is between stays in a core's cache
 
 
 def pixel_area(iy: Array, ix: Array, y: Array, x: Array) -> Array:
@@ -237,22 +238,23 @@ def spline_matrices(
         They share their indices: a matrix has 16 values for each place, so at full size each copy counts.
     """
     kind = np.int32 if shape[0] * shape[1] < 2**31 else np.int64
-    of_y, of_x = _taps_and_slopes(y.ravel(), shape[0]), _taps_and_slopes(x.ravel(), shape[1])
-    count = y.size
-    places = np.empty((count, 16), kind)
-    for i in range(4):
-        for j in range(4):
-            np.add(of_y[0] * kind(shape[1]) + kind(i * shape[1] + j), of_x[0], out=places[:, 4 * i + j])
+    y, x, count = y.ravel(), x.ravel(), y.size
+    products = ((1, 1), (2, 1), (1, 2)) if slopes else ((1, 1),)
+    places = np.empty((count, 4, 4), kind)
+    values = [np.empty((count, 4, 4), np.float32) for _ in products]
+    across: np.ndarray = np.arange(4, dtype=kind)
+    down = across[:, None] * shape[1]
+
+    for begin in range(0, count, PLACES):
+        some = slice(begin, begin + PLACES)
+        of_y, of_x = _taps_and_slopes(y[some], shape[0]), _taps_and_slopes(x[some], shape[1])
+        first: np.ndarray = of_y[0].astype(kind) * shape[1] + of_x[0]
+        np.add(first[:, None, None], down + across, out=places[some])
+        for one, (k, n) in zip(values, products, strict=True):
+            np.multiply(of_y[k].T[:, :, None], of_x[n].T[:, None, :], out=one[some])
     ends = np.arange(0, 16 * count + 1, 16, dtype=np.int32 if 16 * count < 2**31 else np.int64)
-    made = []
-    for down, across in ((1, 1), (2, 1), (1, 2)) if slopes else ((1, 1),):
-        values = np.empty((count, 16), np.float32)
-        for i in range(4):
-            for j in range(4):
-                np.multiply(of_y[down][i], of_x[across][j], out=values[:, 4 * i + j])
-        parts = (values.ravel(), places.ravel(), ends)
-        made.append(csr_matrix(parts, shape=(count, shape[0] * shape[1]), copy=False))
-    return made
+    size = (count, shape[0] * shape[1])
+    return [csr_matrix((one.ravel(), places.ravel(), ends), shape=size, copy=False) for one in values]
 
 
 def _taps_and_slopes(place: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -25,7 +25,7 @@ from runtime.camera.sampling import (
 )
 from runtime.lightpath.fft import irfft2, rfft2
 from runtime.lightpath.grid import Grid, image_frequencies
-from runtime.lightpath.legendre import edge_to_edge, legendre_maps
+from runtime.lightpath.legendre import edge_to_edge, legendre_surface
 
 SENSITIVITY_ORDER = 4  # of the camera's own fall-off, so that none of it is taken for the beam's
 TERMS = 14  # of that order
@@ -95,7 +95,7 @@ class View:
 
     def evenness(self) -> np.ndarray:
         """The camera's relative sensitivity, float64 [h, w]."""
-        return np.exp(np.tensordot(np.asarray(self.sensitivity), sensitivity_maps(self.shape), 1))
+        return np.exp(legendre_surface(np.asarray(self.sensitivity, float), *edge_to_edge(self.shape)))
 
     def matrix(self, panel: tuple[int, int]) -> np.ndarray:
         """The homography with the motion: from camera pixels (x, y, 1) to pixels of a panel of that shape."""
@@ -133,11 +133,6 @@ def view_of(bundle: Bundle) -> View | None:
         raise InputError(
             f"the bundle's record of its camera cannot be read: {error}; export it again"
         ) from None
-
-
-def sensitivity_maps(shape: tuple[int, int]) -> np.ndarray:
-    """The maps that `View.sensitivity` has a term for: float64 [TERMS, h, w]."""
-    return legendre_maps(*edge_to_edge(shape), SENSITIVITY_ORDER)
 
 
 def _bent(
