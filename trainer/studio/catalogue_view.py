@@ -202,8 +202,9 @@ class _CatalogueView:
             self._say(str(error))
             return
         self._say("")
-        self._pictures.draw(picture)
-        self._figures.text = picture_figures(picture)
+        with pn.io.hold():  # one message, not one for each change
+            self._pictures.draw(picture)
+            self._figures.text = picture_figures(picture)
 
     def _say(self, fault: str) -> None:
         """Show what went wrong with a user's effect; nothing for ""."""
@@ -258,7 +259,7 @@ def effect_words(effect: Effect) -> str:
     cited = f'<ul class="sources" aria-label="References">{sources}</ul>' if sources else ""
     return (
         f'<div class="head"><h2>{escape(effect.name)}</h2>'
-        f'<ol class="path" aria-label="Light path, this effect\'s stage marked">{steps}</ol></div>'
+        f'<ol class="place" aria-label="Light path, this effect\'s stage marked">{steps}</ol></div>'
         f'<div class="what"><div class="text"><p class="about">{escape(effect.about)}</p>{description}'
         f'<p class="acts">{acts_on}{own}</p></div>{formula}</div>{cited}'
     )
@@ -303,10 +304,10 @@ option:disabled { font-size: 0.78em; letter-spacing: 0.08em; padding-top: 9px; }
 _WORDS_STYLE = """
 .head { display: flex; flex-wrap: wrap; align-items: center; justify-content: space-between; gap: 6px 20px; }
 h2 { font-size: 1.35rem; margin: 0; font-weight: 650; }
-.path { display: flex; flex-wrap: wrap; list-style: none; margin: 0; padding: 0; font-size: 0.85rem; gap: 4px 0; }
-.path span { padding: 2px 8px; border-radius: 999px; opacity: 0.8; }
-.path li + li::before { content: "→"; opacity: 0.5; }
-.path .here { opacity: 1; font-weight: 650; background: #20639b; color: #fff; }
+.place { display: flex; flex-wrap: wrap; list-style: none; margin: 0; padding: 0; font-size: 0.85rem; gap: 4px 0; }
+.place span { padding: 2px 8px; border-radius: 999px; opacity: 0.8; }
+.place li + li::before { content: "→"; opacity: 0.5; }
+.place .here { opacity: 1; font-weight: 650; background: #20639b; color: #fff; }
 .what { display: flex; flex-wrap: wrap; gap: 8px 28px; align-items: center; margin-top: 8px; }
 .text { flex: 1 1 380px; max-width: 105ch; }
 .formula-box { flex: 0 1 auto; margin-left: auto; padding: 10px 18px; border-radius: 8px; font-size: 1.05rem;

@@ -19,6 +19,7 @@ from bokeh.models import (
     WheelZoomTool,
 )
 from bokeh.models.annotations.geometry import Span
+from bokeh.models.widgets.markups import Div
 from bokeh.plotting import figure
 
 from trainer.report.palettes import DIFFERENCE, IRRADIANCE, gradient, palette
@@ -57,7 +58,8 @@ class EffectPictures:
         ):
             plots.append(self._plot(name, mapper, (across, down)))
         self._with_title = _html("")
-        self._difference_bar = _html("")
+        # Bokeh's own text: while a slider moves, a new one of Panel's would have the page laid out again.
+        self._difference_bar = Div(sizing_mode="stretch_width", stylesheets=[_STYLE], margin=0)
         pictures = [
             pn.Column(_html(_title("Ideal")), plots[0], styles=_flex(NARROWEST, 1)),
             pn.Column(self._with_title, plots[1], styles=_flex(NARROWEST, 1)),
@@ -70,7 +72,7 @@ class EffectPictures:
         difference = pn.Column(
             _html(_title("Difference", "with the effect less ideal")),
             plots[2],
-            self._difference_bar,
+            pn.pane.Bokeh(self._difference_bar, sizing_mode="stretch_width", margin=0),
             styles=_flex(NARROWEST, 1),
         )
         self.view = pn.FlexBox(
@@ -89,7 +91,7 @@ class EffectPictures:
             self._spread = _round_up(max(spread, 1.0))
             self._difference.update(low=-self._spread, high=self._spread)
             ends = (f"−{self._spread:g}", "0", f"+{self._spread:g}")
-            self._difference_bar.object = _bar(DIFFERENCE, ends, "counts")
+            self._difference_bar.text = _bar(DIFFERENCE, ends, "counts")
         self._source.data = _columns(picture)
 
     def show_whole(self) -> None:
@@ -171,6 +173,7 @@ def _round_up(value: float) -> float:
 
 
 _STYLE = """
+.bk-clearfix { display: block; width: 100%; }
 h3 { font-size: 0.95rem; font-weight: 600; margin: 0 0 6px; }
 h3 small { font-weight: 400; opacity: 0.75; }
 .bar { margin-top: 8px; font-size: 0.85rem; font-variant-numeric: tabular-nums; }

@@ -208,7 +208,7 @@ def _work(connection: Connection, prepared: str, threads: int) -> None:
 
     def say(kind: str, value: Any) -> None:
         data = pickle.dumps((kind, value))
-        with sending:
+        with sending, suppress(OSError):  # the server has ended, and so does this process
             connection.send_bytes(data)
 
     while True:
