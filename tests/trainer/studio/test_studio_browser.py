@@ -276,7 +276,9 @@ def test_a_failing_effect_file_is_a_sentence_in_the_page(browser: Any, home: Pat
         chooser.select_option("my_depth")
         playwright.expect(page.get_by_role("heading", name="my_depth", exact=True)).to_be_visible()
         stages = page.get_by_role("list", name="Light path, this effect's stage marked").bounding_box()
-        assert stages and stages["height"] < 60 < stages["width"], "the stages stand in a line beside the name"
+        assert stages and stages["height"] < 60 < stages["width"], (
+            "the stages stand in a line beside the name"
+        )
         file.write_text(OWN_EFFECT.format(body="raise ValueError('no such depth')"))
         verdict(page, "no such depth")
         verdict(page, "mine.py, line 7")
