@@ -31,10 +31,10 @@ def comparison_view(project: Project, visit: Visit) -> Any:
     place = pn.FlexBox(gap="12px", sizing_mode="stretch_width")
     note = pn.pane.HTML("", margin=0, sizing_mode="stretch_width")
     scales = pn.pane.HTML("", margin=0, sizing_mode="stretch_width")
-    colour = PromptSelect(name="Colour", options=list(project.set.captures.channels), width=110, margin=0)
+    colour = PromptSelect(name="Colour", options=list(project.set.captures.channels), width=100, margin=0)
     planes = {f"{z:g} mm": z for z in project.set.captures.planes}
-    plane = PromptSelect(name="Plane", options=planes, width=110, margin=0)
-    capture = PromptSelect(name="Capture", options=[], width=230, margin=0)
+    plane = PromptSelect(name="Plane", options=planes, width=100, margin=0)
+    capture = PromptSelect(name="Capture", options=[], width=250, margin=0)
     way = pn.widgets.Select(name="Pictures", options=["side by side", "wipe"], width=130, margin=0)
     wipe = pn.widgets.IntSlider(
         name="Wipe, % of the width", start=0, end=100, value=50, step=1, width=220, margin=0
