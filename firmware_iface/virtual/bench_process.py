@@ -15,7 +15,7 @@ from multiprocessing.connection import Connection
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_iface.errors import InputError
+from firmware_iface.errors import DeviceError, InputError
 from firmware_iface.virtual.bench_description import BenchDescription
 from firmware_iface.virtual.virtual_devices import LitField
 from firmware_iface.virtual.virtual_headset import VirtualHeadset
@@ -37,7 +37,7 @@ def bench_process(description: BenchDescription, seed: int) -> Expose:
     callable
         From what the panel shows in turn, each laser's power (fraction of full) and an exposure (ms) to the camera's
         picture, uint16 counts [h, w]. For one thread at a time. It raises InputError as `VirtualCamera` does, and
-        OSError where the process has ended.
+        DeviceError where the process has ended.
     """
     context = multiprocessing.get_context("spawn")  # the caller has threads
     ours, theirs = context.Pipe()
@@ -47,11 +47,13 @@ def bench_process(description: BenchDescription, seed: int) -> Expose:
     def expose(
         fields: Sequence[LitField], power: Mapping[str, float], exposure_ms: float
     ) -> NDArray[np.uint16]:
-        ours.send((tuple(fields), dict(power), exposure_ms))
         try:
+            ours.send((tuple(fields), dict(power), exposure_ms))
             picture = ours.recv()
-        except EOFError:
-            raise OSError("the process of the simulated bench has ended") from None
+        except (EOFError, OSError):
+            raise DeviceError(
+                "the process of the simulated bench has ended; start the emulated hardware again."
+            ) from None
         if isinstance(picture, InputError):
             raise picture
         return np.asarray(picture)

@@ -152,12 +152,9 @@ def numbers_text(stated: Camera, used: Camera) -> str:
         f"camera.full_well_e = {stated.full_well_e:g} and read_noise_e = {stated.read_noise_e:g} do not fit the noise "
         f"of repeated pictures: these show {measured}, which are used"
     )
-    depth = equal_depth(stated, used)
-    return (
-        text
-        if depth is None
-        else f"{text}; bit_depth = {depth} instead of {stated.bit_depth} would explain it, too"
-    )
+    if (depth := equal_depth(stated, used)) is not None:
+        text += f"; bit_depth = {depth} instead of {stated.bit_depth} would explain it, too"
+    return text
 
 
 def equal_depth(stated: Camera, used: Camera) -> int | None:

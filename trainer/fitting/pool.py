@@ -138,7 +138,13 @@ def open_pool(workers: int | None = None, cluster: str | None = None) -> Iterato
     if count == 1:
         yield Pool(_ThisProcess(), 1, elsewhere=False)
         return
-    executor = _Processes(count, _beginning(), _single_threaded)
+    context = _beginning()
+    executor = _Processes(count, context, _single_threaded)
+    if (
+        context.get_start_method() == "spawn"
+    ):  # each imports by itself, while this process looks at the captures
+        for _ in range(count):
+            executor.submit(import_module, TASKS)
     try:
         yield Pool(executor, count)
     except BaseException:
@@ -179,7 +185,7 @@ def _refusal(error: BaseException, address: str) -> str:
     from distributed.comm import get_address_host_port
 
     try:  # Dask's last attempt may have ended with its time, before it was refused
-        socket.create_connection(get_address_host_port(address), ANSWER_S).close()
+        socket.create_connection(get_address_host_port(address), 0.2 * ANSWER_S).close()
     except ConnectionRefusedError:
         return "nobody answers there: the connection was refused"
     except (OSError, ValueError):

@@ -25,9 +25,7 @@ from runtime.lightpath.fft import rfft2
 from runtime.lightpath.grid import FINE
 from runtime.lightpath.light_path import LightPath, mode_irradiance, panel_phase, panel_spectrum, states
 from runtime.lightpath.modulation import Modulation
-from runtime.lightpath.propagation import (
-    far_field_matrix,
-)
+from runtime.lightpath.propagation import far_field_matrix
 from trainer.prediction.capture_motion import blurred_spectrum, displaced_spectrum
 from trainer.prediction.panel_gradient import has_panel_gradient, image_with_panel_gradient
 from trainer.prediction.pupil_modes import pupil_modes
