@@ -195,7 +195,7 @@ def sharpened(
     """A set with further captures that sharpen a model in which nothing is in doubt."""
     rows = tuple(fit_rows(captures))
     model = fit(model, model.names, load(captures, rows)).model
-    doubts = Doubts(diagnose(captures, model, {}, pool, with_probes=False), model, (), rows)
+    doubts = Doubts(diagnose(captures, model, {}, pool, thorough=False), model, (), rows)
     possible = possible_captures(captures, near_planes(captures), count, seed + 1000 * len(captures))
     found = next_captures(captures, doubts, possible, count, pool).chosen
     names = new_ids(captures, count)

@@ -94,7 +94,7 @@ def judge(number: int, seed: int, pool: Pool) -> Judged:
         spec = str(bench_file(folder, *defects))
         acquire_from(spec, folder / "captures", patterns=hidden.captures - 1, seed=own)
         captures = read_captures(folder / "captures")
-        said = diagnose(captures, Model(captures.bench), catalogue(), pool, with_probes=False)
+        said = diagnose(captures, Model(captures.bench), catalogue(), pool, thorough=False)
     return Judged(
         seed,
         number,

@@ -248,7 +248,7 @@ def test_a_cluster_sees_captures_and_effects_as_they_are_now(
         path.write_text(OWN.replace("1 + tilt", f"1 {sign} tilt"))
         known = few(catalogue([path]), path)
         with open_pool(cluster=cluster) as running:
-            found = diagnose(captures, Model(captures.bench), known, running, with_probes=False)
+            found = diagnose(captures, Model(captures.bench), known, running, thorough=False)
         best = next(r for r in found.ranking if r.effect.name == "row_tilt")
         sizes.append(float(best.model.present[0].values["tilt"]))
     assert sizes == pytest.approx([0.2, -0.2], abs=0.01)
@@ -261,7 +261,7 @@ def test_a_cluster_sees_captures_and_effects_as_they_are_now(
         with open_pool(cluster=cluster) as running:
             set_now = read_captures(folder)
             found = diagnose(
-                set_now, Model(set_now.bench), few(catalogue([own]), own), running, with_probes=False
+                set_now, Model(set_now.bench), few(catalogue([own]), own), running, thorough=False
             )
         best = next(r for r in found.ranking if r.effect.name == "row_tilt")
         assert float(best.model.present[0].values["tilt"]) == pytest.approx(tilt, abs=0.01)

@@ -79,7 +79,7 @@ def diagnosed(captures: CaptureSet, *names: str) -> Diagnosis:
     """A diagnosis with these effects alone, to be quick."""
     known = {n: e for n, e in catalogue().items() if n in names}
     with open_pool(1) as pool:
-        return diagnose(captures, Model(captures.bench), known, pool, with_probes=False)
+        return diagnose(captures, Model(captures.bench), known, pool, thorough=False)
 
 
 @pytest.mark.parametrize(

@@ -30,6 +30,7 @@ from trainer.commands.verdict_page import (
 from trainer.commands.workers import worker_options, workers_of
 
 if TYPE_CHECKING:
+    from trainer.diagnosis.verdict import Thresholds
     from trainer.effects.effect_catalogue import Catalogue
     from trainer.fitting.pool import Pool
     from trainer.model.model import Model
@@ -65,18 +66,20 @@ def run(args: Namespace, screen: Screen) -> Result:
     """
     from trainer.fitting.pool import open_pool
 
+    thresholds = thresholds_of(args)
     added: list[list[str]] = []
     try:
         # First: a cluster that does not answer is known at once, and processes begin while this one reads.
         with open_pool(workers_of(args), args.cluster) as pool:
-            return _explain_on(args, screen, pool, added)
+            return _explain_on(args, screen, pool, thresholds, added)
     except KeyboardInterrupt:
         raise Interrupted(_interrupted(added, args)) from None
 
 
-def _explain_on(args: Namespace, screen: Screen, pool: Pool, added: list[list[str]]) -> Result:
+def _explain_on(
+    args: Namespace, screen: Screen, pool: Pool, thresholds: Thresholds, added: list[list[str]]
+) -> Result:
     """Each model that is written appends the names of its effects that were not there at the beginning to `added`."""
-    thresholds = thresholds_of(args)
     captures, known, model = inputs_of(args)
     from trainer.captures.capture_origin import origin
     from trainer.diagnosis.explanation import explain

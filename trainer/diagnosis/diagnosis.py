@@ -15,10 +15,10 @@ from trainer.captures.camera_numbers import camera_of_residual
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import CaptureRoles, capture_roles, scenes
 from trainer.diagnosis.bench_facts import EqualFact, EqualFacts, camera_facts, equal_facts
-from trainer.diagnosis.candidate_fits import CandidateFit
+from trainer.diagnosis.fitted_ranking import fitted_ranking
 from trainer.diagnosis.previews import CandidatePreview, previews
 from trainer.diagnosis.probes import ProbeResult, probe
-from trainer.diagnosis.ranking import RankedEffect, raise_orders, rank, try_all, try_together_with_present
+from trainer.diagnosis.ranking import RankedEffect
 from trainer.diagnosis.screen import ScreenResult, screen
 from trainer.diagnosis.separate import captures_that_separate
 from trainer.diagnosis.table_facts import DRIFT, exposure_facts, facts_sentence, plane_facts
@@ -31,12 +31,6 @@ from trainer.fitting.predictor import evaluate_captures
 from trainer.formatting import number
 from trainer.model.model import Model
 from trainer.model.parameters import describe
-
-FITTED_FIRST = 5  # candidates fitted after the screen; all of them when none of these explains anything
-# An explanation asks for no other candidate where one leaves at most this share of the excess: either nothing that is
-# worth adding, or enough for another look at all of them. At first it fits those that the screen expects to remove at
-# least this share of what the best one does.
-SETTLES, RIVALS = 0.1, 0.5
 
 
 @dataclass(frozen=True)
@@ -189,7 +183,7 @@ def diagnose(
     thresholds: Thresholds | None = None,
     progress: Progress | None = None,
     ideal: PredictionErrors | None = None,
-    with_probes: bool = True,
+    thorough: bool = True,
     screened: Sequence[ScreenResult] | None = None,
 ) -> Diagnosis:
     """What is missing from `model` on a capture set.
@@ -202,10 +196,10 @@ def diagnose(
         Called with the share that is done and what is being done.
     ideal : PredictionErrors, optional
         The ideal model's held-out errors, where they are known.
-    with_probes : bool
+    thorough : bool
         False leaves out what the next step of an explanation does not need: the stages' free-form probes and the
-        distances of single planes unless nothing named fits, candidates of which the screen says little where another
-        one leaves next to nothing, and all of it for a complete model.
+        distances of single planes unless nothing named fits, candidates that `fitted_ranking` leaves out then, and
+        all of it for a complete model.
     screened : sequence of ScreenResult, optional
         What `screen_candidates` says of this very model, where it was asked before.
     """
@@ -221,7 +215,7 @@ def diagnose(
     little = complete and not thresholds.may_be_worth_adding(before.excess, ideal_excess)
 
     overstated = below_the_noise(before)
-    if overstated or (little and not with_probes):
+    if overstated or (little and not thorough):
         same = equal_facts(model, captures)
         return Diagnosis(
             model,
@@ -242,43 +236,13 @@ def diagnose(
     if screened is None:
         screened = screen_candidates(roles, model, known, pool, report)
     order = sorted(screened, key=lambda s: -s.removed_excess)
-    promising = [
-        s for s in order[:FITTED_FIRST] if s.removed_excess > 0.05 * max(order[0].removed_excess, 1e-12)
-    ] or order[:1]
-    # The screen says little of an effect whose derivatives do not reach, or that shows from capture to capture only.
-    blind = [s for s in order if known[s.effect].rugged or known[s.effect].measure]
-    unseen = [s for s in blind if s not in promising]
-    near = [s for s in promising if with_probes or s.removed_excess > RIVALS * order[0].removed_excess]
-    first = (promising + unseen)[:2] if little else near + (unseen if with_probes else [])
-
-    def settled(fits: Sequence[CandidateFit]) -> bool:
-        left = min((f.held_out.excess for f in fits), default=before.excess)
-        least, most = thresholds.least(ideal_excess), thresholds.complete_excess
-        return left < SETTLES * before.excess and not least < left < most
-
-    def raised(fits: Sequence[CandidateFit]) -> list[CandidateFit]:
-        return raise_orders(roles, model, before, fits, pool, lambda _: report(0.6, "raising orders"))
-
-    fits = try_all(roles, model, first, pool, report, 0.3, 0.5)
-    if not (little or settled(fits)):
-        second = [s for s in promising + unseen if s not in first]
-        fits += try_all(roles, model, second, pool, report, 0.5, 0.6)
-    if with_probes or not settled(fits):
-        fits = raised(fits)
-    ranking = rank(before, fits, known, thresholds, ideal_excess, len(screened))
-    if not complete and not any(r.worth_adding for r in ranking):
-        rest = [s for s in order if s.effect not in {f.effect for f in fits}]
-        fits += raised(try_all(roles, model, rest, pool, report, 0.6, 0.7))
-        ranking = rank(before, fits, known, thresholds, ideal_excess, len(screened))
-        if model.present and not any(r.worth_adding for r in ranking):
-            report(0.7, "fitting candidates and present effects together")
-            without, together = try_together_with_present(roles, model, fits, pool)
-            jointly = rank(without, together, known, thresholds, ideal_excess, len(screened))
-            ranking = jointly + [r for r in ranking if r.effect.name not in {f.effect for f in together}]
+    ranking, fits = fitted_ranking(
+        roles, model, before, order, known, pool, thresholds, ideal_excess, thorough, report
+    )
     verdict = verdict_of(complete, bool(ranking) and ranking[0].worth_adding)
 
     probes: list[ProbeResult] = []
-    if with_probes or verdict == "outside_catalogue":
+    if thorough or verdict == "outside_catalogue":
         probes = probe_all(roles, model, before, pool, report)
     stage = None
     if verdict == "missing":
@@ -288,7 +252,7 @@ def diagnose(
         telling = [p for p in probes if thresholds.worth_adding(p.removed, ideal_excess, len(probes))]
         stage = max(telling, key=lambda p: p.removed.value).stage if telling else None
     table: tuple[EqualFact, ...] = ()
-    if verdict == "outside_catalogue" or (with_probes and verdict == "missing"):
+    if verdict == "outside_catalogue" or (thorough and verdict == "missing"):
         best = min([before, *(f.held_out for f in fits)], key=lambda e: e.excess)
         table = plane_facts(roles, model, best, known, pool, thresholds, ideal_excess)
     drifts = [f.effect for f in fits if f.held_out.excess < before.excess]

@@ -106,7 +106,7 @@ def doubts_of(
         model = fit(model, model.names, batches).model
     parts = 1 + len(model.names)
     found = diagnose(
-        captures, model, known, pool, thresholds, part_of(report, 0.05, 1 / parts), with_probes=False
+        captures, model, known, pool, thresholds, part_of(report, 0.05, 1 / parts), thorough=False
     )
     rivals: list[Rival] = []
     best = found.model
@@ -116,7 +116,7 @@ def doubts_of(
     elif found.verdict == "complete":
         for k, name in enumerate(best.names, 1):
             part = part_of(report, k / parts, (k + 1) / parts, f"without {name}")
-            again = diagnose(captures, best.without(name), known, pool, thresholds, part, with_probes=False)
+            again = diagnose(captures, best.without(name), known, pool, thresholds, part, thorough=False)
             best, more = _exchanged(best, name, again.ranking)
             rivals += more
     else:  # what is most like what is missing shows which captures say most of it

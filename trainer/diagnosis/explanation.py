@@ -228,7 +228,7 @@ def explain(
         kept = model.names
         model, errors = without_unnecessary(model, errors, [steps[-1].added] if steps[-1].added else [])
         if model.names != kept:
-            found = diagnose(captures, model, known, pool, thresholds, None, ideal, with_probes=False)
+            found = diagnose(captures, model, known, pool, thresholds, None, ideal, thorough=False)
             diagnoses.append(found)
     rest = None
     if learn and diagnoses[-1].verdict != "complete" and not below_the_noise(errors):

@@ -271,4 +271,4 @@ def _complete(captures: CaptureSet, model: Model, effects: Sequence[Path]) -> Di
         ideal = ideal_errors(roles, model)
         if not Thresholds().complete(errors.excess, ideal.excess):
             return None
-        return diagnose(captures, model, catalogue(effects), pool, ideal=ideal, with_probes=False)
+        return diagnose(captures, model, catalogue(effects), pool, ideal=ideal, thorough=False)

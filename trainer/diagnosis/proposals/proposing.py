@@ -124,7 +124,7 @@ def propose(
     """
     thresholds = thresholds or Thresholds()
     report = progress or no_progress
-    found = diagnose(captures, model, known, pool, thresholds, part_of(report, 0, 0.4), with_probes=False)
+    found = diagnose(captures, model, known, pool, thresholds, part_of(report, 0, 0.4), thorough=False)
     if not has_no_name(found):
         report(1.0, "done")
         return Proposals(found)

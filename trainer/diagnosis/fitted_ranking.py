@@ -1,0 +1,120 @@
+"""Which candidates of a diagnosis are fitted, how far, and how they rank."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from runtime.excess import PredictionErrors
+from runtime.program.progress import Progress
+from trainer.captures.held_out import CaptureRoles
+from trainer.diagnosis.candidate_fits import CandidateFit
+from trainer.diagnosis.ranking import RankedEffect, raise_orders, rank, try_all, try_together_with_present
+from trainer.diagnosis.screen import ScreenResult
+from trainer.diagnosis.verdict import Thresholds
+from trainer.effects.effect_catalogue import Catalogue
+from trainer.fitting.pool import Pool
+from trainer.model.model import Model
+
+FITTED_FIRST = 5  # candidates fitted after the screen; all of them when none of these explains anything
+# Where it is not thorough, no other candidate is asked for where one leaves at most this share of the excess: either
+# nothing that is worth adding, or enough for another look at all of them. At first those are fitted that the screen
+# expects to remove at least this share of what the best one does.
+SETTLES, RIVALS = 0.1, 0.5
+
+
+def fitted_ranking(
+    roles: CaptureRoles,
+    model: Model,
+    before: PredictionErrors,
+    order: Sequence[ScreenResult],
+    known: Catalogue,
+    pool: Pool,
+    thresholds: Thresholds,
+    ideal_excess: float,
+    thorough: bool,
+    report: Progress,
+) -> tuple[list[RankedEffect], list[CandidateFit]]:
+    """Fit the candidates that may explain the most, and rank them.
+
+    Parameters
+    ----------
+    before : PredictionErrors
+        Held-out errors of `model`.
+    order : sequence of ScreenResult
+        All candidates, the one that the screen expects most of first.
+    ideal_excess : float
+        Held-out excess of the bench file's own model.
+    thorough : bool
+        False: candidates of which the screen says little are not fitted, and no orders are raised, where one candidate
+        leaves next to nothing.
+    report : callable
+        Called with the share of the whole diagnosis that is done, and what is being done.
+
+    Returns
+    -------
+    (list of RankedEffect, list of CandidateFit)
+        The ranking, best first, and every fit that was made.
+    """
+    complete = thresholds.complete(before.excess, ideal_excess)
+
+    def raised(fits: Sequence[CandidateFit]) -> list[CandidateFit]:
+        return raise_orders(roles, model, before, fits, pool, lambda _: report(0.6, "raising orders"))
+
+    def ranked(fits: Sequence[CandidateFit]) -> list[RankedEffect]:
+        return rank(before, fits, known, thresholds, ideal_excess, len(order))
+
+    fits = _first_fits(roles, model, before, order, known, pool, thresholds, ideal_excess, thorough, report)
+    if thorough or not _settled(fits, before, thresholds, ideal_excess):
+        fits = raised(fits)
+    ranking = ranked(fits)
+    if complete or any(r.worth_adding for r in ranking):
+        return ranking, fits
+    rest = [s for s in order if s.effect not in {f.effect for f in fits}]
+    fits += raised(try_all(roles, model, rest, pool, report, 0.6, 0.7))
+    ranking = ranked(fits)
+    if model.present and not any(r.worth_adding for r in ranking):
+        report(0.7, "fitting candidates and present effects together")
+        without, together = try_together_with_present(roles, model, fits, pool)
+        jointly = rank(without, together, known, thresholds, ideal_excess, len(order))
+        ranking = jointly + [r for r in ranking if r.effect.name not in {f.effect for f in together}]
+    return ranking, fits
+
+
+def _first_fits(
+    roles: CaptureRoles,
+    model: Model,
+    before: PredictionErrors,
+    order: Sequence[ScreenResult],
+    known: Catalogue,
+    pool: Pool,
+    thresholds: Thresholds,
+    ideal_excess: float,
+    thorough: bool,
+    report: Progress,
+) -> list[CandidateFit]:
+    """Fits of the candidates that the screen expects most of, and of those of which it says little."""
+    most = max(order[0].removed_excess, 1e-12)
+    promising = [s for s in order[:FITTED_FIRST] if s.removed_excess > 0.05 * most] or list(order[:1])
+    # The screen says little of an effect whose derivatives do not reach, or that shows from capture to capture only.
+    blind = [s for s in order if known[s.effect].rugged or known[s.effect].measure]
+    wanted = promising + [s for s in blind if s not in promising]
+    if thresholds.complete(before.excess, ideal_excess) and not thresholds.may_be_worth_adding(
+        before.excess, ideal_excess
+    ):
+        return try_all(roles, model, wanted[:2], pool, report, 0.3, 0.6)
+    first = (
+        wanted if thorough else [s for s in promising if s.removed_excess > RIVALS * order[0].removed_excess]
+    )
+    fits = try_all(roles, model, first, pool, report, 0.3, 0.5)
+    if _settled(fits, before, thresholds, ideal_excess):
+        return fits
+    return fits + try_all(roles, model, [s for s in wanted if s not in first], pool, report, 0.5, 0.6)
+
+
+def _settled(
+    fits: Sequence[CandidateFit], before: PredictionErrors, thresholds: Thresholds, ideal_excess: float
+) -> bool:
+    """Whether one fit leaves so little that no other candidate is asked for."""
+    left = min((f.held_out.excess for f in fits), default=before.excess)
+    least, most = thresholds.least(ideal_excess), thresholds.complete_excess
+    return left < SETTLES * before.excess and not least < left < most
