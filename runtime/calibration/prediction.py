@@ -18,7 +18,7 @@ from runtime.camera.view import View
 from runtime.lightpath import fft
 from runtime.lightpath.grid import FINE, Grid
 from runtime.lightpath.light_path import LightPath, panel_phase
-from runtime.solver.array_backend import Backend
+from runtime.solver.array_backend import Backend, Room
 from runtime.solver.in_place_path import Optics
 
 SMALL = 200_000  # panel pixels up to which threads wait for each other longer than they work
@@ -50,7 +50,8 @@ class Predictor:
         self.bases, self.finer, self.slopes = bases, finer, slopes
         size = max(b.path.grid.shape[0] * b.path.grid.shape[1] for b in bases.values())
         self.backend = Backend(fft.THREADS if size > SMALL else 1)
-        self.optics = {c: Optics(b.path, FINE, True, self.backend) for c, b in bases.items()}
+        room = Room(self.backend)
+        self.optics = {c: Optics(b.path, FINE, True, self.backend, room) for c, b in bases.items()}
         self.paths: dict[str, LightPath] = {}
         self.readings: dict[str, Reading] = {}
         self.images: dict[Grid, np.ndarray] = {}
@@ -95,7 +96,7 @@ class Predictor:
         return np.asarray(panel_phase(path, shot.gray))
 
     def image(self, channel: str, phase: np.ndarray) -> np.ndarray:
-        """Irradiance on the fine grid before filters; the fields are kept in `optics`. Valid until the next call."""
+        """Irradiance on the fine grid before filters; the fields are in `optics`. Valid until the next call."""
         grid = self.paths[channel].grid
         if grid not in self.images:
             self.images[grid] = np.zeros(grid.image_shape, np.float32)

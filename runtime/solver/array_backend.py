@@ -97,6 +97,20 @@ class Backend:
         return np.asarray(x)
 
 
+class Room:
+    """Arrays that several light paths use one after the other: for each name and shape there is one."""
+
+    def __init__(self, backend: Backend) -> None:
+        self._xp, self._arrays = backend.xp, dict[Any, Array]()
+
+    def zeros(self, name: str, shape: tuple[int, ...], dtype: Any) -> Array:
+        """The array of that name, shape and type; zeros when it is first asked for."""
+        key = (name, shape, np.dtype(dtype))
+        if key not in self._arrays:
+            self._arrays[key] = self._xp.zeros(shape, dtype)
+        return self._arrays[key]
+
+
 class CupyBackend(Backend):
     """CuPy arrays on the GPU: a strip is the whole array, and streams do what threads do on a CPU."""
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from runtime.lightpath.light_path import LightPath
 from runtime.lightpath.periodic_axis import ring
-from runtime.solver.array_backend import Backend
+from runtime.solver.array_backend import Backend, Room
 from runtime.solver.iris_band import Band
 
 Array = Any
@@ -32,6 +32,8 @@ class ImagePlane:
     spectrum : complex array [rows of the period, columns of the band]
         What `forward` reads, and `adjoint` writes.
     backend : Backend
+    room : Room
+        Where the fields are.
 
     Attributes
     ----------
@@ -50,6 +52,7 @@ class ImagePlane:
         columns: Band,
         spectrum: Array,
         backend: Backend,
+        room: Room,
     ) -> None:
         xp, grid = backend.xp, path.grid
         real, pair = path.response.dtype, path.source.dtype
@@ -60,7 +63,7 @@ class ImagePlane:
         self.weights = [float(w) for w in weights]
         self.down, self.across = _window(margin, height, padded[0]), _window(margin, width, padded[1])
         self.dark = slice(width - margin, padded[1] - margin)  # of the period: what the window leaves out
-        self.fields = [xp.zeros((height, width), pair) for _ in weights]
+        self.fields = [room.zeros(f"field {k}", (height, width), pair) for k in range(len(weights))]
         self.strip = min(backend.strip_rows(padded[1]), height)
         self.row = [xp.zeros((self.strip, padded[1]), pair) for _ in range(backend.threads)]
         self.part = [xp.empty((self.strip, width), real) for _ in range(backend.threads)]

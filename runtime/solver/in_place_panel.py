@@ -9,7 +9,7 @@ import numpy as np
 
 from runtime.lightpath.light_path import LightPath, nominal_phase, states
 from runtime.lightpath.modulation import factor_at, slope_at
-from runtime.solver.array_backend import Backend
+from runtime.solver.array_backend import Backend, Room
 from runtime.solver.in_place_crosstalk import Crosstalk
 from runtime.solver.iris_band import Band, Run
 
@@ -33,21 +33,20 @@ class Panel:
         The panel's states during an exposure; one where nothing modulates the light besides its phase.
     """
 
-    def __init__(self, path: LightPath, rows: Band, columns: Band, backend: Backend) -> None:
+    def __init__(self, path: LightPath, rows: Band, columns: Band, backend: Backend, room: Room) -> None:
         xp, grid = backend.xp, path.grid
         real, pair = path.response.dtype, path.source.dtype
         self.backend, self.rows, self.columns = backend, rows, columns
         self.take(path)
         self.shape = height, width = grid.shape
         self.strip = min(backend.strip_rows(grid.padded[1]), height)
-        room = (self.strip, grid.padded[1])
         # source m(phase) exp(j phase); dark beyond the panel
-        self.lit = xp.zeros((height, grid.padded[1]), pair)
-        self.row = [xp.zeros(room, pair) for _ in range(backend.threads)]
+        self.lit = room.zeros("lit", (height, grid.padded[1]), pair)
+        self.row = [xp.zeros((self.strip, grid.padded[1]), pair) for _ in range(backend.threads)]
         self.part = [xp.empty((self.strip, width), real) for _ in range(backend.threads)]
         self.crosstalk = None if path.crosstalk is None else Crosstalk(path, rows, columns, backend)
         count = len(rows.frequencies) if self.crosstalk else grid.padded[0]
-        self.spectrum = xp.zeros((count, len(columns.frequencies)), pair)
+        self.spectrum = room.zeros("panel spectrum", (count, len(columns.frequencies)), pair)
         self.runs = rows.runs
         if self.crosstalk:  # in the band's own order, whose frequencies are each there once
             self.runs = tuple(Run(run.band, run.band, run.image, False) for run in rows.runs)

@@ -13,6 +13,7 @@ of z: once a pixel carries it where the iris passes no more than half of the pan
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ import numpy as np
 from firmware_iface.errors import InputError
 from runtime.lightpath.grid import Grid
 from runtime.lightpath.light_path import LightPath
-from runtime.solver.array_backend import Backend
+from runtime.solver.array_backend import Backend, Room
 from runtime.solver.in_place_image import ImagePlane, pixel_filter
 from runtime.solver.in_place_panel import Panel
 from runtime.solver.iris_band import band, folded
@@ -47,6 +48,8 @@ class Optics:
         two more real transforms each way. Without it, `forward` gives irradiance at their centres, which the fine
         grid is not offered for.
     backend : Backend
+    room : Room, optional
+        Where the fields are, for paths that are used one after the other; None: room of its own.
 
     Raises
     ------
@@ -54,7 +57,9 @@ class Optics:
         For a path to the far field, and for crosstalk where the image aliases.
     """
 
-    def __init__(self, path: LightPath, fine: int, integrate: bool, backend: Backend) -> None:
+    def __init__(
+        self, path: LightPath, fine: int, integrate: bool, backend: Backend, room: Room | None = None
+    ) -> None:
         xp, grid = backend.xp, path.grid
         if path.far_field is not None:
             raise InputError("patterns for the far field are not computed: use angular_spectrum or fresnel")
@@ -65,26 +70,24 @@ class Optics:
         self.rows, self.columns = (
             band(edge, n, fine * n) for edge, n in zip(grid.band, grid.padded, strict=True)
         )
-        self.panel = Panel(path, self.rows, self.columns, backend)
+        room = room or Room(backend)
+        self.panel = Panel(path, self.rows, self.columns, backend, room)
         self._take_pupil(path)
         self.strongest = int(np.argmax(path.weights))
         # Where one buffer can be both, the pupil multiplies in place.
         self.in_place = fine == 1 and len(self.transfers) == 1 and path.crosstalk is None
         self.spectrum = self.panel.spectrum
         if not self.in_place:
-            self.spectrum = xp.zeros((fine * grid.padded[0], len(self.columns.frequencies)), pair)
+            self.spectrum = room.zeros(
+                "image spectrum", (fine * grid.padded[0], len(self.columns.frequencies)), pair
+            )
         margin = fine * grid.margin if integrate else 0
         self.at_pixels = tuple(slice(margin, margin + fine * n, fine) for n in grid.shape)
         weights = [w for state in self.panel.states for w in state.weights]
-        self.image_plane = ImagePlane(path, weights, fine, margin, self.columns, self.spectrum, backend)
+        self.image_plane = ImagePlane(path, weights, fine, margin, self.columns, self.spectrum, backend, room)
         self.strip = self.image_plane.strip
         self.one = xp.zeros(grid.shape if len(self.panel.states) > 1 else (0, 0), real)
-        self.image = None
-        if integrate:
-            transfer = xp.asarray(pixel_filter(path, fine).astype(pair))
-            self.filter, self.filter_back = transfer, transfer.conj()
-            self.image = xp.zeros(self.image_plane.shape, real)
-            self.half_spectrum = xp.zeros(transfer.shape, pair)
+        self.integrate, self._fine, self._first = integrate, fine, path
 
     def take(self, path: LightPath) -> None:
         """Go on with another light path that differs from the one before in its source, leak and transfers alone."""
@@ -105,13 +108,26 @@ class Optics:
             over_band = folded(over_band, axis, grid.band[axis - 1], to)
         return over_band
 
+    @cached_property
+    def _pixels(self) -> tuple[Array, Array, Array, Array]:
+        """Irradiance at the image's samples, its half spectrum, and the pixels' transfer function and its conjugate.
+
+        Made when first used: a calibration, whose camera has pixels of its own, never uses them.
+        """
+        xp, path = self.backend.xp, self._first
+        transfer = xp.asarray(pixel_filter(path, self._fine).astype(path.source.dtype))
+        image = xp.zeros(self.image_plane.shape, path.response.dtype)
+        return image, xp.zeros(transfer.shape, transfer.dtype), transfer, transfer.conj()
+
     def forward(self, phase: Array, light: Array) -> None:
         """Fill `light` [H, W] from phase (rad) [H, W]; the fields are kept for `adjoint`."""
-        image = light if self.image is None else self.image
+        if not self.integrate:
+            self.irradiance(phase, light)
+            return
+        image, spectrum, transfer, _ = self._pixels
         self.irradiance(phase, image)
-        if self.image is not None:
-            self.backend.filter(image, self.filter, self.half_spectrum)
-            light[...] = image[self.at_pixels]
+        self.backend.filter(image, transfer, spectrum)
+        light[...] = image[self.at_pixels]
 
     def irradiance(self, phase: Array, image: Array) -> None:
         """Fill irradiance at the image's own samples, before any filter; the fields are kept for `adjoint`."""
@@ -229,12 +245,13 @@ class Optics:
 
     def _slope_over_image(self, slope: Array) -> Array:
         """A gradient over light [H, W] as one over the image's own samples."""
-        if self.image is None:
+        if not self.integrate:
             return slope
-        self.image[...] = 0
-        self.image[self.at_pixels] = slope
-        self.backend.filter(self.image, self.filter_back, self.half_spectrum)
-        return self.image
+        image, spectrum, _, conjugate = self._pixels
+        image[...] = 0
+        image[self.at_pixels] = slope
+        self.backend.filter(image, conjugate, spectrum)
+        return image
 
     def _back(self, image: Array, state: int) -> None:
         """Fill the panel's spectrum with 2 slope z of every mode of a state, back through the pupil."""

@@ -101,6 +101,29 @@ def test_light_that_stays_is_not_propagated_again_and_gives_the_cameras_slopes()
     assert slopes.distance == 0 and not slopes.over_panel["green"].any()
 
 
+def test_colours_share_the_memory_of_their_fields_and_say_what_each_says_alone() -> None:
+    colours = {"green": 520.0, "red": 638.0, "blue": 450.0}
+    bases = {
+        c: ColourLightPath(single(ideal_path(SHAPE, 8e-6, nm * 1e-9, 8e-3, 1.0)), nm)
+        for c, nm in colours.items()
+    }
+    rng = np.random.default_rng(3)
+    shots = [
+        Shot(c, grains(SHAPE, 3, k), *rng.uniform(0.5, 1.5, (2, *SHAPE)).astype(np.float32))
+        for k, c in enumerate([*colours, *colours])
+    ]
+    start = Estimate(Drift(distance_mm=0.05), View(SHAPE))
+    together = Misfit(bases, shots)
+    chi2, slopes = together.at(start)
+    alone = [Misfit({c: bases[c]}, [s for s in shots if s.channel == c]).at(start) for c in colours]
+    assert chi2 == pytest.approx(sum(one for one, _ in alone), rel=1e-6)
+    for (_, one), colour in zip(alone, colours, strict=True):
+        np.testing.assert_allclose(slopes.over_panel[colour], one.over_panel[colour], rtol=1e-4, atol=1e-2)
+    assert slopes.distance == pytest.approx(sum(one.distance for _, one in alone), rel=1e-4)
+    fields = [o.image_plane.fields[0] for o in together.predictor.optics.values()]
+    assert np.shares_memory(fields[0], fields[1]) and np.shares_memory(fields[0], fields[2])
+
+
 def test_one_colours_captures_tell_how_much_the_others_say(monkeypatch: pytest.MonkeyPatch) -> None:
     """Along every direction to a factor that only costs a fit some steps."""
     bases, shots = {}, []
