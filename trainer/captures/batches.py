@@ -81,13 +81,12 @@ class Batch:
             seen=self.mask,
         )
 
-    def first(self, count: int) -> Batch:
-        """The batch's first captures alone."""
-        tensors = {k: getattr(self, k)[:count] for k in ("gray", "signal", "mask", "noise", "exposure")}
-        seen = None if self.seen is None else self.seen[:count]
-        return replace(
-            self, ids=self.ids[:count], shown_before=lambda: self.shown_before()[:count], seen=seen, **tensors
-        )
+    def only(self, places: list[int]) -> Batch:
+        """The batch's captures at these places alone."""
+        tensors = {k: getattr(self, k)[places] for k in ("gray", "signal", "mask", "noise", "exposure")}
+        seen = None if self.seen is None else self.seen[places]
+        ids = tuple(self.ids[k] for k in places)
+        return replace(self, ids=ids, shown_before=lambda: self.shown_before()[places], seen=seen, **tensors)
 
     def as_compared(self, counts: Tensor) -> Tensor:
         """Predicted counts [B, h, w] as `signal` is: smoothed where it is smoothed."""

@@ -8,6 +8,7 @@ from pathlib import Path
 from runtime.excess import PredictionErrors
 from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet, chosen, opened
+from trainer.fitting.gauss_newton import fit
 from trainer.fitting.predictor import evaluate_captures
 from trainer.fitting.refit import fit_from, least_for_order, raise_order, settled
 from trainer.model.model import EffectInstance, Model
@@ -56,6 +57,34 @@ def try_effect(
     batches = load(captures, chosen(captures, ids))
     name = start.effect.name
     fitted = fit_from(model, start, batches, iterations)
+    if raising:
+        fitted = raise_order(fitted, name, batches, least_for_order)
+    return _judged(name, fitted.model, captures, held_ids)
+
+
+def try_on_few(
+    folder: Path, ids: tuple[str, ...], model: Model, start: EffectInstance
+) -> tuple[Model, float]:
+    """Fit one effect, with present ones as they are, to a few captures.
+
+    Returns
+    -------
+    (Model, float)
+        The fitted model, and its excess on these same captures: what it cannot explain of them, it cannot explain of
+        all.
+    """
+    captures = opened(folder)
+    fitted = fit_from(model, start, load(captures, chosen(captures, ids)), iterations=8)
+    return fitted.model, fitted.errors.excess
+
+
+def try_further(
+    folder: Path, ids: tuple[str, ...], held_ids: tuple[str, ...], model: Model, name: str, raising: bool
+) -> CandidateFit:
+    """Go on with the fit of effect `name` from where it is in a model, as `try_effect` does from a start."""
+    captures = opened(folder)
+    batches = load(captures, chosen(captures, ids))
+    fitted = fit(model, [name], batches, iterations=8)
     if raising:
         fitted = raise_order(fitted, name, batches, least_for_order)
     return _judged(name, fitted.model, captures, held_ids)

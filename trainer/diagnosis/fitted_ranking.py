@@ -8,7 +8,14 @@ from runtime.excess import PredictionErrors
 from runtime.program.progress import Progress
 from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.candidate_fits import CandidateFit
-from trainer.diagnosis.ranking import RankedEffect, raise_orders, rank, try_all, try_together_with_present
+from trainer.diagnosis.ranking import (
+    RankedEffect,
+    raise_orders,
+    rank,
+    try_all,
+    try_near,
+    try_together_with_present,
+)
 from trainer.diagnosis.screen import ScreenResult
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import Catalogue
@@ -58,7 +65,8 @@ def fitted_ranking(
     complete = thresholds.complete(before.excess, ideal_excess)
 
     def raised(fits: Sequence[CandidateFit]) -> list[CandidateFit]:
-        return raise_orders(roles, model, before, fits, pool, lambda _: report(0.6, "raising orders"))
+        report(0.6, "raising orders")
+        return raise_orders(roles, before, fits, pool)
 
     def ranked(fits: Sequence[CandidateFit]) -> list[RankedEffect]:
         return rank(before, fits, known, thresholds, ideal_excess, len(order))
@@ -102,13 +110,14 @@ def _first_fits(
         before.excess, ideal_excess
     ):
         return try_all(roles, model, wanted[:2], pool, report, 0.3, 0.6)
-    first = (
-        wanted if thorough else [s for s in promising if s.removed_excess > RIVALS * order[0].removed_excess]
-    )
-    fits = try_all(roles, model, first, pool, report, 0.3, 0.5)
+    if thorough:
+        return try_all(roles, model, wanted, pool, report, 0.3, 0.6)
+    first = [s for s in promising if s.removed_excess > RIVALS * order[0].removed_excess]
+    fits = try_near(roles, model, first, [], thresholds.excess, pool, report, 0.3, 0.4)
     if _settled(fits, before, thresholds, ideal_excess):
         return fits
-    return fits + try_all(roles, model, [s for s in wanted if s not in first], pool, report, 0.5, 0.6)
+    rest = [s for s in wanted if s not in first]
+    return fits + try_near(roles, model, rest, fits, thresholds.excess, pool, report, 0.4, 0.6)
 
 
 def _settled(

@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from runtime.excess import PredictionErrors, RemovedExcess, removed_excess
 from runtime.program.progress import Progress
+from trainer.captures.capture_table import Capture
 from trainer.captures.held_out import CaptureRoles
-from trainer.diagnosis.candidate_fits import CandidateFit, try_effect, try_together
+from trainer.diagnosis.candidate_fits import CandidateFit, try_effect, try_further, try_on_few, try_together
 from trainer.diagnosis.screen import ScreenResult
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.definition import Effect
 from trainer.effects.effect_catalogue import Catalogue
 from trainer.fitting.pool import Pool
+from trainer.fitting.predictor import evaluate_captures
 from trainer.model.model import Model
 from trainer.model.parameters import json_values
 
 # A number for each pixel takes up a little of whatever stays in its place: share of the excess that it must remove.
 PIXEL_SHARE = 0.01
+# A candidate is near the best where it leaves at most NEAR times as much on few captures, and removes half as much; or,
+# where its order can be raised, removes at least RAISED of what the best does. All are near where the best leaves more
+# than LITTLE of the excess.
+NEAR, RAISED, LITTLE = 2.0, 0.3, 0.9
 FITTED_TOGETHER = 3  # candidates fitted with the present effects free, when none explains anything alone
 
 
@@ -102,47 +108,103 @@ def try_all(
     return pool.map(try_effect, tasks, fitted)
 
 
-def raise_orders(
+def try_near(
     roles: CaptureRoles,
     model: Model,
-    before: PredictionErrors,
-    fits: Sequence[CandidateFit],
+    screened: Sequence[ScreenResult],
+    others: Sequence[CandidateFit],
+    least: float,
     pool: Pool,
-    tick: Callable[[int], None],
+    report: Progress,
+    start: float,
+    end: float,
+) -> list[CandidateFit]:
+    """Fit candidates to few captures, and those that come near the best there to all.
+
+    A candidate leaves no less on all captures than on few, where its numbers are free to suit these alone. So one that
+    is far from the best there cannot be taken for it.
+
+    Parameters
+    ----------
+    others : sequence of CandidateFit
+        Candidates that are fitted already, to compare with.
+    least : float
+        Excess that makes no difference.
+    report, start, end
+        As for `try_all`.
+
+    Returns
+    -------
+    list of CandidateFit
+        Of those that come near.
+    """
+    if len(screened) + len(others) < 2:
+        return try_all(roles, model, screened, pool, report, start, end)
+    telling = _telling(roles, model)
+    few = tuple(c.capture for c in telling)
+    screened = sorted(screened, key=lambda s: not s.start.effect.rugged)
+    tasks = [(roles.folder, few, model, s.start) for s in screened]
+    share = (end - start) / max(1, len(tasks))
+    fits = pool.map(try_on_few, tasks, lambda n: report(start + n * share, "fitting candidates"))
+    before, *compared = (
+        evaluate_captures(roles.captures, telling, one).excess for one in (model, *(f.model for f in others))
+    )
+    left = min(compared + [excess for _, excess in fits])
+    again = [
+        (fitted, s.effect)
+        for (fitted, excess), s in zip(fits, screened, strict=True)
+        if left > LITTLE * before or excess <= _near(left, before, least, len(s.start.effect.orders) > 1)
+    ]
+    return try_further_all(roles, again, False, pool)
+
+
+def _telling(roles: CaptureRoles, model: Model) -> list[Capture]:
+    """The capture of each colour and plane of which a model leaves most unexplained, in counts."""
+    left = {}
+    for c in roles.fitted:
+        errors = evaluate_captures(roles.captures, [c], model)
+        left[c.capture] = float(errors.squared.sum() - errors.noise.sum())
+    ordered = sorted(roles.fitted, key=lambda c: left[c.capture])
+    return list({(c.channel, c.plane_mm): c for c in ordered}.values())
+
+
+def _near(left: float, before: float, least: float, can_be_raised: bool) -> float:
+    """Excess on few captures up to which a candidate is near the best, which leaves `left` there."""
+    if can_be_raised:
+        return before - RAISED * (before - left)
+    return min(NEAR * left + least, (before + left) / 2)
+
+
+def try_further_all(
+    roles: CaptureRoles, fitted: Sequence[tuple[Model, str]], raising: bool, pool: Pool
+) -> list[CandidateFit]:
+    """Go on with fits of one effect in each model, and raise its order as far as that helps if that is asked for."""
+    ids = tuple(c.capture for c in roles.fitted)
+    held = tuple(c.capture for c in roles.held_out)
+    return pool.map(try_further, [(roles.folder, ids, held, model, name, raising) for model, name in fitted])
+
+
+def raise_orders(
+    roles: CaptureRoles, before: PredictionErrors, fits: Sequence[CandidateFit], pool: Pool
 ) -> list[CandidateFit]:
     """Raise the order of the fitted candidates that do about as well as the best.
 
     Parameters
     ----------
     before : PredictionErrors
-        Held-out errors of `model`.
-    tick : callable
-        Called with how many are done.
+        Held-out errors without any of the candidates.
     """
     if not fits:
         return []
-    ids = tuple(c.capture for c in roles.fitted)
-    held = tuple(c.capture for c in roles.held_out)
     least, most = min(f.held_out.excess for f in fits), before.excess
     again = [
-        k
-        for k, f in enumerate(fits)
+        (f.model, f.effect)
+        for f in fits
         if len(f.model.instance(f.effect).effect.orders) > 1
-        and most - f.held_out.excess > 0.3 * (most - least)
+        and most - f.held_out.excess > RAISED * (most - least)
     ]
-    tasks = [
-        (
-            roles.folder,
-            ids,
-            held,
-            replace(model, gain=fits[k].model.gain),
-            fits[k].model.instance(fits[k].effect),
-            True,
-        )
-        for k in again
-    ]
-    better = dict(zip(again, pool.map(try_effect, tasks, tick), strict=True))
-    return [better.get(k, f) for k, f in enumerate(fits)]
+    better = {f.effect: f for f in try_further_all(roles, again, True, pool)}
+    return [better.get(f.effect, f) for f in fits]
 
 
 def try_together_with_present(

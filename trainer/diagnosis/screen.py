@@ -19,7 +19,7 @@ from trainer.captures.capture_set import chosen, opened
 from trainer.effects.definition import Effect
 from trainer.effects.evidence import Evidence
 from trainer.effects.own_effect import starts_of
-from trainer.fitting.jacobian import keys_of, slopes_of, weighted_residuals
+from trainer.fitting.jacobian import keys_of, remaining, stacked, weighted_residuals
 from trainer.fitting.least_squares_gain import with_gain
 from trainer.fitting.many_numbers import ManySlopes, has_many
 from trainer.fitting.predictor import Predictor, lights_of
@@ -83,12 +83,12 @@ def screen_batches(batches: list[Batch], model: Model, effects: tuple[Effect, ..
             predictors = [Predictor(reach, b) for b in batches]
             points = [p.trace(model) for p in predictors]
             few = [p.effect.name for p in model.present if not has_many(p)]
-            nuisance = _stacked(model, keys_of(model, few), predictors, points)
+            nuisance = stacked(model, keys_of(model, few), predictors, points)
             prepared[opens_iris] = (predictors, points, *nuisance)
         predictors, points, residual, present = prepared[opens_iris]
         noise = sum(float((b.mask * b.noise).sum()) for b in batches)
         scale = float(joined([b.errors(torch.zeros_like(b.signal)) for b in batches]).variance.sum())
-        before = (_remaining(residual, present) - noise) / scale
+        before = (remaining(residual, present) - noise) / scale
         start = _start(effect, model, predictors, points)
         trial = model.having(start)
         moved = [p.trace(trial, effect.stage, t) for p, t in zip(predictors, points, strict=True)]
@@ -96,8 +96,8 @@ def screen_batches(batches: list[Batch], model: Model, effects: tuple[Effect, ..
         if has_many(start):
             left = _remaining_of_many(trial, effect.name, predictors, moved, present)
         else:
-            residual_there, slopes = _stacked(trial, keys_of(trial, [effect.name]), predictors, moved)
-            left = _remaining(residual_there, torch.cat([slopes, present]))
+            residual_there, slopes = stacked(trial, keys_of(trial, [effect.name]), predictors, moved)
+            left = remaining(residual_there, torch.cat([slopes, present]))
         after = (left - noise) / scale
         results.append(ScreenResult(effect.name, start, before, after))
     return results
@@ -127,7 +127,7 @@ def _one_step_ahead(
 ) -> float:
     """Squared error that a straight-line step from a start would leave."""
     trial = model.having(start)
-    return _remaining(*_stacked(trial, keys_of(trial, [start.effect.name]), predictors, points))
+    return remaining(*stacked(trial, keys_of(trial, [start.effect.name]), predictors, points))
 
 
 def _remaining_of_many(
@@ -140,26 +140,3 @@ def _remaining_of_many(
     there = slopes.along_with_others(slopes.step(residuals))
     left = slopes.alone([r - t for r, t in zip(residuals, there, strict=True)])
     return sum(float((one.double() ** 2).sum()) for one in left)
-
-
-def _stacked(
-    model: Model, keys: tuple[tuple[str, str, int], ...], predictors: list[Predictor], points: list[Trace]
-) -> tuple[Tensor, Tensor]:
-    """Weighted residual [pixels] and derivatives [keys + colours, pixels] over all batches."""
-    channels = list(dict.fromkeys(p.batch.channel for p in predictors))
-    residuals, _ = weighted_residuals(model, predictors, points)
-    return torch.cat(residuals), torch.cat(slopes_of(model, keys, channels, predictors, points), dim=1)
-
-
-def _remaining(residual: Tensor, slopes: Tensor) -> float:
-    """Sum of squares of the residual outside the span of the columns."""
-    norms = torch.linalg.vector_norm(slopes, dim=1, dtype=torch.float64)
-    slopes = slopes[norms > 1e-9 * float(norms.max() + 1e-30)]
-    norms = norms[norms > 1e-9 * float(norms.max() + 1e-30)]
-    total = float((residual.double() ** 2).sum())
-    if not len(norms):
-        return total
-    normal = (slopes @ slopes.T).double() / torch.outer(norms, norms)
-    along = (slopes @ residual).double() / norms
-    normal += 1e-6 * torch.eye(len(norms), dtype=torch.float64)
-    return total - float(along @ torch.linalg.solve(normal, along))

@@ -109,3 +109,26 @@ def weighted_residuals(
         residuals.append((batch.mask * (batch.signal - prediction)).reshape(-1))
         errors.append(batch.errors(prediction))
     return residuals, joined(errors)
+
+
+def stacked(
+    model: Model, keys: tuple[tuple[str, str, int], ...], predictors: list[Predictor], points: list[Trace]
+) -> tuple[Tensor, Tensor]:
+    """Weighted residual [pixels] and derivatives [keys + colours, pixels] over all batches."""
+    channels = list(dict.fromkeys(p.batch.channel for p in predictors))
+    residuals, _ = weighted_residuals(model, predictors, points)
+    return torch.cat(residuals), torch.cat(slopes_of(model, keys, channels, predictors, points), dim=1)
+
+
+def remaining(residual: Tensor, slopes: Tensor) -> float:
+    """Sum of squares of the residual outside the span of the columns."""
+    norms = torch.linalg.vector_norm(slopes, dim=1, dtype=torch.float64)
+    slopes = slopes[norms > 1e-9 * float(norms.max() + 1e-30)]
+    norms = norms[norms > 1e-9 * float(norms.max() + 1e-30)]
+    total = float((residual.double() ** 2).sum())
+    if not len(norms):
+        return total
+    normal = (slopes @ slopes.T).double() / torch.outer(norms, norms)
+    along = (slopes @ residual).double() / norms
+    normal += 1e-6 * torch.eye(len(norms), dtype=torch.float64)
+    return total - float(along @ torch.linalg.solve(normal, along))
