@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
 import os
 import resource
 import tempfile
@@ -23,16 +22,16 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from multiprocessing.connection import Connection
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-from firmware_iface.virtual import BenchDescription, VirtualHeadset, make_defect
+from firmware_iface.virtual import BenchDescription, make_defect
 from firmware_iface.virtual.bench_description import ChannelDescription
+from firmware_iface.virtual.bench_process import bench_process
 from firmware_iface.virtual.simulated_panel import panel_path_nm
+from firmware_iface.virtual.virtual_devices import VirtualCamera, VirtualLasers, VirtualPanel
 from runtime.bundle.bundle_folder import read_bundle, write_bundle
 from runtime.bundle.light_path_arrays import load_light_path, pack_light_paths
 from runtime.calibration.bundle_replacement import replace_bundle
@@ -66,75 +65,30 @@ def write_ideal(folder: Path, shape: tuple[int, int], distance_mm: float, colour
     write_bundle(folder, arrays, {"paths": records, "distance_mm": distance_mm}, {"bench": "ideal"})
 
 
-def serve(pipe: Connection, bench: BenchDescription) -> None:
-    """A simulated headset at one end of a pipe: one call after another, until nothing is asked for."""
-    headset = VirtualHeadset(bench, 1)
-    for part, name, arguments in iter(pipe.recv, None):
-        one = getattr(headset, part) if part else headset
-        if name == "exposure_ms":
-            one.exposure_ms = arguments[0]
-            pipe.send(None)
-        else:
-            pipe.send(getattr(one, name)(*arguments))
-
-
-class FarCamera:
-    """The camera of a headset in another process.
+class TimedPictures:
+    """The pictures of a simulated headset in another process, and how long they were waited for.
 
     Attributes
     ----------
     waited_s : float, s
-        For pictures.
     first_s : float, s
         When the first was asked for.
     """
 
-    def __init__(self, bench: BenchDescription, pipe: Connection) -> None:
-        self.shape, self.bit_depth = (bench.camera.height, bench.camera.width), bench.camera.bit_depth
-        self._pipe, self._exposure_ms, self.waited_s, self.first_s = pipe, 10.0, 0.0, 0.0
+    def __init__(self, bench: BenchDescription, panel: VirtualPanel, lasers: VirtualLasers) -> None:
+        self._expose, self._panel, self._lasers = bench_process(bench, 1), panel, lasers
+        self.waited_s, self.first_s = 0.0, 0.0
+        self.camera = VirtualCamera(
+            (bench.camera.height, bench.camera.width), bench.camera.bit_depth, self._take
+        )
 
-    @property
-    def exposure_ms(self) -> float:
-        return self._exposure_ms
-
-    @exposure_ms.setter
-    def exposure_ms(self, value: float) -> None:
-        self._exposure_ms = value
-        asked(self._pipe, "camera", "exposure_ms", value)
-
-    def capture(self) -> np.ndarray:
+    def _take(self) -> np.ndarray:
         begun = time.perf_counter()
         self.first_s = self.first_s or begun
-        counts: np.ndarray = asked(self._pipe, "camera", "capture")
+        power = {c: self._lasers.power(c) for c in self._lasers.channels}
+        counts = self._expose(self._panel.fields, power, self.camera.exposure_ms)
         self.waited_s += time.perf_counter() - begun
         return counts
-
-
-def asked(pipe: Connection, part: str, name: str, *arguments: object) -> Any:
-    """What a call of the headset at the pipe's other end returns."""
-    pipe.send((part, name, arguments))
-    return pipe.recv()
-
-
-@contextmanager
-def far_headset(bench: BenchDescription) -> Iterator[Devices]:
-    """The devices of a simulated headset in a process of its own."""
-    context = multiprocessing.get_context("spawn")
-    pipe, other = context.Pipe()
-    process = context.Process(target=serve, args=(other, bench))
-    process.start()
-    panel = SimpleNamespace(
-        shape=(bench.panel.height, bench.panel.width), show=lambda gray: asked(pipe, "panel", "show", gray)
-    )
-    lasers = SimpleNamespace(
-        channels=tuple(c.name for c in bench.channels),
-        off=lambda: asked(pipe, "lasers", "off"),
-        set_power=lambda channel, power: asked(pipe, "lasers", "set_power", channel, power),
-    )
-    camera = FarCamera(bench, pipe)
-    yield Devices(panel, lasers, camera, {}, lambda plane: asked(pipe, "", "move_to_plane", plane))
-    pipe.send(None)
-    process.join()
 
 
 class Parts:
@@ -174,7 +128,11 @@ def peak_mb() -> int:
 def measured(shape: tuple[int, int], distance_mm: float, colours: list[str], aloud: bool) -> dict[str, Any]:
     """One calibration: its parts, times (s), memory (MB) and errors."""
     bench = bench_of(shape, distance_mm, colours)
-    with tempfile.TemporaryDirectory() as name, far_headset(bench) as devices:
+    panel = VirtualPanel((bench.panel.height, bench.panel.width))
+    lasers = VirtualLasers(tuple(c.name for c in bench.channels))
+    pictures = TimedPictures(bench, panel, lasers)
+    devices = Devices(panel, lasers, pictures.camera, {}, lambda plane_mm: None)  # it has one plane
+    with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "bundle"
         write_ideal(folder, shape, distance_mm, colours)
         parts, begun = Parts(aloud), time.perf_counter()
@@ -190,7 +148,7 @@ def measured(shape: tuple[int, int], distance_mm: float, colours: list[str], alo
         replace_bundle(folder, bundle, found)
         end = time.perf_counter()
         parts(1.0, "end")
-        drift, camera = found.estimate.drift, devices.camera
+        drift = found.estimate.drift
         new = load_light_path(read_bundle(folder), colours[0])
         hidden = panel_path_nm(bench.defects[0], *shape, shape[1] / shape[0])  # type: ignore[arg-type]
         error = float(without_tilt(drift.wavefront(shape) - hidden).std())
@@ -203,8 +161,8 @@ def measured(shape: tuple[int, int], distance_mm: float, colours: list[str], alo
             "colours": colours,
             "cores": len(os.sched_getaffinity(0)),
             "load_before": round(os.getloadavg()[1], 2),
-            "first_pattern_to_exchange_s": round(end - camera.first_s, 1),
-            "of_it_waiting_for_simulated_pictures_s": round(camera.waited_s, 1),
+            "first_pattern_to_exchange_s": round(end - pictures.first_s, 1),
+            "of_it_waiting_for_simulated_pictures_s": round(pictures.waited_s, 1),
             "whole_s": round(end - begun, 1),
             "cpu_s": round(sum(p["cpu_s"] for p in parts.table()), 1),
             "peak_mb": parts.begun[-1][3],
