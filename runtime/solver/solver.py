@@ -261,7 +261,7 @@ class Solver:
             iterations = ITERATIONS if deadline_ms is None else _ENDLESS
         history: list[float] = []
         rounding = self.objective.rounding
-        stages = (0.0,) if rounding is None else SHARPNESS
+        stages = (0.0,) if rounding is None else SHARPNESS if iterations else SHARPNESS[-1:]
         for stage, sharpness in enumerate(stages, 1):
             if rounding is not None:
                 rounding.sharpness = sharpness

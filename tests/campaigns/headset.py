@@ -74,6 +74,7 @@ def write_configuration(
     colours: bool = False,
     shape: tuple[int, int] = SHAPE,
     metrics_port: int = 0,
+    patterns: int = 1,
 ) -> Path:
     """A bundle, a bench and a configuration in `folder`; returns the configuration's path.
 
@@ -94,6 +95,8 @@ def write_configuration(
         would take longer than a frame.
     metrics_port : int
         Of the service's metrics; 0: none.
+    patterns : int
+        Of each colour of a picture.
     """
     small = shape == SHAPE
     distance_mm = DISTANCE_MM * shape[0] / SHAPE[0]
@@ -111,7 +114,8 @@ def write_configuration(
         camera = f'kind = "oak"\naddress = "{oak}"\nframes_per_s = 100.0'
     elif not small:
         camera = 'kind = "tests.campaigns.still_camera:still_camera"'
-    panel = "refresh_hz = 1000.0\n" if small else f"refresh_hz = {60 * len(shown)}\ntimeout_ms = 500\n"
+    fields = len(shown) * patterns
+    panel = "refresh_hz = 1000.0\n" if small else f"refresh_hz = {60 * fields}\ntimeout_ms = 500\n"
     file.write_text(
         CONFIGURATION.format(
             folder=folder,
@@ -119,7 +123,7 @@ def write_configuration(
             solve_ms=solve_ms,
             stale_limit_ms=stale_limit_ms,
             camera=camera,
-            panel=panel + (f"fields = {len(shown)}\n" if colours else ""),
+            panel=panel + (f"fields = {fields}\n" if fields > 1 else ""),
             metrics_port=metrics_port,
             power=", ".join(f"{name} = 0.5" for name in shown),
         )
