@@ -184,7 +184,9 @@ def test_colours_planes_a_deadline_and_a_video(ideal: LightPath, sixteen: LightP
 
 
 @pytest.mark.parametrize("frames", [2, 4, 8, 9])
-def test_patterns_that_are_needed_at_once_are_no_worse_than_one_and_differ(ideal: LightPath, frames: int) -> None:
+def test_patterns_that_are_needed_at_once_are_no_worse_than_one_and_differ(
+    ideal: LightPath, frames: int
+) -> None:
     target = scene(SHAPE)
     one = Solver(ideal, grid="panel").frame(target, 0).quality.psnr_db
     solver = Solver(ideal, frames=frames, grid="panel")
