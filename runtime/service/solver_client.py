@@ -146,7 +146,9 @@ class SolverClient:
                 names = tuple(colours.split(","))
                 if self.colours and names != self.colours:
                     os.close(fd)
-                    self._lost(f"its bundle has other colours now ({colours}): start the service again")
+                    self._lost(
+                        f"its bundle has other colours now ({colours}; start the service again for them)"
+                    )
                     return
                 self._patterns = open_ring(fd, slots, (fields, height, width), np.uint8)
                 self.shape = self.shape or (channels, height, width)

@@ -75,6 +75,7 @@ def write_configuration(
     shape: tuple[int, int] = SHAPE,
     metrics_port: int = 0,
     patterns: int = 1,
+    half_width: float = 1.0,
 ) -> Path:
     """A bundle, a bench and a configuration in `folder`; returns the configuration's path.
 
@@ -97,17 +98,20 @@ def write_configuration(
         Of the service's metrics; 0: none.
     patterns : int
         Of each colour of a picture.
+    half_width : float
+        Of the iris, as a share of the panel's band.
     """
     small = shape == SHAPE
     distance_mm = DISTANCE_MM * shape[0] / SHAPE[0]
-    path = converted(ideal_path(shape, distance_mm * 1e-3), np.float32)
+    path = converted(ideal_path(shape, distance_mm * 1e-3, half_width), np.float32)
     shown = COLOURS if colours else {"green": 520.0}
     records, arrays = pack_light_paths([(name, distance_mm, nm, path) for name, nm in shown.items()])
     write_bundle(folder / "bundle", arrays, {"paths": records, "distance_mm": distance_mm}, {})
     channels = [f'[[channel]]\nname = "{name}"\nwavelength_nm = {nm}\n' for name, nm in shown.items()]
     coarse = "[simulation]\nsubpixels = 2\n" if colours else ""  # three colours take a third of the time each
     bench = BENCH.format(height=shape[0], width=shape[1], distance_mm=distance_mm)
-    (folder / "bench.toml").write_text(bench + "".join(channels) + coarse)
+    iris = f"[iris]\nhalf_width = {half_width}\n"
+    (folder / "bench.toml").write_text(bench + iris + "".join(channels) + coarse)
     file = folder / "headset.toml"
     camera = f'kind = "virtual"\nbus = "virtual:{folder}/hardware.sock"'
     if oak:

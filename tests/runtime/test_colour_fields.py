@@ -113,9 +113,10 @@ def test_what_has_no_field_or_no_laser_is_refused() -> None:
         gated(devices(headset), ("red", "infrared"), 3)
 
 
-def test_through_the_drivers_no_light_is_in_another_colours_field(tmp_path: Path) -> None:
+@pytest.mark.parametrize("patterns", [1, 2])
+def test_through_the_drivers_no_light_is_in_another_colours_field(tmp_path: Path, patterns: int) -> None:
     """On emulated hardware, whose panel records what was on it whenever a light output was open."""
-    file = write_configuration(tmp_path, colours=True)
+    file = write_configuration(tmp_path, colours=True, patterns=patterns)
     grays = {colour: pattern(k) for k, colour in enumerate(COLOURS)}
     truth = VirtualHeadset(BenchDescription(
         channels=tuple(ChannelDescription(name, nm) for name, nm in COLOURS.items())
