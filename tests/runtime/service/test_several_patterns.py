@@ -16,6 +16,7 @@ import pytest
 from firmware_iface.errors import InputError
 from firmware_iface.lasers.eye_safety import GatedLight, spot_shares
 from firmware_iface.virtual.remote_hardware import RemoteHardware
+from runtime.headset.device_findings import _unlit
 from runtime.service.client import Client, RefusedError
 from runtime.service.configuration import read_configuration
 from runtime.service.event_loop import EventLoop
@@ -251,3 +252,15 @@ def test_a_solver_that_comes_back_with_other_colours_is_ended(tmp_path: Path) ->
 
 def linked() -> tuple[MessageLink, MessageLink]:
     return tuple(MessageLink(one, SOLVER) for one in socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET))  # type: ignore[return-value]
+
+
+def test_only_the_laser_of_the_colour_that_is_shown_needs_power(tmp_path: Path) -> None:
+    file = write_configuration(tmp_path, colours=True)
+    text = file.read_text().replace("{ red = 0.5, green = 0.5, blue = 0.5 }", "{ green = 0.5 }")
+    file.write_text(text)
+    assert [p.split(" and ")[0] for p in _unlit(read_configuration(file))] == [
+        "the service shows red",
+        "the service shows blue",
+    ]
+    file.write_text(text.replace("[service]\n", "[service]\nchannel = 'green'\n"))
+    assert _unlit(read_configuration(file)) == []
