@@ -6,8 +6,9 @@ kind = "board"                or "dlpc900", TI's phase light modulator, or "mirr
 bus = "virtual:SOCKET"        emulated hardware (firmware_iface.virtual.served); without it, the host's USB
 serial = "HL0001"             where several are attached
 refresh_hz = 60.0             of the panel itself; with fields, of a field
-fields = 3                    board, dlpc900: colours in turn, a field each, with lasers gated to them; without it, one
-                              colour (version 1 of the board's protocol)
+fields = 3                    board, dlpc900: patterns in turn, a field each, with lasers gated to them: 3 for three
+                              colours, 6 for two patterns of each; without it, one colour and one pattern (version 1 of
+                              the board's protocol)
 modulator = "p47"             dlpc900: or "p67"
 display = 1                   mirrored, and dlpc900 unless frames are uploaded over USB: N of /dev/fbN
 height = 1080                 mirrored: its pixels
@@ -36,6 +37,7 @@ frames_per_s = 60.0
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -44,12 +46,13 @@ from firmware_iface.errors import InputError, nearest
 from firmware_iface.lasers import VIRTUAL_CHANNELS, LaserChannel
 from firmware_iface.lasers.eye_safety import GatedLight, exposure
 from firmware_iface.own_device import check_kind, open_own
-from firmware_iface.panel.fields import light_times_us
+from firmware_iface.panel.fields import FieldPanel, light_times_us
 from firmware_iface.toml_tables import parameter, read_table
 
 Table = Mapping[str, Any]
 
 WITH_FIELDS = ("board", "dlpc900")
+MOST_LASERS = 3  # of a board: no more colours are shown in turn
 KINDS = {"panel": ("board", "dlpc900", "mirrored"), "camera": ("oak", "virtual")}
 
 
@@ -61,7 +64,7 @@ class PanelTable:
     bus: str = parameter("usb", "usb, or virtual:SOCKET")
     serial: str = parameter("", "serial number, where several are attached")
     refresh_hz: float = parameter(60.0, "of the panel", 10, 1000)
-    fields: int = parameter(1, "of a frame: colours in turn", 1, 8)
+    fields: int = parameter(1, "of a frame: colours in turn, each as often as it has patterns", 1, 24)
     timeout_ms: float = parameter(80.0, "longest wait for one transfer", 5, 10000)
     modulator: str = parameter("p47", "of a DLPC900", choices=("p47", "p67"))
     display: int = parameter(-1, "N of /dev/fbN; -1: none", -1, 63)
@@ -90,8 +93,8 @@ class CameraTable:
     frames_per_s: float = parameter(60.0, "pictures a second", 1, 1000)
 
 
-def open_panel(table: Table) -> Any:
-    """The panel of a configuration's [panel].
+def open_panel(table: Table, gated: GatedLight | None = None) -> Any:
+    """The panel of a configuration's [panel]; where it shows fields, it refuses frames with more light than `gated`.
 
     Raises
     ------
@@ -111,13 +114,16 @@ def open_panel(table: Table) -> Any:
     if settings.kind == "mirrored":
         return open_mirrored(max(0, settings.display), (settings.height, settings.width))
     if settings.kind == "dlpc900":
-        return open_dlpc900(
-            None if settings.display < 0 else settings.display,
-            modulator={"p47": P47, "p67": P67}[settings.modulator],
-            serial=settings.serial or None,
-            timeout_s=settings.timeout_ms / 1000,
-            exposure_us=period_us if settings.fields > 1 else 16000,
-            fields=settings.fields,
+        return _budgeted(
+            open_dlpc900(
+                None if settings.display < 0 else settings.display,
+                modulator={"p47": P47, "p67": P67}[settings.modulator],
+                serial=settings.serial or None,
+                timeout_s=settings.timeout_ms / 1000,
+                exposure_us=period_us if settings.fields > 1 else 16000,
+                fields=settings.fields,
+            ),
+            gated,
         )
     timing = Timing(period_us, light_delay_us=period_us // 4, light_width_us=period_us // 2)
     backend = None
@@ -125,29 +131,47 @@ def open_panel(table: Table) -> Any:
         from firmware_iface.virtual.remote_hardware import usb_backend
 
         backend = usb_backend(settings.bus)
-    return open_board(
-        settings.serial or None,
-        backend=backend,
-        timing=timing,
-        timeout_s=settings.timeout_ms / 1000,
-        fields=settings.fields,
+    return _budgeted(
+        open_board(
+            settings.serial or None,
+            backend=backend,
+            timing=timing,
+            timeout_s=settings.timeout_ms / 1000,
+            fields=settings.fields,
+        ),
+        gated,
     )
 
 
+def _budgeted(panel: Any, gated: GatedLight | None) -> Any:
+    """The panel, which shows no more light than the lasers are budgeted for."""
+    if isinstance(panel, FieldPanel):
+        panel.gated = gated
+    return panel
+
+
 def panel_fields(table: Table) -> int:
-    """How many fields a frame has on the panel of a configuration's [panel]; 1: it shows one colour."""
+    """How many fields a frame has on the panel of a configuration's [panel]; 1: one pattern, which is not gated."""
     return _panel_table(table).fields
 
 
-def gated_light(table: Table) -> GatedLight | None:
-    """How the panel of a configuration's [panel] gates the lasers, at most; None where it shows one colour."""
+def gated_light(table: Table, pulses: int) -> GatedLight | None:
+    """How the panel of a configuration's [panel] gates the lasers, at most; None where it does not.
+
+    Parameters
+    ----------
+    table : mapping
+        [panel].
+    pulses : int
+        In how many fields of a frame one laser may shine: the patterns of its colour.
+    """
     settings = _panel_table(table)
     if settings.fields == 1:
         return None
     field_us = round(1e6 / settings.refresh_hz)
     _, light_us = light_times_us(field_us)
     frame_us = settings.fields * field_us
-    return GatedLight(light_us / frame_us, 1e-6 * light_us, 1e-6 * frame_us)
+    return GatedLight(pulses * light_us / frame_us, 1e-6 * light_us, 1e-6 * frame_us, pulses)
 
 
 def open_lasers(table: Table, gated: GatedLight | None = None) -> Any:
@@ -207,6 +231,9 @@ def simulated(tables: Mapping[str, Any]) -> bool:
 def check_tables(tables: Mapping[str, Table]) -> None:
     """Check [panel], [lasers] and [camera] without opening anything.
 
+    How many colours are shown is not known here, so the power is checked for as many as can be, which are lit least
+    often; `check_budget` checks it for the true number.
+
     Raises
     ------
     InputError
@@ -217,7 +244,8 @@ def check_tables(tables: Mapping[str, Table]) -> None:
     if "camera" in tables:
         _camera_table(tables["camera"])
     _lasers_table(tables["lasers"])
-    _check_budget(tables["lasers"], gated_light(tables["panel"]) if "panel" in tables else None)
+    fewest = math.ceil(panel_fields(tables["panel"]) / MOST_LASERS) if "panel" in tables else 1
+    check_budget(tables, fewest)
 
 
 def _panel_table(table: Table) -> PanelTable:
@@ -241,8 +269,23 @@ def _camera_table(table: Table) -> CameraTable:
     return settings
 
 
-def _check_budget(table: Table, gated: GatedLight | None) -> None:
-    """Check the power, summed over the fields of a frame: without a prediction, all light counts as one spot."""
+def check_budget(tables: Mapping[str, Table], pulses: int) -> None:
+    """Check the power of [lasers], summed over the fields of a frame: without a prediction, all light is one spot.
+
+    Parameters
+    ----------
+    tables : mapping
+        With [lasers] and, where there is one, [panel].
+    pulses : int
+        As in `gated_light`.
+
+    Raises
+    ------
+    InputError
+        Where it exceeds the Class 1 budget.
+    """
+    table = tables["lasers"]
+    gated = gated_light(tables["panel"], pulses) if "panel" in tables else None
     power, lasers = laser_power(table), {laser.name: laser for laser in laser_channels(table)}
     if mrad_per_pixel(table):
         return
@@ -253,9 +296,13 @@ def _check_budget(table: Table, gated: GatedLight | None) -> None:
     ).worst
     if used > 1:
         raise InputError(
-            f"power in [lasers] is {used:.2f} of the Class 1 budget of one spot; lower it, or write mrad_per_pixel, "
-            "so that the light of each pattern is predicted"
+            f"power in [lasers] is {used:.2f} of the Class 1 budget of one spot{_how(gated)}; lower it, or write "
+            "mrad_per_pixel, so that the light of each pattern is predicted"
         )
+
+
+def _how(gated: GatedLight | None) -> str:
+    return "" if gated is None else f", with each laser in {gated.pulses} of a frame's fields"
 
 
 def mrad_per_pixel(table: Table) -> float:

@@ -17,6 +17,12 @@ fields of a frame, keeps the limits above, and each pulse keeps the limit of a s
 pulse of t seconds. C5 is taken as 1 up to 5 mrad and as 0.2, its lowest value, above; C6 grows up to
 200 t^0.5 mrad, and 5 mrad at least. Pulses of all lasers are taken to come together.
 
+Where a laser has n pulses in a frame, any k of them that follow one another, k = 1 to n, also keep the limit of a
+single pulse: they bring k times the energy, taken as one pulse of k t. In truth they last longer, with the pauses
+between them, and the energy that is allowed only grows with time. In power that is P <= limit(k t). Every k is
+checked, since for a large source the limit over time falls (up to 0.6 ms), rises and falls again: the lowest can be
+at any k.
+
 This is arithmetic, not a classification. Software does not make a product Class 1.
 """
 
@@ -33,6 +39,7 @@ from firmware_iface.errors import InputError
 
 POINT_MRAD, LARGEST_MRAD = 1.5, 100.0
 SHORTEST_PULSE_S = 5e-6  # shorter ones count as this long
+ROUNDED = 1 + 1e-9
 SIZES_MRAD = tuple(np.geomspace(POINT_MRAD, LARGEST_MRAD, 13).tolist())
 ALL_IN_ONE_SPOT = (1.0,) * len(SIZES_MRAD)
 
@@ -108,32 +115,41 @@ def spot_shares(irradiance: NDArray[np.floating], mrad_per_pixel: float) -> tupl
 
 @dataclass(frozen=True)
 class GatedLight:
-    """Light that the panel gates: in each frame, every laser shines in its own field alone.
+    """Light that the panel gates: in each frame, every laser shines in its own fields alone.
 
     Attributes
     ----------
     duty : float
-        Share of the time in which each laser shines, at most.
+        Share of the time in which each laser shines, at most: in all of its pulses together.
     pulse_s : float, s
         How long it shines at a time, at most.
     frame_s : float, s
         Time of a frame, with all of its fields.
+    pulses : int
+        In how many fields of a frame one laser shines, at most.
 
     Raises
     ------
     InputError
-        For a value out of range.
+        For a value out of range, and for a share of the time that is less than that of the pulses.
     """
 
     duty: float
     pulse_s: float
     frame_s: float
+    pulses: int = 1
 
     def __post_init__(self) -> None:
-        if not (0 < self.duty <= 1 and 0 < self.pulse_s <= self.frame_s < math.inf):
+        lit_s = self.pulses * self.pulse_s
+        if not (0 < self.duty <= 1 and self.pulses >= 1 and 0 < lit_s <= self.frame_s * ROUNDED < math.inf):
             raise InputError(
-                f"light for {self.duty:g} of the time, in pulses of {self.pulse_s:g} s of {self.frame_s:g} s, cannot "
-                "be; give a share of 0 to 1 and a pulse within the frame."
+                f"light for {self.duty:g} of the time, in {self.pulses} pulses of {self.pulse_s:g} s of "
+                f"{self.frame_s:g} s, cannot be; give a share of 0 to 1 and pulses within the frame."
+            )
+        if lit_s > self.duty * self.frame_s * ROUNDED:
+            raise InputError(
+                f"{self.pulses} pulses of {self.pulse_s:g} s are {lit_s / self.frame_s:.3g} of a frame of "
+                f"{self.frame_s:g} s, and {self.duty:g} is given; give the share of all pulses together."
             )
 
 
@@ -182,7 +198,8 @@ def exposure(
     """
     if gated is not None:
         mean = exposure({c: gated.duty * p for c, p in power_uw.items()}, wavelength_nm, shares)
-        return Exposure(max(mean.thermal, _pulsed(power_uw, shares, gated.pulse_s)), mean.photochemical)
+        groups = (_pulsed(power_uw, shares, k * gated.pulse_s) for k in range(1, gated.pulses + 1))
+        return Exposure(max(mean.thermal, *groups), mean.photochemical)
     photochemical = sum(p / photochemical_limit_uw(wavelength_nm[c]) for c, p in power_uw.items())
     found = {c: (shares or {}).get(c, ALL_IN_ONE_SPOT) for c in power_uw}
     thermal = sum(power_uw.values()) / thermal_limit_uw(LARGEST_MRAD)  # all light, in the largest source
@@ -195,7 +212,7 @@ def exposure(
 def _pulsed(
     power_uw: Mapping[str, float], shares: Mapping[str, Sequence[float]] | None, pulse_s: float
 ) -> float:
-    """The share of the limit of a single pulse that these lasers use together."""
+    """The share of the limit of a single pulse of this length that these lasers use together."""
     found = {c: (shares or {}).get(c, ALL_IN_ONE_SPOT) for c in power_uw}
     worst = 0.0
     for k in range(len(SIZES_MRAD)):

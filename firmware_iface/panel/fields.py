@@ -1,4 +1,8 @@
-"""Frames of several fields in turn: a pattern each, and which lasers may shine on it, when and for how long."""
+"""Frames of several fields in turn: a pattern each, and which lasers may shine on it, when and for how long.
+
+A picture in C colours with N patterns for each has C N fields: all colours in turn, N times, so that colours break up
+least when the eye moves. Arrays of patterns [C N, H, W] are in this order everywhere, so field k is of colour k mod C.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.errors import InputError
+from firmware_iface.lasers.eye_safety import GatedLight
 from firmware_iface.panel.panel import Control, Frames, Gray, Panel, checked_gray
 
 SETTLE_SHARE, LIGHT_SHARE = 0.25, 0.5  # of a field's time: until the panel has settled, and of light at most
@@ -65,12 +70,16 @@ class FieldPanel(Panel):
     Attributes
     ----------
     fields : int
+    gated : GatedLight or None
+        Light that the lasers' power is budgeted for: a frame with more is refused. None: whoever shows frames and
+        powers the lasers sees to it.
     """
 
     def __init__(self, control: Control, frames: FieldFrames, fields: int) -> None:
         super().__init__(control, frames)
         self._fields = frames
         self.fields = fields
+        self.gated: GatedLight | None = None
 
     @property
     def field_us(self) -> int:
@@ -99,11 +108,13 @@ class FieldPanel(Panel):
         Raises
         ------
         InputError
-            For another number, type or size, or light that does not fit a field's time.
+            For another number, type or size, light that does not fit a field's time, or more than is budgeted.
         DeviceError
             Where the panel does not show them.
         """
         checked = checked_fields(fields, self.shape, self.field_us, self._fields.most_fields)
+        if self.gated is not None:
+            check_light(checked, self.field_us, self.gated)
         self.frames.wait(self._fields.send_fields(checked))
 
 
@@ -130,6 +141,28 @@ def checked_fields(
     return list(fields)
 
 
+def check_light(fields: Sequence[Field], field_us: int, gated: GatedLight) -> None:
+    """Check that a frame, shown again and again, gives no laser more light than is budgeted.
+
+    Raises
+    ------
+    InputError
+        Where a laser shines in more fields or for longer, or the frame is shorter.
+    """
+    if len(fields) * field_us < round(1e6 * gated.frame_s):
+        raise InputError(
+            f"a frame of {len(fields)} fields of {field_us} µs is shorter than the {gated.frame_s:g} s that the "
+            "lasers are budgeted for; show all fields of a frame."
+        )
+    for laser in range(max(field.lasers for field in fields).bit_length()):
+        widths = [field.width_us for field in fields if field.lasers >> laser & 1 and field.width_us]
+        if len(widths) > gated.pulses or max(widths, default=0) > round(1e6 * gated.pulse_s):
+            raise InputError(
+                f"laser {laser} would shine in {len(widths)} fields, up to {max(widths)} µs in each, and is budgeted "
+                f"for {gated.pulses} of {round(1e6 * gated.pulse_s)} µs; show fewer or shorter ones."
+            )
+
+
 def light_times_us(field_us: int) -> tuple[int, int]:
     """From the start of a field until the panel has settled, and the longest light after that, µs."""
     return round(SETTLE_SHARE * field_us), int(LIGHT_SHARE * field_us)
@@ -138,14 +171,15 @@ def light_times_us(field_us: int) -> tuple[int, int]:
 def colours_in_turn(
     grays: NDArray[np.uint8], lasers: Sequence[int], brightness: Sequence[float], field_us: int
 ) -> list[Field]:
-    """The frame of a picture in several colours: a field for each colour, lit by its own laser alone.
+    """The frame of a picture in C colours with N patterns for each: every pattern a field, lit by its own laser alone.
 
-    The light begins when the panel has settled, and lasts in proportion to the colour's brightness.
+    The light begins when the panel has settled, and lasts in proportion to the colour's brightness, alike in all of its
+    fields.
 
     Parameters
     ----------
-    grays : uint8 array [C, H, W]
-        The pattern of each colour.
+    grays : uint8 array [C N, H, W]
+        The patterns: of all colours in turn, N times.
     lasers : sequence of int
         The laser of each colour, counted from 0.
     brightness : sequence of float
@@ -156,11 +190,20 @@ def colours_in_turn(
     Returns
     -------
     list of Field
+
+    Raises
+    ------
+    InputError
+        Where the patterns are no whole number for each colour.
     """
+    if len(grays) % len(lasers):
+        raise InputError(
+            f"{len(grays)} patterns are no whole number for each of {len(lasers)} colours; give every colour as many."
+        )
     delay_us, most_us = light_times_us(field_us)
-    frame = []
-    for gray, laser, share in zip(grays, lasers, brightness, strict=True):
+    lights = []
+    for laser, share in zip(lasers, brightness, strict=True):
         width_us = round(min(1.0, max(0.0, share)) * most_us)
         width_us = width_us if width_us >= SHORTEST_LIGHT_US else 0
-        frame.append(Field(gray, 1 << laser if width_us else 0, delay_us, width_us))
-    return frame
+        lights.append((1 << laser if width_us else 0, delay_us, width_us))
+    return [Field(gray, *lights[k % len(lights)]) for k, gray in enumerate(grays)]

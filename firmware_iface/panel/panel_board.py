@@ -161,7 +161,8 @@ class BoardControl:
         if found.highest < 2 or self._fields > found.most_fields:
             most = found.most_fields if found.highest >= 2 else 1
             raise InputError(
-                f"{self._link.name} shows {most} fields at most, not {self._fields}; ask for less."
+                f"{self._link.name} shows {most} fields at most, not {self._fields}; ask for less (fields in [panel]): "
+                "fewer patterns of each colour."
             )
         self._link.control_out(VERSION, value=2)
         self.versions = found

@@ -57,6 +57,11 @@ def phase_waves() -> NDArray[np.float64]:
     return np.array(DISPLACEMENT) * 15 / 16
 
 
+def gray_levels() -> list[int]:
+    """The gray level nearest to each state: `gray_levels` in [panel] of bench.toml, so that solvers see them."""
+    return [round(256 * waves) for waves in phase_waves().tolist()]
+
+
 def states(gray: Gray) -> NDArray[np.uint8]:
     """The state, 0 to 15, whose phase is nearest on the circle to gray / 256 of a wave."""
     requested = np.arange(256)[:, None] / 256

@@ -27,6 +27,7 @@ class PanelDescription:
     levels: float = parameter(256.0, "gray levels of one wave", 1, 65536)
     fill_factor: float = parameter(1.0, "active share of a pixel's area", 0.05, 1)
     phase_sign: int = parameter(1, "-1 where more gray means less phase", choices=(1, -1))
+    gray_levels: tuple[float, ...] = parameter((), "that it has; others are shown as the nearest of them")
 
 
 @dataclass(frozen=True)
@@ -111,6 +112,13 @@ class BenchDescription:
                     f"bench '{self.name}' has two defects of kind '{defect.kind}'; keep one of them."
                 )
         camera, panel = self.camera, self.panel
+        grays = panel.gray_levels
+        if grays and (
+            len(grays) < 2 or any(not (g.is_integer() and 0 <= g <= 255) for g in map(float, grays))
+        ):
+            raise InputError(
+                f"'gray_levels' in [panel] of bench '{self.name}' needs two or more whole numbers from 0 to 255."
+            )
         if camera.registered and (camera.height, camera.width) != (panel.height, panel.width):
             raise InputError(
                 f"[camera] of bench '{self.name}' is registered but not of the panel's size; "
@@ -165,6 +173,9 @@ class BenchDescription:
         panel = asdict(self.panel)
         if self.panel.phase_sign == 1:
             del panel["phase_sign"]
+        del panel["gray_levels"]
+        if self.panel.gray_levels:
+            panel["gray_levels"] = [int(gray) for gray in self.panel.gray_levels]
         camera = asdict(self.camera)
         camera["homography"] = list(self.camera.homography)
         if self.camera.registered:

@@ -60,6 +60,11 @@ class Drive:
         panel = bench.panel
         self.q = bench.simulation.subpixels
         self.levels = panel.levels
+        self._own: Array | None = None  # the gray level shown for each of 0 to 255
+        if panel.gray_levels:
+            own = np.array(panel.gray_levels)
+            turns = (np.arange(256)[:, None] - own) / panel.levels
+            self._own = own[np.abs(turns - np.rint(turns)).argmin(1)]
         convention = bench.defect(Convention)
         self.sign = panel.phase_sign * (convention.phase_sign if convention else 1)
         self._curve = bench.defect(PhaseResponse)
@@ -106,7 +111,7 @@ class Drive:
         before : float64 array [H, W], optional
             What this returned for the capture before; None: the gray levels have been shown for long.
         """
-        settled = self._shape(gray)
+        settled = self._shape(self._has(gray))
         if before is None or not self.slow:
             return settled
         return (1 - self._left) * settled + self._left * before
@@ -121,7 +126,7 @@ class Drive:
         d = self._absorption
         if d is None:
             return np.ones((1, 1), np.float32)
-        t = np.asarray(gray, np.float64) / 255
+        t = self._has(gray) / 255
         amplitude = 1 - d.fall * (t + d.curvature * t * (1 - t))
         return np.float32(self.sign) * self.spread(amplitude.astype(np.float32))
 
@@ -133,6 +138,13 @@ class Drive:
         t = np.asarray(gray, np.float64) / 255
         slope = -d.fall * (1 + d.curvature * (1 - 2 * t)) / 255
         return np.asarray(self.sign * self.spread_adjoint(gradient) * slope, np.float64)
+
+    def _has(self, gray: NDArray[np.floating]) -> Array:
+        """Gray levels as a panel of few levels shows them: the nearest of its own, also across the wave's end."""
+        asked = np.asarray(gray, np.float64)
+        if self._own is None:
+            return asked
+        return np.asarray(self._own[np.clip(np.rint(asked), 0, 255).astype(np.intp)])
 
     def slope(self, gray: NDArray[np.floating]) -> Single:
         """d magnitude / d gray, rad a gray level."""

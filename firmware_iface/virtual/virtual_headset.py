@@ -90,7 +90,7 @@ class VirtualHeadset:
         self._drift = Drift(description.defect(LaserDrift), seed)
         # how far a slow panel has turned after the last capture; None: as far as it was asked to
         self._turned = self._optics.turned(self.panel.gray, None)
-        self._recent: dict[str, _Seen] = {}
+        self._recent: dict[tuple[str, int], _Seen] = {}
         self._integrators: OrderedDict[tuple[int, int, int], Integrator] = OrderedDict()
 
     def move_to_plane(self, plane_mm: float) -> None:
@@ -107,11 +107,14 @@ class VirtualHeadset:
         dose = self.camera.exposure_ms / 10 * self._drift.gain(self.captures)
         motion = camera_motion(self.description, self.seed, self.captures)
         electrons = np.zeros(self.camera.shape)
-        for field in self.panel.fields:  # the camera integrates over whole frames
+        self._recent = {key: seen for key, seen in self._recent.items() if key[1] < len(self.panel.fields)}
+        for number, field in enumerate(self.panel.fields):  # the camera integrates over whole frames
             for k, channel in enumerate(self.lasers.channels):
                 power = self.lasers.power(channel) * field.share * (field.lasers >> k & 1)
                 if power > 0:
-                    seen = self._camera_irradiance(field.gray, channel, self.plane_mm, motion, self._turned)
+                    seen = self._camera_irradiance(
+                        field.gray, channel, self.plane_mm, motion, self._turned, number
+                    )
                     electrons = electrons + self._sensor.electrons(seen, dose * power)
             self._turned = self._optics.turned(field.gray, self._turned)
         rng = np.random.default_rng([self.seed, 11, self.captures])
@@ -219,9 +222,10 @@ class VirtualHeadset:
         plane_mm: float,
         motion: CameraMotion | None,
         before: NDArray[np.float64] | None = None,
+        field: int = 0,
     ) -> NDArray[np.float64]:
-        """Irradiance on camera pixels; kept for each channel, since a running camera repeats most of it."""
-        last = self._recent.get(channel)
+        """Irradiance on camera pixels; kept for each channel and field, since a running camera repeats most of it."""
+        last = self._recent.get((channel, field))
         if last is None or not last.holds(gray, plane_mm, before):
             light = self._optics.irradiance(gray, channel, plane_mm, before)
         elif last.motion == motion:
@@ -230,7 +234,7 @@ class VirtualHeadset:
             light = last.light
         seen = self._integrator(channel, plane_mm).camera(light, motion)
         seen.flags.writeable = False
-        self._recent[channel] = _Seen(gray.copy(), plane_mm, before, motion, light, seen)
+        self._recent[channel, field] = _Seen(gray.copy(), plane_mm, before, motion, light, seen)
         return seen
 
     def _integrator(self, channel: str, plane_mm: float) -> Integrator:

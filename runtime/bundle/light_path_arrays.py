@@ -8,7 +8,8 @@
 
 Fields that are None in a LightPath are not listed; `crosstalk` is two arrays, crosstalk_rows and
 crosstalk_columns, and `modulation` three: modulation_ends, modulation_factors and modulation_shares.
-Arrays that several planes or colours share are stored once.
+Arrays that several planes or colours share are stored once. Where the panel has few gray levels, the description's
+`panel` lists them as `gray_levels`: a light path's response is then of these alone, so that solvers see them.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 
 from firmware_iface.errors import InputError, nearest
 from runtime.bundle.bundle_folder import ARRAYS, MANIFEST, Bundle
+from runtime.lightpath.gray_levels import checked_gray_levels, shown_as
 from runtime.lightpath.grid import FINE, Grid
 from runtime.lightpath.light_path import LightPath
 
@@ -162,11 +164,18 @@ def load_light_path(bundle: Bundle, channel: str | None = None, plane_mm: float 
             raise InputError(f"{MANIFEST}: {where} has an array '{field}' that this release does not know")
     arrays = {field: _array(bundle, names.get(field), field, where) for field in NEEDED + OPTIONAL}
     _check_shapes(arrays, grid, where)
+    response, gray_levels, levels = arrays["response"], *_gray_levels(bundle)
+    if response is not None and gray_levels:
+        if response.size < 256:
+            raise InputError(
+                f"{MANIFEST} lists gray levels and {where} has {response.size}: export the bundle again"
+            )
+        response = response[shown_as(gray_levels, levels)]
     rows, columns = (arrays[name] for name in CROSSTALK)
     ends, factors, shares = (arrays[name] for name in MODULATION)
     return LightPath(
         grid=grid,
-        response=arrays["response"],
+        response=response,
         source=arrays["source"],
         transfers=arrays["transfers"],
         weights=arrays["weights"],
@@ -176,7 +185,18 @@ def load_light_path(bundle: Bundle, channel: str | None = None, plane_mm: float 
         aperture=(arrays["aperture"][0], arrays["aperture"][1]),  # type: ignore[index]
         irradiance_filter=arrays["irradiance_filter"],
         modulation=None if ends is None or factors is None or shares is None else (ends, factors, shares),
+        gray_levels=gray_levels,
     )
+
+
+def _gray_levels(bundle: Bundle) -> tuple[tuple[int, ...], float]:
+    """The gray levels that the bundle's panel has, none: all; and how many make one wave."""
+    panel = bundle.description.get("panel")
+    panel = panel if isinstance(panel, Mapping) else {}
+    levels = panel.get("levels", 256)
+    if not _is_number(levels) or levels < 1:
+        raise InputError(f"{MANIFEST}: 'levels' of its panel is {levels!r}: export the bundle again")
+    return checked_gray_levels(panel.get("gray_levels"), f"'gray_levels' in {MANIFEST}"), levels
 
 
 def plane_of(bundle: Bundle, channel: str | None = None, plane_mm: float | None = None) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 
 from runtime.calibration.drift import Drift, drifted
 from runtime.calibration.estimate import ColourLightPath, Estimate, Shot
-from runtime.calibration.response import SWEEP, best_period, thinned
+from runtime.calibration.response import best_period, swept, thinned
 from runtime.calibration.shown_patterns import GRAINS, HELD_OUT, grains, grating, proof_picture
 from runtime.calibration.taking import Noise, Taker
 from runtime.camera.registration import dot_pattern
@@ -70,7 +70,7 @@ def colour_patterns(channel: str, base: ColourLightPath, seed: int) -> ColourPat
     kept = [grains(shape, size, seed + 1000 + k) for k, size in enumerate(HELD_OUT)]
     return ColourPatterns(
         solve(path, np.maximum(dot_pattern(shape, dot_spacing(shape)), 1e-3), SOLVING).gray,
-        [grating(shape, period, g) for g in SWEEP],
+        [grating(shape, period, g) for g in swept(path)],
         [grains(shape, size, seed + k) for k, size in enumerate(GRAINS)],
         [*kept, proof_pattern(base, channel, Drift())],
     )

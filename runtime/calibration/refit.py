@@ -218,5 +218,5 @@ def _with_response(
     for channel, base in bases.items():
         sweeps[channel] = measured_sweep(predictor, captures[channel].sweep)
         believed = np.asarray(responses.get(channel, base.path.response), np.float64)
-        responses[channel] = fitted_response(believed, sweeps[channel])
+        responses[channel] = fitted_response(believed, sweeps[channel], base.path.gray_levels)
     return replace(estimate, drift=replace(estimate.drift, response=responses)), sweeps

@@ -18,6 +18,7 @@ from runtime.calibration.prediction import Predictor
 from runtime.calibration.shown_patterns import grating
 from runtime.camera.view import Sampler
 from runtime.lightpath.legendre import legendre_curve
+from runtime.lightpath.light_path import LightPath
 
 SWEEP = (*range(16, 256, 16), 255)  # gray levels
 PERIODS = (4, 6, 8, 12, 16, 24)  # pixels
@@ -45,6 +46,14 @@ class Sweep:
     phase: np.ndarray
     error: np.ndarray
     visibility: np.ndarray
+
+
+def swept(path: LightPath) -> tuple[int, ...]:
+    """The gray levels to sweep: SWEEP, and of a panel with few gray levels some that it has."""
+    has = np.array(path.gray_levels[1:])
+    if len(has) > len(SWEEP):
+        has = np.unique([has[np.abs(has - gray).argmin()] for gray in SWEEP])
+    return tuple(has.tolist()) or SWEEP
 
 
 def best_period(base: ColourLightPath, channel: str, estimate: Estimate, sample: Sampler) -> int:
@@ -149,13 +158,15 @@ def _harmonics(
     return mean, (2 * trials[0] - trials[1] - trials[2]) / 3, (trials[1] - trials[2]) / math.sqrt(3)
 
 
-def fitted_response(believed: np.ndarray, sweep: Sweep) -> np.ndarray:
+def fitted_response(believed: np.ndarray, sweep: Sweep, gray_levels: Sequence[int] = ()) -> np.ndarray:
     """A response that follows a sweep: the one that was believed, and a smooth deviation, 0 at gray 0.
 
     Parameters
     ----------
     believed : float array [levels], rad
     sweep : Sweep
+    gray_levels : sequence of int
+        As in a LightPath: others go on having the phase of the one that they are shown as.
 
     Returns
     -------
@@ -169,6 +180,9 @@ def fitted_response(believed: np.ndarray, sweep: Sweep) -> np.ndarray:
     weight = 1 / np.hypot(sweep.error, 1e-3)  # no panel is smoother than a milliradian
     terms = np.linalg.lstsq((shapes[:, sweep.gray] * weight).T, deviation * weight, rcond=None)[0]
     response = believed + terms @ shapes
+    if gray_levels:
+        has = np.array(gray_levels)
+        response = response[has[np.abs(believed[:, None] - believed[has]).argmin(1)]]
     steps = np.diff(believed)
     if (steps >= 0).all():
         return np.maximum.accumulate(response)

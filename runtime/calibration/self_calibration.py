@@ -32,7 +32,7 @@ from runtime.calibration.information import measured_information
 from runtime.calibration.prediction import Predictor
 from runtime.calibration.refit import PIXELS, Progress, few, part_of, refit, start_view
 from runtime.calibration.replacement_rule import LEAST_EXCESS, Verdict, is_certain, replacement_verdict
-from runtime.calibration.response import SWEEP, Sweep
+from runtime.calibration.response import Sweep, swept
 from runtime.calibration.shown_patterns import GRAINS, HELD_OUT
 from runtime.calibration.taking import Taker
 from runtime.camera.view import View, view_of
@@ -140,7 +140,8 @@ def calibrate(
     say(0.0, "solving what is to be shown")
     patterns = {c: colour_patterns(c, bases[c], seed) for c in channels}
     started = time.perf_counter()
-    many = len(channels) * (len(GRAINS) + len(HELD_OUT) + len(SWEEP) + 8) + 2
+    gratings = sum(len(swept(base.path)) for base in bases.values())
+    many = len(channels) * (len(GRAINS) + len(HELD_OUT) + 8) + gratings + 2
 
     def showing(what: str) -> None:
         say(0.25 * min(taker.taken / many, 1), f"showing: {what}")

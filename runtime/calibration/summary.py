@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from runtime.calibration.drift import LOWEST_AMPLITUDE, LOWEST_WAVEFRONT
-from runtime.calibration.response import SWEEP
 from runtime.calibration.self_calibration import Calibration
 from runtime.calibration.shown_patterns import GRAINS, HELD_OUT
 from runtime.excess import removed_excess
@@ -37,13 +36,14 @@ def numbers(found: Calibration) -> dict[str, Any]:
         known = found.known_counts_per_ms.get(channel)
         terms = np.asarray(drift.log_amplitude[channel])
         beam = drift.amplitude(channel, shape)
+        last = base.path.gray_levels[-1] if base.path.gray_levels else -1
         colours[channel] = {
             "wavelength_nm": base.wavelength_nm,
             "illumination_rms": float(np.log(beam).std()),
             "illumination_error": _rms_error(found.errors.log_amplitude[channel], shape, LOWEST_AMPLITUDE),
             "illumination_terms": [float(v) for v in terms],
             "response_change_rad": float(np.abs((now - now[0]) - (was - was[0])).max()),
-            "response_gain": float((now[-1] - now[0]) / (was[-1] - was[0])),
+            "response_gain": float((now[last] - now[0]) / (was[last] - was[0])),
             "response_error_rad": float(np.median(sweep.error)),
             "grating_visibility": float(np.median(sweep.visibility)),
             "counts_per_ms": counts,
@@ -77,7 +77,12 @@ def numbers(found: Calibration) -> dict[str, Any]:
         "camera_scale": found.camera_scale,
         "channels": colours,
         "plane_mm": found.plane_mm,
-        "patterns": {"fitted": len(GRAINS), "gratings": len(SWEEP), "held_out": len(HELD_OUT) + 1, "dots": 1},
+        "patterns": {
+            "fitted": len(GRAINS),
+            "gratings": max(len(sweep.gray) for sweep in found.sweeps.values()),
+            "held_out": len(HELD_OUT) + 1,
+            "dots": 1,
+        },
         "captures": found.pictures_taken,
         "seconds": {name: round(value, 2) for name, value in found.seconds.items()},
     }

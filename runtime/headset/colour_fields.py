@@ -1,9 +1,10 @@
-"""A headset that shows colours in turn, for captures of its colours: each one has light in its own field alone.
+"""A headset that shows colours in turn, for captures of its colours: each one has light in its own fields alone.
 
-A picture of the camera is of whole frames, so that it has all of a field's light wherever in a frame it begins. The
-time of the light in a field makes it darker or brighter: `exposure_ms` is of light, as where a laser shines without
-pause. A laser is switched on when a frame with its field is displayed, and off before its field is dark, so that its
-photodiode always shows the light that there is.
+Where a frame has several fields for each colour, all of a colour's show the same pattern: a picture is of one
+pattern, with as much light as the service's pictures have. A picture of the camera is of whole frames, so that it has
+all of a field's light wherever in a frame it begins. The time of the light in a field makes it darker or brighter:
+`exposure_ms` is of light, as where a laser shines without pause. A laser is switched on when a frame with its field
+is displayed, and off before its field is dark, so that its photodiode always shows the light that there is.
 """
 
 from __future__ import annotations
@@ -51,12 +52,17 @@ def open_colours(spec: str, colours: Sequence[str], seed: int = 0) -> Iterator[D
     """
     tables = configuration_of(spec)
     fields = 1 if tables is None else panel_fields(tables["panel"])
-    with open_devices(spec, seed, fields) as devices:
+    with open_devices(spec, seed, fields, _each(fields, colours)) as devices:
         yield devices if fields == 1 else gated(devices, colours, fields)
 
 
+def _each(fields: int, colours: Sequence[str]) -> int:
+    """How many fields of a frame each colour has."""
+    return max(1, fields // len(colours))
+
+
 def gated(devices: Devices, colours: Sequence[str], fields: int) -> Devices:
-    """Devices whose panel shows `fields` fields, as devices that light each colour in its own field alone.
+    """Devices whose panel shows `fields` fields, as devices that light each colour in its own fields alone.
 
     Raises
     ------
@@ -86,10 +92,12 @@ class ColourPanel:
     colours : sequence of str
         In the order of their fields.
     fields : int
-        Of a frame; those beyond the colours' are dark.
+        Of a frame; each colour has as many, and those that are left over are dark.
 
     Attributes
     ----------
+    each : int
+        Fields of each colour.
     shape : (int, int)
         (H, W), pixels.
     light_us : int, µs
@@ -99,6 +107,7 @@ class ColourPanel:
     def __init__(self, devices: Devices, colours: Sequence[str], fields: int) -> None:
         self.shape: tuple[int, int] = tuple(devices.panel.shape)
         self._devices, self._colours, self._fields = devices, tuple(colours), fields
+        self.each = _each(fields, self._colours)
         self._lit: tuple[str, ...] = ()
         self._waiting: tuple[str, ...] = ()  # those of `_lit` whose laser is still off
         self.light_us = self.most_us
@@ -134,7 +143,7 @@ class ColourPanel:
         self.show_colours(np.stack([gray] * len(self._colours)))
 
     def show_colours(self, grays: np.ndarray) -> None:
-        """Show a pattern for each colour, uint8 [C, H, W], each in its own field.
+        """Show a pattern for each colour, uint8 [C, H, W], each in its own fields.
 
         Raises
         ------
@@ -146,7 +155,7 @@ class ColourPanel:
         lasers = [self._devices.lasers.channels.index(colour) for colour in self._colours]
         share = self.light_us / self.most_us
         brightness = [share if colour in self._lit else 0.0 for colour in self._colours]
-        frame = colours_in_turn(grays, lasers, brightness, self._devices.panel.field_us)
+        frame = self.each * colours_in_turn(grays, lasers, brightness, self._devices.panel.field_us)
         frame += [Field(grays[-1], 0, 0, 0)] * (self._fields - len(frame))
         self._devices.panel.show_fields(frame)
         for colour in self._waiting:
@@ -179,7 +188,7 @@ class WholeFrameCamera:
 
     @property
     def exposure_ms(self) -> float:
-        """Time of light in a picture, ms: of a field, over as many frames as it takes.
+        """Time of light in a picture, ms: of a colour's fields, over as many frames as it takes.
 
         The next pattern that is shown has it. Setting it raises InputError where the camera cannot expose for so many
         frames.
@@ -188,14 +197,15 @@ class WholeFrameCamera:
 
     @exposure_ms.setter
     def exposure_ms(self, value: float) -> None:
-        frames = max(1, math.ceil(1000 * value / self._panel.most_us - 1e-6))
-        light_us = max(SHORTEST_LIGHT_US, round(1000 * value / frames))
+        each = self._panel.each
+        frames = max(1, math.ceil(1000 * value / (each * self._panel.most_us) - 1e-6))
+        light_us = max(SHORTEST_LIGHT_US, round(1000 * value / (each * frames)))
         whole_ms = 1e-3 * frames * self._panel.frame_us
         longest_ms = getattr(self._camera, "longest_exposure_ms", math.inf)
         if longest_ms < whole_ms <= longest_ms * CLOCKS_DIFFER:
             whole_ms = longest_ms
         self._camera.exposure_ms = whole_ms
-        self._panel.light_us, self._exposure_ms = light_us, 1e-3 * frames * light_us
+        self._panel.light_us, self._exposure_ms = light_us, 1e-3 * each * frames * light_us
 
     def capture(self) -> np.ndarray:
         """One picture, uint16 counts [h, w], black level included."""

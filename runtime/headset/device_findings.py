@@ -224,12 +224,12 @@ def _unlit(configuration: Configuration) -> list[str]:
         channels = bundle_channels(read_bundle(configuration.bundle))
     except InputError:  # reported of the bundle
         return []
-    first = configuration.timing.channel or channels[0]
-    several = panel_fields(configuration.devices["panel"]) > 1
+    chosen = configuration.timing.channel
+    several = not chosen and panel_fields(configuration.devices["panel"]) > 1
     power = laser_power(configuration.devices["lasers"])
     return [
         f"the service shows {shown} and its laser gets no power: write power = {{ {shown} = 0.5 }} in [lasers]"
-        for shown in (channels if several else [first])
+        for shown in (channels if several else [chosen or channels[0]])
         if shown in channels and not power.get(shown, 0.0) > 0
     ]
 

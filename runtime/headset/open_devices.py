@@ -55,7 +55,7 @@ class Devices:
 
 
 @contextmanager
-def open_devices(spec: str, seed: int = 0, fields: int = 1) -> Iterator[Devices]:
+def open_devices(spec: str, seed: int = 0, fields: int = 1, pulses: int = 1) -> Iterator[Devices]:
     """The devices of `virtual:NAME`, of a virtual bench's TOML file, or of a service's configuration; dark at the end.
 
     With a configuration, the lasers are armed, in a guard process that switches them off when this process ends in any
@@ -69,6 +69,8 @@ def open_devices(spec: str, seed: int = 0, fields: int = 1) -> Iterator[Devices]
         Of a virtual bench's noise.
     fields : int
         Fields of a frame; more than 1 opens a panel that shows them in turn (`show_fields`) and gates the lasers.
+    pulses : int
+        In how many of them one laser may shine.
 
     Yields
     ------
@@ -91,12 +93,12 @@ def open_devices(spec: str, seed: int = 0, fields: int = 1) -> Iterator[Devices]
     for name in ("panel", "lasers", "camera"):
         if name not in tables:
             raise InputError(f"{spec} has no [{name}]: the panel, the lasers and the camera are all needed")
-    with open_tables(tables, fields) as devices:
+    with open_tables(tables, fields, pulses) as devices:
         yield devices
 
 
 @contextmanager
-def open_tables(tables: Mapping[str, Any], fields: int = 1) -> Iterator[Devices]:
+def open_tables(tables: Mapping[str, Any], fields: int = 1, pulses: int = 1) -> Iterator[Devices]:
     """As `open_devices`, for the tables [panel], [lasers] and [camera] of a configuration."""
     from firmware_iface.configured_devices import (
         gated_light,
@@ -112,9 +114,10 @@ def open_tables(tables: Mapping[str, Any], fields: int = 1) -> Iterator[Devices]
     panel_table = {**tables["panel"], "fields": fields}
     with ExitStack() as stack:
         camera = stack.enter_context(closing(open_camera(tables["camera"])))
-        panel = stack.enter_context(closing(open_panel(panel_table)))
+        gated = gated_light(panel_table, pulses)
+        panel = stack.enter_context(closing(open_panel(panel_table, gated)))
         bus = i2c_bus(bus) if bus.startswith("virtual:") else bus
-        guarded = open_guarded_lasers(bus, laser_channels(tables["lasers"]), gated_light(panel_table))
+        guarded = open_guarded_lasers(bus, laser_channels(tables["lasers"]), gated)
         lasers = stack.enter_context(closing(guarded))
         lasers.arm()
         stack.enter_context(lasers.beating())

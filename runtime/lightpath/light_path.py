@@ -47,6 +47,8 @@ class LightPath:
     grid : Grid
     response : float array [levels], rad
         Phase of each gray level.
+    gray_levels : tuple of int
+        Those that the panel has, where it has few: the response of others is that of the nearest. Empty: all.
     source : complex array [H, W]
         The illuminating field.
     transfers : complex array [M, 2 band + 1, 2 band + 1]
@@ -85,6 +87,7 @@ class LightPath:
     irradiance_filter: Array | None = None
     far_field: tuple[Array, Array] | None = None
     modulation: Modulation | None = None
+    gray_levels: tuple[int, ...] = ()
 
 
 def states(path: LightPath) -> Iterator[LightPath]:

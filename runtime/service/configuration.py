@@ -113,7 +113,7 @@ def read_configuration(file: str | os.PathLike[str]) -> Configuration:
         if name not in devices:
             raise InputError(f"{file} has no [{name}]: add it, the service cannot show anything without")
     check_tables(devices)
-    gated = gated_light(devices["panel"])
+    gated = gated_light(devices["panel"], 1)
     if gated is not None and timing.refresh_hz * gated.frame_s > 1.02:
         raise InputError(
             f"refresh_hz = {timing.refresh_hz:g} in [service] of {file} is more pictures than the panel shows, "

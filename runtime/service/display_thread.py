@@ -47,8 +47,8 @@ class DisplayPattern:
         Number of the frame's job.
     display_ns : int, ns
         When the frame is to be displayed (CLOCK_MONOTONIC).
-    gray : uint8 array [C, H, W]
-        Gray levels of each colour.
+    gray : uint8 array [C N, H, W]
+        Gray levels of each field: of all colours in turn, N times.
     crc : int
         CRC-32 of `gray`.
     psnr_db : float, dB
@@ -60,7 +60,7 @@ class DisplayPattern:
     refined : bool
         The pattern is one of a refinement's, which the camera has to capture.
     brightness : tuple of float
-        Light of each colour, 0 to 1; empty for one colour.
+        Light of each colour, 0 to 1; empty for one field, which is not gated.
     """
 
     job: int
@@ -114,9 +114,9 @@ class DisplayThread(threading.Thread):
     lit_until_ns : int, ns
         Until when the pattern on the panel may be lit.
     lasers : sequence of int
-        The laser of each colour, where there are several; set before the thread starts.
+        The laser of each colour, where a frame has several fields; set when the panel is opened.
     lit_colours : frozenset of int or None
-        Colours that have light in the frame on the panel; None: it has one colour.
+        Colours that have light in the frame on the panel; None: it has one field, which is not gated.
     """
 
     def __init__(
@@ -194,12 +194,12 @@ class DisplayThread(threading.Thread):
                 self._keep(pattern)
 
     def _show(self, pattern: DisplayPattern) -> None:
-        """Show the pattern of one colour, or the frame of several, swapped in as a whole."""
+        """Show the pattern of one field, or the frame of several, swapped in as a whole."""
         if len(pattern.gray) == 1:
             self._panel.show(pattern.gray[0])
             return
         frame = colours_in_turn(pattern.gray, self.lasers, pattern.brightness, self._panel.field_us)
-        lit = frozenset(k for k, field in enumerate(frame) if field.lasers)
+        lit = frozenset(k % len(self.lasers) for k, field in enumerate(frame) if field.lasers)
         if self.lit_colours is not None:
             self.lit_colours &= lit  # what the frame before had and this has: until it is displayed
         self._panel.show_fields(frame)

@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from firmware_iface.configured_devices import laser_numbers, open_panel
+from firmware_iface.configured_devices import gated_light, laser_numbers, open_panel, panel_fields
 from firmware_iface.errors import InputError
+from firmware_iface.lasers.eye_safety import GatedLight
 from runtime.service import process_messages, protocol
 from runtime.service.configuration import Configuration
 from runtime.service.display_thread import WAKE_NS, DisplayClock, DisplayPattern, DisplayThread
@@ -188,7 +189,9 @@ class FramePipeline:
                 bool(message.flags & process_messages.FINAL),
                 bool(message.flags & process_messages.DARK),
                 bool(message.flags & process_messages.REFINED),
-                struct.unpack_from(f"<{len(gray)}f", message.brightness) if len(gray) > 1 else (),
+                struct.unpack_from(f"<{len(self.solver.colours)}f", message.brightness)
+                if len(gray) > 1
+                else (),
             )
             self._expect_light(message.shares, partial(self.display.put, pattern))
         if message.flags & process_messages.FINAL:
@@ -240,12 +243,22 @@ class FramePipeline:
 
     @property
     def lit_colours(self) -> frozenset[str] | None:
-        """Colours that have light in the frame on the panel; None: it has one colour."""
+        """Colours that have light in the frame on the panel; None: it has one field, which is not gated."""
         lit = self.display.lit_colours
         return None if lit is None else frozenset(self.solver.colours[k] for k in lit)
 
+    @property
+    def gated(self) -> GatedLight | None:
+        """The light that the panel gives each laser at most, and that the lasers are budgeted for.
+
+        As long as the solver has not said which colours it shows, each laser counts as lit in every field.
+        """
+        table = self._configuration.devices["panel"]
+        return gated_light(table, panel_fields(table) // max(1, len(self.solver.colours)))
+
     def _open_panel(self) -> Any:
-        panel = open_panel(self._configuration.devices["panel"])
+        table = self._configuration.devices["panel"]
+        panel = open_panel(table, self.gated)
         shape = self.solver.shape
         if shape is not None and tuple(panel.shape) != shape[1:]:
             panel.close()
@@ -253,7 +266,7 @@ class FramePipeline:
                 f"the panel is {panel.shape} and the bundle is for {shape[1:]}: attach the panel that it "
                 "was calibrated for, or export its own bundle"
             )
-        if len(self.solver.colours) > 1:
+        if panel_fields(table) > 1:
             self.display.lasers = laser_numbers(self._configuration.devices["lasers"], self.solver.colours)
         return panel
 

@@ -9,7 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from firmware_iface.configured_devices import laser_numbers, mrad_per_pixel, panel_fields
+from firmware_iface.configured_devices import (
+    MOST_LASERS,
+    check_budget,
+    laser_numbers,
+    mrad_per_pixel,
+    panel_fields,
+)
 from firmware_iface.errors import InputError
 from firmware_iface.lasers.eye_safety import SIZES_MRAD, spot_shares
 from runtime.bundle.bundle_folder import INITIALISER, Bundle, read_bundle
@@ -19,29 +25,28 @@ from runtime.networks.onnx_approximator import approximator_of
 from runtime.service.configuration import Configuration
 from runtime.solver import Solution, Solver, shown
 
-MOST_COLOURS = 3  # lasers of a board
 NO_LIGHT = (1e-9,) * len(SIZES_MRAD)  # shares of a colour that is dark
 
 
 @dataclass(frozen=True)
 class Pattern:
-    """Gray levels of a pattern, and what the calibrated model predicts for it.
+    """Gray levels of a picture's pattern, or of all its patterns, and what the calibrated model predicts for them.
 
     Attributes
     ----------
-    gray : uint8 array [C, H, W]
-        Gray levels of each colour.
+    gray : uint8 array [C N, H, W]
+        Gray levels of each field: of all colours in turn, N times.
     psnr_db : float, dB
-        Amplitude PSNR; of several colours, the lowest.
+        Amplitude PSNR, of N patterns that of the mean of their irradiances; of several colours, the lowest.
     final : bool
         No better pattern follows by the deadline.
     dark : bool
         The picture is black, which no pattern can show.
     shares : tuple of float
-        Shares of the light in its brightest spots (eye_safety.spot_shares), colour after colour; empty where they were
-        not asked for.
+        Shares of the light in its brightest spots (eye_safety.spot_shares), colour after colour, each the largest of
+        the colour's patterns; empty where they were not asked for.
     brightness : tuple of float
-        Light of each colour, as a share of what a white picture has; empty for a picture of one colour, which has all.
+        Light of each colour, as a share of what a white picture has; empty for a picture of one field, which has all.
     """
 
     gray: np.ndarray
@@ -61,6 +66,8 @@ class PatternSolver:
         By colour.
     mrad_per_pixel : float, mrad
         Angle of a pixel at the eye, for predicting the brightest spots of each pattern; 0: they are not predicted.
+    frames : int
+        N, the patterns for each colour of a picture.
     **options
         Of `Solver`.
 
@@ -68,14 +75,19 @@ class PatternSolver:
     ----------
     colours : tuple of str
     shape : tuple of int
-        (C, H, W).
+        Of a picture: (C, H, W).
+    fields : int
+        Of a frame: C N.
     """
 
-    def __init__(self, paths: dict[str, LightPath], mrad_per_pixel: float = 0.0, **options: Any) -> None:
+    def __init__(
+        self, paths: dict[str, LightPath], mrad_per_pixel: float = 0.0, frames: int = 1, **options: Any
+    ) -> None:
         self.colours = tuple(paths)
-        self._paths, self._mrad = list(paths.values()), mrad_per_pixel
+        self._paths, self._mrad, self._frames = list(paths.values()), mrad_per_pixel, frames
         self.shape = (len(paths), *self._paths[0].grid.shape)
-        self._solvers = [Solver(path, **options) for path in self._paths]
+        self.fields = len(paths) * frames
+        self._solvers = [Solver(path, frames=frames, **options) for path in self._paths]
 
     def patterns(self, target: np.ndarray, deadline_ns: int) -> Iterator[Pattern]:
         """Patterns for a target, each better than the one before.
@@ -100,33 +112,52 @@ class PatternSolver:
         """
         lit = [k for k, colour in enumerate(target) if colour.any()]
         if not lit:
-            dark = (0.0,) * len(target) if len(target) > 1 else ()
-            yield Pattern(np.zeros(self.shape, np.uint8), 0.0, final=True, dark=True, brightness=dark)
+            dark = (0.0,) * len(target) if self.fields > 1 else ()
+            gray = np.zeros((self.fields, *self.shape[1:]), np.uint8)
+            yield Pattern(gray, 0.0, final=True, dark=True, brightness=dark)
             return
+        gray = np.zeros((self._frames, *self.shape), np.uint8)
         solved = {k: self._solvers[k].frame(target[k], 0) for k in lit}
+        for k, solution in solved.items():
+            gray[:, k] = solution.gray
         left_ms = (deadline_ns - time.monotonic_ns()) * 1e-6
         enough = left_ms > sum(one.milliseconds for one in solved.values())  # as much as another start costs
-        yield self._pattern(solved, target, final=not enough)
+        yield self._pattern(gray, solved, target, final=not enough)
         if enough:
             for done, k in enumerate(lit):
                 share_ms = (deadline_ns - time.monotonic_ns()) * 1e-6 / (len(lit) - done)
                 if share_ms > 0:
-                    start = solved[k].phase
-                    solved[k] = self._solvers[k].solve(target[k], deadline_ms=share_ms, start=start)
-            yield self._pattern(solved, target, final=True)
+                    first = solved[k]
+                    better = self._solvers[k].solve(target[k], deadline_ms=share_ms, start=first.phase)
+                    # with a panel's few levels in the loop, a descent that time cuts short can end below its start
+                    if better.expected_psnr_db >= first.expected_psnr_db:
+                        solved[k], gray[:, k] = better, better.gray
+            yield self._pattern(gray, solved, target, final=True)
 
-    def _pattern(self, solved: dict[int, Solution], target: np.ndarray, final: bool) -> Pattern:
-        gray = np.zeros(self.shape, np.uint8)
-        for k, solution in solved.items():
-            gray[k] = solution.gray
+    def _pattern(
+        self, patterns: np.ndarray, solved: dict[int, Solution], target: np.ndarray, final: bool
+    ) -> Pattern:
+        """What is known of patterns [N, C, H, W], whose colours without a solution are dark."""
+        gray = patterns.copy()
         shares: tuple[float, ...] = ()
         if self._mrad:
             for k, path in enumerate(self._paths):
-                shares += spot_shares(shown(path, gray[k]), self._mrad) if k in solved else NO_LIGHT
+                shares += brightest_spots(path, gray[:, k], self._mrad) if k in solved else NO_LIGHT
         # a pattern puts all of its light into the picture, however bright that is: the light's time makes it right
-        brightness = tuple(float(c.mean()) for c in target) if len(target) > 1 else ()
+        brightness = tuple(float(c.mean()) for c in target) if self.fields > 1 else ()
         lowest_db = min(solution.expected_psnr_db for solution in solved.values())
-        return Pattern(gray, lowest_db, final, shares=shares, brightness=brightness)
+        fields = gray.reshape(self.fields, *self.shape[1:])
+        return Pattern(fields, lowest_db, final, shares=shares, brightness=brightness)
+
+
+def brightest_spots(path: LightPath, grays: np.ndarray, mrad_per_pixel: float) -> tuple[float, ...]:
+    """The largest shares of light in a spot of each size, of any of a picture's patterns, uint8 [N, H, W].
+
+    So they hold for each pulse, and for any pulses together: the mean of several patterns' light is nowhere brighter
+    than the brightest of them.
+    """
+    each = [spot_shares(shown(path, gray), mrad_per_pixel) for gray in grays]
+    return tuple(map(max, zip(*each, strict=True)))
 
 
 def shown_colours(configuration: Configuration, bundle: Bundle) -> list[str]:
@@ -135,7 +166,7 @@ def shown_colours(configuration: Configuration, bundle: Bundle) -> list[str]:
     Raises
     ------
     InputError
-        Where the bundle, the panel and the lasers do not fit.
+        Where the bundle, the panel and the lasers do not fit, or the power exceeds the Class 1 budget.
     """
     channels, fields = bundle_channels(bundle), panel_fields(configuration.devices["panel"])
     channel = configuration.timing.channel
@@ -145,12 +176,18 @@ def shown_colours(configuration: Configuration, bundle: Bundle) -> list[str]:
             f'{configuration.bundle} has several colours and one is shown: write channel = "NAME" in [service], '
             f"one of {', '.join(channels)}, or fields = {len(channels)} in [panel] to show them in turn"
         )
-    if fields not in (1, len(shown)) or len(shown) > MOST_COLOURS:
+    if len(shown) > MOST_LASERS:
         raise InputError(
-            f"[panel] has fields = {fields} and {len(shown)} colours are shown ({', '.join(shown)}): the two must be "
-            f"equal, up to {MOST_COLOURS}; change fields, or leave it out for one colour"
+            f"{configuration.bundle} has {len(shown)} colours and a board has {MOST_LASERS} lasers: write channel = "
+            f'"NAME" in [service], one of {", ".join(channels)}, or export a bundle of fewer'
+        )
+    if fields % len(shown):
+        raise InputError(
+            f"[panel] has fields = {fields} and {len(shown)} colours are shown ({', '.join(shown)}): write fields = "
+            f"{len(shown)}, or a multiple of it for several patterns of each colour"
         )
     laser_numbers(configuration.devices["lasers"], shown if fields > 1 else [])
+    check_budget(configuration.devices, fields // len(shown))
     return shown
 
 
@@ -175,6 +212,7 @@ def open_solver(configuration: Configuration) -> PatternSolver:
     return PatternSolver(
         paths,
         mrad_per_pixel(configuration.devices["lasers"]),
+        panel_fields(configuration.devices["panel"]) // len(colours),
         grid="panel",  # before a deadline, more iterations gain more than the finer grid
         approximator=approximator,
         initialiser=bundle.networks.get(INITIALISER),

@@ -22,9 +22,10 @@ class Pong(NamedTuple):
 
 
 class PatternRing(NamedTuple):
-    """The solver is ready; comes with the ring for its patterns, uint8 [slots, C, H, W]."""
+    """The solver is ready; comes with the ring for its patterns, uint8 [slots, fields, H, W]."""
 
     slots: U32
+    fields: U32  # of a frame: a pattern each, of all channels in turn, as often as each has patterns
     channels: U32
     height: U32
     width: U32
@@ -61,7 +62,7 @@ class SolvedPattern(NamedTuple):
     psnr_db: F32
     solve_us: U32
     shares: Shares  # 13 f32 a colour: of its light in its brightest spots (eye_safety.spot_shares); 0: not predicted
-    brightness: Brightness  # f32 a colour: for how much of its field's light it is lit; 0: dark
+    brightness: Brightness  # f32 a colour: for how much of its fields' light it is lit; 0: dark
 
 
 class FailedJob(NamedTuple):

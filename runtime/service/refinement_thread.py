@@ -137,13 +137,13 @@ def _prepared(configuration: Configuration, target: np.ndarray) -> _PreparedRefi
     Raises
     ------
     InputError
-        Where several colours are shown, the bundle has no network, or the picture is black.
+        Where several patterns are shown in turn, the bundle has no network, or the picture is black.
     """
     bundle = read_bundle(configuration.bundle)
     if panel_fields(configuration.devices["panel"]) > 1:
         raise InputError(
-            "a refinement is of one colour, and several are shown in turn: to refine one, write channel in [service] "
-            "and no fields in [panel]"
+            "a refinement is of one colour's one pattern, and several are shown in turn: to refine one, write channel "
+            "in [service] and no fields in [panel]"
         )
     path = load_light_path(bundle, configuration.timing.channel or None)
     approximator = approximator_of(bundle, (1, *path.grid.shape))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -35,7 +36,7 @@ class SolverEvents(Protocol):
         """The solver's process was ended, and with it the jobs that it had."""
 
     def pattern_solved(self, message: process_messages.SolvedPattern, gray: np.ndarray) -> None:
-        """There is a pattern, gray levels uint8 [C, H, W], for a job."""
+        """There is a pattern, gray levels uint8 [C N, H, W], for a job."""
 
     def job_failed(self, job: int, code: int, text: str) -> None:
         """There is no pattern for a job."""
@@ -59,9 +60,9 @@ class SolverClient:
     process : ChildProcess
         The process itself.
     shape : tuple of int or None
-        (C, H, W) of a pattern; None until the solver was ready for the first time.
+        (C, H, W) of a picture; None until the solver was ready for the first time.
     colours : tuple of str
-        Names of the colours of a pattern.
+        Names of its colours. They stay: the lasers are budgeted for them.
     fresh_until_ns : int, ns
         Until when the solver counts as fresh (CLOCK_MONOTONIC); 0: it was lost.
     busy_until_ns : int, ns
@@ -139,10 +140,19 @@ class SolverClient:
             self._lost(f"its process died ({error})")
             return
         match message:
-            case process_messages.PatternRing(slots, channels, height, width, colours) if fd is not None:
-                self._patterns = open_ring(fd, slots, (channels, height, width), np.uint8)
+            case process_messages.PatternRing(slots, fields, channels, height, width, colours) if (
+                fd is not None
+            ):
+                names = tuple(colours.split(","))
+                if self.colours and names != self.colours:
+                    os.close(fd)
+                    self._lost(
+                        f"its bundle has other colours now ({colours}; start the service again for them)"
+                    )
+                    return
+                self._patterns = open_ring(fd, slots, (fields, height, width), np.uint8)
                 self.shape = self.shape or (channels, height, width)
-                self.colours = tuple(colours.split(","))
+                self.colours = names
                 self._out = False
                 self._events.solver_ready()
             case process_messages.FailedJob(0, _, text):

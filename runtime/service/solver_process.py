@@ -53,7 +53,9 @@ class Worker:
     Parameters
     ----------
     shape : tuple of int
-        (C, H, W) of a pattern.
+        (C, H, W) of a picture.
+    fields : int
+        Patterns of a picture.
     colours : sequence of str
         Their names.
     """
@@ -62,17 +64,18 @@ class Worker:
         self,
         link: MessageLink,
         shape: tuple[int, int, int],
+        fields: int,
         colours: Sequence[str],
         configuration: Configuration,
     ) -> None:
         self.link, self.shape, self.configuration = link, shape, configuration
         self.refinement_request: RefinePicture | None = None  # for the picture of the next job
         self.refinement: RefinementThread | None = None
-        self.ring = make_ring(SLOTS, shape, np.uint8)
+        self.ring = make_ring(SLOTS, (fields, *shape[1:]), np.uint8)
         self.free = set(range(SLOTS))
         self.targets: Ring | None = None
         self.jobs: deque[SolveJob] = deque()
-        link.send(PatternRing(SLOTS, *shape, ",".join(colours)), fds=[self.ring.fd])
+        link.send(PatternRing(SLOTS, fields, *shape, ",".join(colours)), fds=[self.ring.fd])
 
     def receive(self, wait: bool) -> None:
         """Receive one message; without `wait`, only if there is one."""
@@ -187,7 +190,7 @@ def main(fd: str, configuration: str) -> None:
         return
     for _ in solver.patterns(np.ones(solver.shape, np.float32), time.monotonic_ns()):
         pass  # everything that the first use sets up is ready before the first frame
-    Worker(link, solver.shape, solver.colours, settings).run(solver.patterns)
+    Worker(link, solver.shape, solver.fields, solver.colours, settings).run(solver.patterns)
 
 
 if __name__ == "__main__":

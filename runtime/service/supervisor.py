@@ -13,7 +13,7 @@ import time
 from contextlib import suppress
 from functools import partial
 
-from firmware_iface.configured_devices import gated_light, laser_power, open_lasers
+from firmware_iface.configured_devices import laser_power, open_lasers
 from runtime.service import protocol
 from runtime.service.camera_client import CameraClient
 from runtime.service.configuration import Configuration
@@ -44,9 +44,8 @@ class Supervisor:
         self.faults = FaultLog(self.metrics)
         self.camera = CameraClient(configuration, self.loop, self.faults, self.metrics)
         self.lasers = LaserHeartbeat(
-            partial(
-                open_lasers, configuration.devices["lasers"], gated_light(configuration.devices["panel"])
-            ),
+            # a program's Clear opens them again, and by then the solver has said which colours it shows
+            lambda: open_lasers(configuration.devices["lasers"], self.pipeline.gated),
             laser_power(configuration.devices["lasers"]),
             self._fresh_until,
             lambda: self.pipeline.display.lit_until_ns,

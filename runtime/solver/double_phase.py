@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from runtime.solver.objective import Objective
 
 Array = Any
 
+BOARDS = 8  # ways for the pixels of double phase to alternate
 LOUD = 0.98  # share of pixels whose amplitude double phase reproduces; brighter ones are cut
 SAMPLED = 5  # every so many pixels, an axis, are ranked for that
 FAINTEST = 0.7  # of the amplitude in the middle: fainter edges of the image are corrected only as far as this
@@ -66,11 +68,13 @@ class Start:
         if doubled and path.grid.band_share < WIDE:
             self._find_edges()
 
-    def double_phase(self, amplitude: np.ndarray, phase: Array) -> None:
+    def double_phase(self, amplitude: np.ndarray, phase: Array, others: Sequence[Array] = ()) -> None:
         """Fill `phase` (rad) [H, W] with a pattern that shows an amplitude [H, W] at once, without iterations.
 
         The amplitude with flat phase goes back to the panel; there a pixel's complex amplitude a exp(j t),
         a <= 1, is the mean of exp(j (t + acos a)) and exp(j (t - acos a)), which alternate as on a chequerboard.
+
+        Up to BOARDS - 1 `others` get patterns that show it as well and differ: their pixels alternate otherwise.
 
         References
         ----------
@@ -96,9 +100,19 @@ class Start:
             part[odd::2, 1::2] *= -1
             part[1 - odd :: 2, ::2] *= -1
             xp.arctan2(here.imag, here.real, out=new)
+            for number, other in enumerate(others, 1):
+                other[rows] = new + self._alternating(number, rows) * part
             new += part
 
         self.backend.over_rows(len(phase), self.objective.strip, work)
+
+    def _alternating(self, number: int, rows: slice) -> Array:
+        """Signs of a pattern's pixels in these rows, over those of the first pattern's chequerboard."""
+        xp, width = self.backend.xp, self.wave.shape[1]
+        y, x = xp.arange(rows.start, rows.stop)[:, None], xp.arange(width)
+        board = y + x
+        along = (board, y + 0 * x, x + 0 * y, y // 2 + x)[number // 2]
+        return (1 - 2 * ((board + along + number) % 2)).astype(np.int8)
 
     def flat_phase(self, amplitude: np.ndarray, phase: Array) -> None:
         """Fill `phase` with that of the amplitude with flat phase, back at the panel; its amplitude there is lost.

@@ -20,7 +20,7 @@ class DriveRange:
     ----------
     path : LightPath
     levels : int
-        Gray levels that may be used, from 0 on; at most those that the response has.
+        Gray levels that may be used, from 0 on; at most those that the response and the panel have.
 
     Attributes
     ----------
@@ -40,9 +40,12 @@ class DriveRange:
     def __init__(self, path: LightPath, levels: int = 256) -> None:
         if not 2 <= levels <= 256:
             raise InputError(f"{levels} gray levels: give from 2 to 256")
-        response = np.asarray(path.response)[:levels]
-        self.order = np.argsort(response).astype(np.uint8)
-        self.sorted = response[self.order]
+        grays = np.arange(min(levels, len(path.response)))
+        if path.gray_levels:
+            grays = np.array([gray for gray in path.gray_levels if gray < levels])
+        response = np.asarray(path.response)[grays]
+        self.order = grays[np.argsort(response)].astype(np.uint8)
+        self.sorted = np.sort(response)
         self.between = (self.sorted[1:] + self.sorted[:-1]) / 2
         self.gain = None if path.gain is None else np.maximum(path.gain, 1e-3)
         low, high = self.sorted[0], self.sorted[-1]

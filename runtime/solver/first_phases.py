@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from runtime.lightpath.light_path import LightPath
-from runtime.solver.double_phase import Start
+from runtime.solver.double_phase import BOARDS, Start
 from runtime.solver.drive_range import DriveRange
 from runtime.solver.initialiser import Initialiser
 from runtime.solver.objective import Objective
@@ -23,7 +23,9 @@ STRIDE = 0.618  # of the panel's rows: how far a pattern's noise is moved from t
 class FirstPhases:
     """First phases for all colours of an objective, in place.
 
-    Of several patterns for one picture, each but the first gets noise of its own: equal ones would stay equal.
+    Several patterns for one picture must differ: equal ones would stay equal. Each but the first gets noise of its own,
+    and the descent then goes far. Where there is no time for that, double phase has several patterns that are each as
+    good (`soon`): after 10 iterations noise is 1 dB nearer, at the start it is 7 dB farther off.
 
     Parameters
     ----------
@@ -61,23 +63,29 @@ class FirstPhases:
         self.initialiser = None if initialiser is None else Initialiser(initialiser, self.shape)
         self.amplitude = np.zeros(self.shape, stacks[0][0].response.dtype)
 
-    def cold(self, targets: np.ndarray, phases: Array) -> None:
-        """Fill `phases` (rad), a pattern each, from targets [C, K, H, W] alone, not from the picture before."""
+    def cold(self, targets: np.ndarray, phases: Array, soon: bool = False) -> None:
+        """Fill `phases` (rad), a pattern each, from targets [C, K, H, W] alone, not from the picture before.
+
+        With `soon`, for few iterations.
+        """
         for c, (drive, start) in enumerate(zip(self.drives, self.starts, strict=True)):
             phase, *others = phases[c * self.frames : (c + 1) * self.frames]
             np.multiply(
                 targets[c, 0], 1 / float(np.mean(targets[c, 0], dtype=np.float64)), out=self.amplitude
             )
             np.sqrt(self.amplitude, out=self.amplitude)
+            alike: Sequence[Array] = ()
             if self.initialiser is not None:
                 phase[...] = self.backend.xp.asarray(self.initialiser.phase(self.amplitude))
             elif drive.gapless:
-                start.double_phase(self.amplitude, phase)
+                alike = others[: BOARDS - 1] if soon else ()
+                start.double_phase(self.amplitude, phase, alike)
             else:
                 start.flat_phase(self.amplitude, phase)
             if drive.bounded:
-                phase[...] = self.backend.xp.asarray(drive.held(self.backend.to_host(phase)))
-            for n, other in enumerate(others, 1):
+                for one in (phase, *alike):
+                    one[...] = self.backend.xp.asarray(drive.held(self.backend.to_host(one)))
+            for n, other in enumerate(others[len(alike) :], 1 + len(alike)):
                 self._part(n, drive, phase, other)
 
     def _part(self, n: int, drive: DriveRange, phase: Array, other: Array) -> None:
@@ -107,7 +115,7 @@ class FirstPhases:
         """
         shifted(before, motion, phases)
         if any(motion):
-            self.cold(targets, room)
+            self.cold(targets, room, soon=True)
             for n, (phase, fresh) in enumerate(zip(phases, room, strict=True)):
                 for part in renewed(motion, self.starts[n // self.frames].edges, self.shape):
                     phase[part] = fresh[part]

@@ -221,7 +221,7 @@ class Solver:
             room = next(phase for phase in self.phases[1:] if phase is not self.best)
             self.first.warm(self.best, motion, optics_targets, self.phases[0], room)
         else:
-            self.first.cold(optics_targets, self.phases[0])
+            self.first.cold(optics_targets, self.phases[0], soon=True)
         return self._improve(targets, begun, iterations, deadline_ms, None)
 
     def rehearse(self, target: np.ndarray | None = None) -> None:
@@ -261,7 +261,7 @@ class Solver:
             iterations = ITERATIONS if deadline_ms is None else _ENDLESS
         history: list[float] = []
         rounding = self.objective.rounding
-        stages = (0.0,) if rounding is None else SHARPNESS
+        stages = (0.0,) if rounding is None else SHARPNESS if iterations else SHARPNESS[-1:]
         for stage, sharpness in enumerate(stages, 1):
             if rounding is not None:
                 rounding.sharpness = sharpness

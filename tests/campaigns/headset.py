@@ -74,6 +74,8 @@ def write_configuration(
     colours: bool = False,
     shape: tuple[int, int] = SHAPE,
     metrics_port: int = 0,
+    patterns: int = 1,
+    half_width: float = 1.0,
 ) -> Path:
     """A bundle, a bench and a configuration in `folder`; returns the configuration's path.
 
@@ -94,24 +96,30 @@ def write_configuration(
         would take longer than a frame.
     metrics_port : int
         Of the service's metrics; 0: none.
+    patterns : int
+        Of each colour of a picture.
+    half_width : float
+        Of the iris, as a share of the panel's band.
     """
     small = shape == SHAPE
     distance_mm = DISTANCE_MM * shape[0] / SHAPE[0]
-    path = converted(ideal_path(shape, distance_mm * 1e-3), np.float32)
+    path = converted(ideal_path(shape, distance_mm * 1e-3, half_width), np.float32)
     shown = COLOURS if colours else {"green": 520.0}
     records, arrays = pack_light_paths([(name, distance_mm, nm, path) for name, nm in shown.items()])
     write_bundle(folder / "bundle", arrays, {"paths": records, "distance_mm": distance_mm}, {})
     channels = [f'[[channel]]\nname = "{name}"\nwavelength_nm = {nm}\n' for name, nm in shown.items()]
     coarse = "[simulation]\nsubpixels = 2\n" if colours else ""  # three colours take a third of the time each
     bench = BENCH.format(height=shape[0], width=shape[1], distance_mm=distance_mm)
-    (folder / "bench.toml").write_text(bench + "".join(channels) + coarse)
+    iris = f"[iris]\nhalf_width = {half_width}\n"
+    (folder / "bench.toml").write_text(bench + iris + "".join(channels) + coarse)
     file = folder / "headset.toml"
     camera = f'kind = "virtual"\nbus = "virtual:{folder}/hardware.sock"'
     if oak:
         camera = f'kind = "oak"\naddress = "{oak}"\nframes_per_s = 100.0'
     elif not small:
         camera = 'kind = "tests.campaigns.still_camera:still_camera"'
-    panel = "refresh_hz = 1000.0\n" if small else f"refresh_hz = {60 * len(shown)}\ntimeout_ms = 500\n"
+    fields = len(shown) * patterns
+    panel = "refresh_hz = 1000.0\n" if small else f"refresh_hz = {60 * fields}\ntimeout_ms = 500\n"
     file.write_text(
         CONFIGURATION.format(
             folder=folder,
@@ -119,7 +127,7 @@ def write_configuration(
             solve_ms=solve_ms,
             stale_limit_ms=stale_limit_ms,
             camera=camera,
-            panel=panel + (f"fields = {len(shown)}\n" if colours else ""),
+            panel=panel + (f"fields = {fields}\n" if fields > 1 else ""),
             metrics_port=metrics_port,
             power=", ".join(f"{name} = 0.5" for name in shown),
         )

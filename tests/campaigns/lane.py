@@ -38,6 +38,8 @@ class Lane:
         Of pictures in one colour.
     colours : bool
         Whether it shows three colours in turn.
+    patterns : int
+        Of each colour of a picture, in fields of their own.
     file : Path or None
         A configuration that is in the folder already, from `write_configuration`; None: one is written.
 
@@ -64,12 +66,15 @@ class Lane:
         refresh_hz: float = REFRESH_HZ,
         colours: bool = False,
         file: Path | None = None,
+        patterns: int = 1,
     ) -> None:
         self.folder, self.seed = folder, seed
         solve_ms = min(SOLVE_MS, 300 / refresh_hz)
-        if colours:
+        if colours or patterns > 1:
             refresh_hz, solve_ms = COLOURS_HZ, COLOURS_MS
-        self.file = file or write_configuration(folder, refresh_hz, solve_ms, STALE_MS, oak, colours)
+        self.file = file or write_configuration(
+            folder, refresh_hz, solve_ms, STALE_MS, oak, colours, patterns=patterns
+        )
         self.accepted = self.shown = self.lost = 0
         self.outcomes: list[Shown | LostFrame] = []
         self.latest = self.stored = 0

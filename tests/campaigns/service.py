@@ -12,9 +12,11 @@ import signal
 import sys
 from pathlib import Path
 
+from firmware_iface.configured_devices import laser_numbers
+from runtime.bundle.bundle_folder import read_bundle
 from runtime.service import solver_process
 from runtime.service.configuration import read_configuration
-from runtime.service.frame_solver import Pattern
+from runtime.service.frame_solver import Pattern, shown_colours
 from runtime.service.shared_memory import crc32
 from runtime.service.supervisor import Supervisor
 
@@ -40,12 +42,16 @@ def solve(fd: str, configuration: str) -> None:
         for name in (NOTES, FIELDS)
     )
     publish = solver_process.Worker.publish
+    settings = read_configuration(configuration)
+    shown = shown_colours(settings, read_bundle(settings.bundle))
+    lasers = laser_numbers(settings.devices["lasers"], shown)
 
     def note(worker: solver_process.Worker, job: object, pattern: Pattern, began_ns: int) -> None:
         for field in pattern.gray:
             os.write(notes, crc32(field).to_bytes(4, "little"))
-        for laser, (field, light) in enumerate(zip(pattern.gray, pattern.brightness, strict=False)):
-            if light > 0:  # the colours are in the order of the board's lasers
+        for k, field in enumerate(pattern.gray if pattern.brightness else ()):
+            laser = lasers[k % len(lasers)]
+            if pattern.brightness[k % len(lasers)] > 0:
                 os.write(fields, crc32(field).to_bytes(4, "little") + bytes([1 << laser]))
         publish(worker, job, pattern, began_ns)  # type: ignore[arg-type]
 

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
+from firmware_iface.lasers.eye_safety import GatedLight
 from firmware_iface.panel import open_board
 from firmware_iface.panel.fields import Field, FieldPanel, colours_in_turn
 from firmware_iface.panel.panel_board import BoardControl
@@ -308,6 +309,41 @@ def test_what_a_panel_cannot_show_says_why() -> None:
         opened(BoardModel(SHAPE, newest=1))
     with pytest.raises(InputError, match="8 fields at most, not 9"):
         opened(BoardModel(SHAPE), fields=9)
+
+
+def test_a_frame_with_more_light_than_the_lasers_are_budgeted_for_is_refused() -> None:
+    """Two fields of 1 ms for each laser in a frame of six fields of 2 ms, and no more, whatever a program asks for."""
+    panel = opened(BoardModel(SHAPE), fields=6)
+    panel.gated = GatedLight(duty=1 / 6, pulse_s=0.001, frame_s=0.012, pulses=2)
+    grays = np.random.default_rng(0).integers(0, 256, (6, *SHAPE), dtype=np.uint8)
+    usual = colours_in_turn(grays, (0, 1, 2), (1.0, 0.5, 1.0), FAST.period_us)
+    panel.show_fields(usual)
+    panel.show(grays[0])
+    dark = Field(grays[0], 0, 0, 0)
+    for frame, message in (
+        (colours_in_turn(grays, (0, 1), (1.0, 0.5), FAST.period_us), "laser 0 would shine in 3 fields"),
+        ([*usual[:5], Field(grays[5], 5, 500, 100)], "laser 0 would shine in 3 fields"),
+        ([Field(grays[0], 2, 500, 1001), *5 * [dark]], "laser 1 .* up to 1001 µs"),
+        (usual[:5], "5 fields of 2000 µs is shorter than the 0.012 s"),
+        ([usual[0]], "shorter"),
+    ):
+        with pytest.raises(InputError, match=message):
+            panel.show_fields(frame)
+    panel.show_fields(6 * [dark])
+
+
+def test_patterns_of_a_colour_are_fields_of_its_laser_alone() -> None:
+    """Two colours with four patterns each fill the board's eight fields: c0 c1, four times."""
+    model = BoardModel(SHAPE)
+    panel = opened(model, fields=8)
+    grays = np.random.default_rng(1).integers(0, 256, (8, *SHAPE), dtype=np.uint8)
+    frame = colours_in_turn(grays, (2, 0), (1.0, 0.5), FAST.period_us)
+    assert [(f.lasers, f.width_us) for f in frame] == [(4, 1000), (1, 500)] * 4
+    panel.show_fields(frame)
+    _, _, patterns = model.lit()
+    assert [(p.outputs, crc(p.gray)) for p in patterns] == [
+        (4 - 3 * (k % 2), crc(g)) for k, g in enumerate(grays)
+    ]
 
 
 def test_a_board_that_was_unplugged_speaks_version_2_again() -> None:

@@ -88,6 +88,29 @@ def test_the_camera_sees_the_sum_of_the_colours_each_for_its_share_of_the_frame(
     assert np.corrcoef(seen.ravel(), expected.ravel())[0, 1] > 0.995
 
 
+def test_the_camera_sees_the_mean_of_several_patterns_of_each_colour(bench: Path) -> None:
+    """Two colours with two patterns each: all colours in turn, and again."""
+    headset = open_headset(str(bench), seed=1)
+    for channel in COLOURS[:2]:
+        headset.lasers.set_power(channel, 1.0)
+    headset.camera.exposure_ms = 30.0
+    patterns = np.concatenate([grays(0)[:2], grays(1)[:2]])
+    frame = colours_in_turn(patterns, (0, 1), (1.0, 0.4), headset.panel.field_us)
+    assert [field.lasers for field in frame] == [1, 2, 1, 2]
+    assert len({(field.lasers, field.width_us) for field in frame}) == 2
+    headset.panel.show_fields(frame)
+    black = headset.description.camera.black_level
+    seen = headset.camera.capture() - black
+    truth = [headset.expected_counts(g, COLOURS[k % 2]) - black for k, g in enumerate(patterns)]
+    # a quarter of the time each, half of that at most with light, in three times the exposure
+    expected = sum(3 / 8 * (1.0, 0.4)[k % 2] * one for k, one in enumerate(truth))
+    assert seen.mean() == pytest.approx(expected.mean(), rel=0.01)
+    assert np.corrcoef(seen.ravel(), expected.ravel())[0, 1] > 0.995
+    assert np.corrcoef(seen.ravel(), (truth[0] + 0.4 * truth[1]).ravel())[0, 1] < 0.9
+    with pytest.raises(InputError, match="no whole number"):
+        colours_in_turn(patterns[:3], (0, 1), (1.0, 0.4), headset.panel.field_us)
+
+
 def test_a_fields_light_is_gated(bench: Path) -> None:
     """All lasers are on, and each field has the light of its own mask alone."""
     headset = open_headset(str(bench), seed=1)

@@ -55,6 +55,25 @@ def test_each_colours_pattern_is_in_its_own_field_and_further_fields_are_dark() 
     assert all((f.gray == gray).all() for f, gray in zip(shown, grays, strict=False))
 
 
+def test_a_colour_shows_its_pattern_in_all_of_its_fields() -> None:
+    """Seven fields are two for each of three colours, and one that is dark: twice the light of one in a frame."""
+    headset, lit = headset_in_colour(noisy=False, fields=7)
+    grays = np.stack([pattern(k) for k in range(3)])
+    lit.light_all(["red", "blue"])
+    lit.panel.show_colours(grays)
+    assert [f.lasers for f in headset.panel.fields] == [1, 0, 4, 1, 0, 4, 0]
+    assert all((f.gray == grays[k % 3]).all() for k, f in enumerate(headset.panel.fields[:6]))
+    for asked_ms, frames in ((2 * LIGHT_MS, 1), (3.0, 1), (2 * LIGHT_MS + 0.1, 2)):
+        lit.camera.exposure_ms = asked_ms
+        assert lit.camera.exposure_ms == pytest.approx(asked_ms, rel=2e-3)
+        assert headset.camera.exposure_ms == pytest.approx(7 * frames * FIELD_MS)
+        lit.light("green")
+        lit.panel.show(pattern(1))
+        black = headset.description.camera.black_level
+        expected = (headset.expected_counts(pattern(1), "green") - black) * asked_ms / 10
+        assert (lit.camera.capture() - float(black)).mean() == pytest.approx(expected.mean(), rel=5e-3)
+
+
 @pytest.mark.parametrize(
     ("asked_ms", "frames"), [(0.3, 1), (LIGHT_MS, 1), (3 * LIGHT_MS, 3), (20.0, 8), (1000.0, 360)]
 )
@@ -94,9 +113,10 @@ def test_what_has_no_field_or_no_laser_is_refused() -> None:
         gated(devices(headset), ("red", "infrared"), 3)
 
 
-def test_through_the_drivers_no_light_is_in_another_colours_field(tmp_path: Path) -> None:
+@pytest.mark.parametrize("patterns", [1, 2])
+def test_through_the_drivers_no_light_is_in_another_colours_field(tmp_path: Path, patterns: int) -> None:
     """On emulated hardware, whose panel records what was on it whenever a light output was open."""
-    file = write_configuration(tmp_path, colours=True)
+    file = write_configuration(tmp_path, colours=True, patterns=patterns)
     grays = {colour: pattern(k) for k, colour in enumerate(COLOURS)}
     truth = VirtualHeadset(BenchDescription(
         channels=tuple(ChannelDescription(name, nm) for name, nm in COLOURS.items())

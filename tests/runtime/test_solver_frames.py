@@ -183,6 +183,20 @@ def test_colours_planes_a_deadline_and_a_video(ideal: LightPath, sixteen: LightP
     assert moved.quality.psnr_db > cold.quality.psnr_db - 0.3
 
 
+@pytest.mark.parametrize("frames", [2, 4, 8, 9])
+def test_patterns_that_are_needed_at_once_are_no_worse_than_one_and_differ(
+    ideal: LightPath, frames: int
+) -> None:
+    target = scene(SHAPE)
+    one = Solver(ideal, grid="panel").frame(target, 0).quality.psnr_db
+    solver = Solver(ideal, frames=frames, grid="panel")
+    made = solver.frame(target, 0)
+    assert len({gray.tobytes() for gray in made.gray}) == frames
+    assert made.quality.psnr_db > one - (0.2 if frames <= 8 else 2)  # the ninth has noise
+    assert Solver(ideal, frames=frames, grid="panel").solve(target, 0).quality.psnr_db < one - 2
+    assert solver.frame(target, 10).quality.psnr_db > made.quality.psnr_db + 1, "they part"
+
+
 @pytest.mark.parametrize("frames", [0, -1, 33])
 def test_a_number_of_frames_out_of_range_is_refused(ideal: LightPath, frames: int) -> None:
     with pytest.raises(InputError, match=f"{frames} frames a picture: give from 1 to 32"):

@@ -19,6 +19,7 @@ from runtime.lightpath.light_path import irradiance, panel_phase
 from tests.trainer.made_sets import write_captures
 from tests.trainer.test_effects import HEIGHT, PLANE, WIDTH, bench, gray, present
 from tests.trainer.test_networks import disturbed
+from trainer.captures.bench_file import bench_tables, read_bench
 from trainer.captures.capture_set import read_captures
 from trainer.effects import catalogue
 from trainer.model.bundle_export import export_bundle
@@ -174,6 +175,26 @@ def test_the_description_says_what_the_panel_is(folder: Path) -> None:
     }  # fmt: skip
     assert [c["name"] for c in description["channels"]] == ["red", "green"]
     assert {a.dtype for a in read_bundle(folder).arrays.values()} <= {np.dtype("f4"), np.dtype("c8")}
+
+
+def test_a_panel_of_few_gray_levels_is_one_for_the_trainer_and_for_the_headset(tmp_path: Path) -> None:
+    """bench.toml says which it has; a model file and a bundle keep it; prediction and headset round alike."""
+    few = read_bench(
+        {**bench_tables(bench()), "panel": {**bench_tables(bench())["panel"], "gray_levels": [0, 40, 128]}}
+    )
+    assert few.panel.gray_levels == (0, 40, 128) and read_bench(bench_tables(few)) == few
+    assert "gray_levels" not in bench_tables(bench())["panel"]
+    model = Model(few, every_effect())
+    export_bundle(model, None, tmp_path / "b")
+    bundle = read_bundle(tmp_path / "b")
+    assert bundle.description["panel"]["gray_levels"] == [0, 40, 128]
+    ours, theirs = headset_irradiance(bundle, "green", PLANE), trained_irradiance(model, "green", PLANE)
+    assert np.abs(ours - theirs).max() < 2e-5 * theirs.max()
+    assert len(np.unique(load_light_path(bundle).response)) == 3
+    smooth = trained_irradiance(Model(bench(), every_effect()), "green", PLANE)
+    assert np.abs(smooth - theirs).max() > 0.1 * theirs.max()
+    with pytest.raises(InputError, match=r"panel\.gray_levels in bench\.toml"):
+        read_bench({**bench_tables(few), "panel": {**bench_tables(few)["panel"], "gray_levels": [40, 0]}})
 
 
 def test_channels_must_be_named_where_there_are_several(folder: Path) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from firmware_iface.errors import InputError
+from runtime.lightpath.gray_levels import checked_gray_levels
 from trainer.captures.bench_keys import (
     TOP_KEYS,
     KeyRule,
@@ -60,6 +61,8 @@ class Panel:
         Share of a pixel's area that the pattern modulates.
     phase_sign : int
         1, or -1 where more gray means less phase.
+    gray_levels : tuple of int
+        Those that the panel has, where it has few: others are shown as the nearest of these. Empty: all.
     """
 
     width: int
@@ -68,6 +71,7 @@ class Panel:
     levels: int = 256
     fill_factor: float = 1.0
     phase_sign: int = 1
+    gray_levels: tuple[int, ...] = ()
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -251,6 +255,8 @@ def read_bench(source: Path | str | Mapping[str, Any]) -> Bench:
 def bench_tables(bench: Bench) -> dict[str, Any]:
     """The tables of bench.toml that describe a bench; `read_bench` of them gives the bench back."""
     panel, camera = dict(vars(bench.panel)), dict(vars(bench.camera))
+    if gray_levels := list(panel.pop("gray_levels")):
+        panel["gray_levels"] = gray_levels
     if camera["homography"] is None:
         del camera["homography"]
     else:
@@ -276,7 +282,9 @@ def _bench(tables: Mapping[str, Any]) -> Bench:
     if type(schema) is not int or schema != 1:
         raise InputError(f"schema is {printed(schema)}, but this reader knows schema 1: write schema = 1")
     name = checked_value("name", KeyRule(str), tables.get("name"))
-    panel = Panel(**checked_table("panel", tables.get("panel")))
+    values = checked_table("panel", tables.get("panel"))
+    values["gray_levels"] = checked_gray_levels(values["gray_levels"], "panel.gray_levels in bench.toml")
+    panel = Panel(**values)
     rows = tables.get("channel")
     if not isinstance(rows, (list, tuple)) or not rows:
         raise InputError(

@@ -61,6 +61,7 @@ TABLES: dict[str, dict[str, KeyRule]] = {
         "levels": KeyRule(int, 2, 65536, default=256),
         "fill_factor": KeyRule(float, 0, 1, above=True, default=1.0),
         "phase_sign": KeyRule(int, choices=(1, -1), default=1),
+        "gray_levels": KeyRule(list),
     },
     "channel": {"name": KeyRule(str), "wavelength_nm": KeyRule(float, 100, 20000, unit="nm")},
     "propagation": {"distance_mm": KeyRule(float, -1e4, 1e4, unit="mm")},

@@ -82,6 +82,7 @@ def export_bundle(
             "pitch_um": panel.pitch_um,
             "levels": panel.levels,
             "phase_sign": panel.phase_sign,
+            **({"gray_levels": list(panel.gray_levels)} if panel.gray_levels else {}),
         },
         "channels": [
             {"name": c.name, "wavelength_nm": c.wavelength_nm}
@@ -177,7 +178,7 @@ def _single(value: Any) -> Any:
         return tuple(_single(part) for part in value)
     if isinstance(value, Tensor):
         return value.to(torch.complex64 if value.is_complex() else torch.float32).numpy()
-    if value is None or isinstance(value, Grid):
+    if value is None or isinstance(value, Grid | int):
         return value
     raise TypeError(f"a light path does not hold {type(value).__name__}")
 

@@ -22,6 +22,7 @@ from runtime.camera.sampling import (
     spline_filter,
 )
 from runtime.lightpath.fft import rfft2
+from runtime.lightpath.gray_levels import shown_as
 from runtime.lightpath.grid import FINE
 from runtime.lightpath.light_path import LightPath, mode_irradiance, panel_phase, panel_spectrum, states
 from runtime.lightpath.modulation import Modulation
@@ -47,9 +48,12 @@ def light_path(scene: Scene, stages: Stages) -> LightPath:
     source, offset = stages.panel.source, stages.drive.offset
     if offset is not None:
         source = source * torch.polar(torch.ones_like(offset), offset)
+    response, panel = stages.drive.response, scene.bench.panel
+    if panel.gray_levels:
+        response = response[shown_as(panel.gray_levels, panel.levels)]
     return LightPath(
         grid=scene.grid,
-        response=stages.drive.response,
+        response=response,
         source=source,
         transfers=transfers,
         weights=weights,
@@ -60,6 +64,7 @@ def light_path(scene: Scene, stages: Stages) -> LightPath:
         irradiance_filter=display_filter(stages),
         far_field=_far_field(scene, stages.pupil) if scene.method == "fraunhofer" else None,
         modulation=_modulation(stages.drive),
+        gray_levels=panel.gray_levels,
     )
 
 

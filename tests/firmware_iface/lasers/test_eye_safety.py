@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_iface.errors import InputError
+from firmware_iface.lasers.channels import LaserChannel
 from firmware_iface.lasers.eye_safety import (
     ALL_IN_ONE_SPOT,
     SIZES_MRAD,
@@ -19,6 +20,7 @@ from firmware_iface.lasers.eye_safety import (
     spot_shares,
     thermal_limit_uw,
 )
+from firmware_iface.lasers.pattern_power import LightBudget
 
 NM = {"red": 638.0, "green": 520.0, "blue": 450.0}
 
@@ -128,3 +130,66 @@ def test_a_short_bright_pulse_is_limited_by_itself_and_not_by_the_mean() -> None
 def test_gated_light_that_cannot_be_is_refused(duty: float, pulse_s: float, frame_s: float) -> None:
     with pytest.raises(InputError, match="within the frame"):
         GatedLight(duty, pulse_s, frame_s)
+
+
+def test_several_pulses_in_a_frame_are_also_one_pulse_of_all_their_light() -> None:
+    """2 mW fit a pulse of 4 ms a second, and not two: as one of 8 ms they may have 1.898 mW.
+
+    A source of 6.08 mrad bears the least: 0.2 * 6.08 / 1.5 of the 2.783 mW and 2.341 mW of a point.
+    """
+    once = GatedLight(duty=0.004, pulse_s=0.004, frame_s=1.0)
+    twice = GatedLight(duty=0.008, pulse_s=0.004, frame_s=1.0, pulses=2)
+    assert exposure({"red": 2000.0}, NM, gated=once).worst == pytest.approx(2.0 / 2.257, rel=1e-3)
+    assert exposure({"red": 2000.0}, NM, gated=twice).worst == pytest.approx(2.0 / 1.898, rel=1e-3)
+    channels = [LaserChannel("red", 638.0, 2000.0, 45.0, 60.0)]
+    LightBudget(channels, once).check({"red": 1.0})
+    with pytest.raises(InputError, match=r"1\.05 of the Class 1 limit"):
+        LightBudget(channels, twice).check({"red": 1.0})
+
+
+def test_the_mean_of_several_pulses_is_of_all_of_them() -> None:
+    """Four pulses of 2 ms in 16 ms are half of the time: 780 uW make the 390 uW of a point, and one a quarter."""
+    each = {"duty": 0.125, "pulse_s": 0.002, "frame_s": 0.016}
+    four = GatedLight(**{**each, "duty": 0.5}, pulses=4)
+    assert exposure({"red": 780.0}, NM, gated=four).thermal == pytest.approx(1)
+    one = exposure({"red": 780.0}, NM, gated=GatedLight(**each))
+    assert one.thermal == pytest.approx(780 / 2684, rel=1e-3), (
+        "its mean is 0.25, and a pulse may have 2.684 mW"
+    )
+    assert exposure({"blue": 78.0}, NM, gated=four).photochemical == pytest.approx(1)
+    with pytest.raises(InputError, match="share of all pulses"):
+        GatedLight(**each, pulses=4)
+    with pytest.raises(InputError, match="within the frame"):
+        GatedLight(duty=1.0, pulse_s=0.002, frame_s=0.016, pulses=9)
+
+
+def test_some_of_a_frames_pulses_can_be_worse_than_one_and_than_all() -> None:
+    """Large sources, 0.3 ms: one pulse may have 3.545 mW, two 2.981, three 3.233, four 3.050."""
+    spread = (1e-6,) * 5 + (1.0,) * (len(SIZES_MRAD) - 5)
+    found = [
+        exposure({"red": 3000.0}, NM, {"red": spread}, GatedLight(n * 0.0003, 0.0003, 1.0, n)).thermal
+        for n in (1, 2, 3, 4)
+    ]
+    assert found[0] == pytest.approx(3.0 / 3.545, rel=1e-3)
+    assert found[1] == found[2] == found[3] == pytest.approx(3.0 / 2.981, rel=1e-3)
+    assert max(3.0 / 3.545, 3.0 / 3.050) < 1 < found[3]
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 8), st.integers(1, 3), st.floats(0.001, 0.02))
+def test_no_time_of_any_length_has_more_light_than_its_limit_when_the_budget_is_kept(
+    seed: int, patterns: int, colours: int, field_s: float
+) -> None:
+    """Against the standard's rule for any part of a train: its mean power keeps the limit of its duration."""
+    rng = np.random.default_rng(seed)
+    shares = np.maximum.accumulate(rng.random(len(SIZES_MRAD)) ** rng.integers(1, 12))
+    pulse_s, frame_s = field_s / 2, patterns * colours * field_s
+    gated = GatedLight(patterns * pulse_s / frame_s, pulse_s, frame_s, patterns)
+    power_uw = 1 / exposure({"red": 1.0}, NM, {"red": shares}, gated).thermal
+    for count in {*range(1, 40), *np.geomspace(40, 30 / field_s, 30).astype(int).tolist()}:
+        lasts_s = (count - 1) * colours * field_s + pulse_s
+        mean_uw = power_uw * count * pulse_s / lasts_s
+        for share, mrad in zip(shares, SIZES_MRAD, strict=True):
+            if mrad <= largest_pulsed_mrad(lasts_s):
+                longest = 10 * 10 ** ((mrad - 1.5) / 98.5)
+                limit_uw = 700 * min(lasts_s, longest) ** -0.25 * mrad / 1.5
+                assert share * mean_uw <= 1.01 * limit_uw, (count, mrad)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from firmware_iface.errors import InputError
+from firmware_iface.panel.phase_light_modulator import gray_levels
 from firmware_iface.virtual.simulated_drive import Drive
 from runtime.calibration.columns import Columns
 from runtime.calibration.drift import LOWEST_WAVEFRONT, Drift, drifted
@@ -17,16 +18,17 @@ from runtime.calibration.parameter_layout import ParameterLayout
 from runtime.calibration.prediction import Predictor
 from runtime.calibration.replacement_rule import replacement_verdict
 from runtime.calibration.response import (
-    SWEEP,
     Sweep,
     best_period,
     fitted_response,
     measured_sweep,
+    swept,
 )
 from runtime.calibration.shown_patterns import grains, grating
 from runtime.calibration.taking import Taker
 from runtime.camera.view import View, sampler
 from runtime.excess import PredictionErrors, is_complete
+from runtime.lightpath.gray_levels import shown_as
 from runtime.lightpath.legendre import edge_to_edge, legendre_maps
 from runtime.lightpath.light_path import irradiance, panel_phase, pixel_irradiance
 from tests.runtime.benches import PITCH, ideal_path, random_path
@@ -131,10 +133,17 @@ def test_derivatives_are_what_differences_say() -> None:
         assert np.linalg.norm(column - wanted) < 0.05 * np.linalg.norm(wanted), place
 
 
-def test_a_sweep_of_gratings_gives_a_hidden_response() -> None:
+@pytest.mark.parametrize("has", [(), tuple(gray_levels())])
+def test_a_sweep_of_gratings_gives_a_hidden_response(has: tuple[int, ...]) -> None:
+    """Also of a panel with 16 gray levels, which shows others as the nearest of its own."""
     shape = (64, 80)
     bench = drifted_bench("phase_response", shape=shape)
+    bench = replace(bench, panel=replace(bench.panel, gray_levels=tuple(map(float, has))))
     device, one, still = headset(bench), base(shape), Estimate(Drift(), View(shape))
+    if has:
+        path = one.path
+        coarse = replace(path, response=path.response[shown_as(has, 256)], gray_levels=has)
+        one = replace(one, path=coarse)
     taker = Taker(devices(device), lambda what: None)
     black, floor = taker.darkness()
     taker.light("green")
@@ -142,7 +151,7 @@ def test_a_sweep_of_gratings_gives_a_hidden_response() -> None:
     noise = taker.noise(grains(shape, 4, 0), black, floor)
     sample = sampler(still.view, one.path.grid)
     period = best_period(one, "green", still, sample)
-    shots = taker.shots("green", [grating(shape, period, g) for g in SWEEP], noise, "grating")
+    shots = taker.shots("green", [grating(shape, period, g) for g in swept(one.path)], noise, "grating")
     predictor = Predictor({"green": one})
     predictor.take(still)
     sweep = measured_sweep(predictor, shots)
@@ -150,8 +159,11 @@ def test_a_sweep_of_gratings_gives_a_hidden_response() -> None:
     assert np.abs(true - one.path.response).max() > 0.5
     assert np.abs(sweep.phase - true[sweep.gray]).max() < 0.03
     assert sweep.visibility.min() > 0.98 and 0 < sweep.error.max() < 0.02
-    found = fitted_response(np.asarray(one.path.response, float), sweep)
-    assert np.abs(found - true).max() < 0.02 and (np.diff(found) >= 0).all()
+    found = fitted_response(np.asarray(one.path.response, float), sweep, has)
+    assert np.abs(found - true).max() < 0.02
+    assert (
+        (np.diff(found) >= 0).all() if not has else len(np.unique(found)) == len(has) == len(sweep.gray) + 1
+    )
 
 
 def test_the_cameras_noise_is_measured_without_its_data_sheet() -> None:

@@ -184,7 +184,7 @@ def test_patterns_of_three_colours_by_a_deadline(tmp_path: Path) -> None:
     [
         ("fields = 3\n", "", "fields = 3 in [panel] to show them in turn"),
         ("fields = 3\n", "fields = 2\n", "fields = 2 and 3 colours"),
-        ("solve_ms = 12.0", "solve_ms = 12.0\nchannel = 'green'", "fields = 3 and 1 colours"),
+        ("fields = 3\n", "fields = 5\n", "fields = 5 and 3 colours"),
         ("refresh_hz = 1000.0", "refresh_hz = 100.0", "33.3 a second"),
         ("fields = 3\n", "fields = 3\nkind = 'mirrored'\n", "shows one colour"),
         (
