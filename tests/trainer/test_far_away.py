@@ -92,7 +92,7 @@ def test_what_is_not_needed_is_left_out_again(captures: CaptureSet) -> None:
     names = ("illumination", "distance", "phase_response", "misregistration", "zero_order")
     with open_pool(1) as pool:
         screened = screen_candidates(roles, ideal, known(*names), pool, no_progress)
-    found = explain_together(roles, ideal, errors, known(*names), screened, Thresholds())
+        found = explain_together(roles, ideal, errors, known(*names), screened, Thresholds(), pool)
     assert found is not None
     assert set(found.model.names) == set(names[:-1])
     assert [name for name, _ in found.ladder] != [] and found.ladder[-1][1].excess < 0.02 * errors.excess
@@ -106,7 +106,7 @@ def test_one_strong_effect_alone_is_not_far_away(tmp_path: Path) -> None:
     errors = evaluate_captures(captures, roles.held_out, ideal)
     with open_pool(1) as pool:
         screened = screen_candidates(roles, ideal, known("distance", "illumination"), pool, no_progress)
-    found = explain_together(roles, ideal, errors, catalogue(), screened, Thresholds())
+        found = explain_together(roles, ideal, errors, catalogue(), screened, Thresholds(), pool)
     assert found is None
 
 

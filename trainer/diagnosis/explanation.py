@@ -9,7 +9,7 @@ from typing import Any
 
 from runtime.excess import PredictionErrors, removed_excess
 from runtime.program.progress import Progress, no_progress, part_of
-from trainer.captures.capture_set import CaptureSet
+from trainer.captures.capture_set import CaptureSet, opened
 from trainer.captures.held_out import CaptureRoles, capture_roles
 from trainer.diagnosis.addition import add_from, gone_on, with_maps_again
 from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors, screen_candidates
@@ -25,7 +25,7 @@ from trainer.fitting.pool import Pool
 from trainer.fitting.predictor import evaluate_captures
 from trainer.fitting.refit import next_order
 from trainer.model.history import recorded
-from trainer.model.model import Model
+from trainer.model.model import EffectInstance, Model
 
 MOST_EFFECTS = 8  # an explanation longer than this explains nothing
 NEAR = 0.7  # of the excess that the best candidate removes: a candidate that removes so much is near
@@ -160,7 +160,7 @@ def explain(
         """The model without those of the named effects that it does as well without, each a step."""
         limits = diagnoses[-1].thresholds
         while True:
-            smaller = without_one(roles, model, errors, names, limits, ideal.excess)
+            smaller = without_one(roles, model, errors, names, limits, ideal.excess, pool)
             if smaller is None:
                 return model, errors
             dropped, model, errors = smaller
@@ -174,7 +174,7 @@ def explain(
     if is_far(roles, model, errors):
         screened = screen_candidates(roles, model, known, pool, report)
         together = explain_together(
-            roles, model, errors, known, screened, thresholds, part_of(report, 0.3, 0.4)
+            roles, model, errors, known, screened, thresholds, pool, part_of(report, 0.3, 0.4)
         )
     if together is not None:
         screened = None  # of another model
@@ -208,7 +208,7 @@ def explain(
                 save(model)
             continue
         report_share(0.9, f"adding {best.effect.name}")
-        best, candidate, after = _added(roles, found)
+        best, candidate, after = _added(roles, found, pool)
         candidate, after = with_maps_again(roles, candidate, after)
         # A map whose next order did not help is looked at again only where nothing else fits.
         if next_order(candidate.instance(best.effect.name)) is None:
@@ -238,22 +238,28 @@ def explain(
     return Explanation(tuple(steps), model, diagnoses[-1], tuple(diagnoses), rest)
 
 
-def _added(roles: CaptureRoles, found: Diagnosis) -> tuple[RankedEffect, Model, PredictionErrors]:
+def _added(roles: CaptureRoles, found: Diagnosis, pool: Pool) -> tuple[RankedEffect, Model, PredictionErrors]:
     """The effect to add, the model with it, everything refitted, and that model's held-out errors.
 
     A candidate is ranked while present effects stay as they are, and these may have taken up a part of the right one.
     So its closest rival is fitted together with them, too.
     """
     rival = _rival(found) if found.model.present else None
-    fitted = []
-    for one in (found.ranking[0], rival):
-        if one is not None:
-            model = add_from(roles, one.base, one.model.instance(one.effect.name))
-            fitted.append((one, model, evaluate_captures(roles.captures, roles.held_out, model)))
-    first, *second = fitted
-    if second and removed_excess(first[2], second[0][2]).interval()[0] > 0:
-        return second[0]
-    return first
+    ones = [one for one in (found.ranking[0], rival) if one is not None]
+    tasks = [(roles.folder, one.base, one.model.instance(one.effect.name)) for one in ones]
+    fitted = pool.map_here_if_one(_with_everything_refitted, tasks)
+    if len(ones) > 1 and removed_excess(fitted[0][1], fitted[1][1]).interval()[0] > 0:
+        return ones[1], *fitted[1]
+    return ones[0], *fitted[0]
+
+
+def _with_everything_refitted(
+    folder: Path, base: Model, start: EffectInstance
+) -> tuple[Model, PredictionErrors]:
+    """A model with one more effect, and its held-out errors: a task for any process."""
+    roles = capture_roles(opened(folder))
+    model = add_from(roles, base, start)
+    return model, evaluate_captures(roles.captures, roles.held_out, model)
 
 
 def _rival(found: Diagnosis) -> RankedEffect | None:

@@ -15,6 +15,7 @@ from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import Catalogue
 from trainer.fitting.gains import with_gains
 from trainer.fitting.joint_start import joint_start
+from trainer.fitting.pool import Pool
 from trainer.fitting.predictor import evaluate_captures
 from trainer.fitting.refit import settled
 from trainer.model.model import Model
@@ -51,6 +52,7 @@ def explain_together(
     known: Catalogue,
     screened: Sequence[ScreenResult],
     thresholds: Thresholds,
+    pool: Pool,
     progress: Progress | None = None,
 ) -> JointExplanation | None:
     """The effects that most benches have, fitted together from coarse to fine, less those that are not needed.
@@ -80,7 +82,7 @@ def explain_together(
         return None
     report(0.8, "leaving out effects that are not needed")
     names = joint.names
-    while smaller := without_one(roles, joint, after, names, thresholds, errors.excess, thorough=False):
+    while smaller := without_one(roles, joint, after, names, thresholds, errors.excess, pool, thorough=False):
         dropped, joint, after = smaller
         names = names[names.index(dropped) + 1 :]
     return JointExplanation(joint, _ladder(roles, joint, after))

@@ -10,7 +10,7 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import (
     BrokenExecutor,
     CancelledError,
@@ -91,6 +91,10 @@ class Pool:
             for f in futures:
                 f.cancel()
             raise
+
+    def map_here_if_one(self, function: Callable[..., T], tasks: Sequence[tuple[Any, ...]]) -> list[T]:
+        """As `map`, but a single task runs in this process, which may use all cores for it."""
+        return [function(*tasks[0])] if len(tasks) == 1 else self.map(function, tasks)
 
     def submit(self, function: Callable[..., Any], task: tuple[Any, ...]) -> Future[Any]:
         """The future of `function(*task)`, for `result`."""
