@@ -44,6 +44,10 @@ class PhaseResponse(Defect):
     lopsidedness: float = parameter(0.02, "bulge of the curve, share of full phase", -0.08, 0.08)
     reference_nm: float = parameter(520.0, "wavelength at which the gain holds", 200, 2000)
     dispersion: float = parameter(1.1, "exponent of reference over wavelength", 0, 4)
+    kink: float = parameter(
+        0.0, "height of a kink, share of full phase: the curve is bent at one level", -0.2, 0.2
+    )
+    kink_at: float = parameter(0.4, "share of the gray levels where the kink is", 0.1, 0.9)
 
 
 @dataclass(frozen=True)

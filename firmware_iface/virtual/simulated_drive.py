@@ -141,6 +141,7 @@ class Drive:
         slope = np.ones_like(t)
         if d:
             slope += -d.s_curvature * np.cos(2 * np.pi * t) + np.pi * d.lopsidedness * np.sin(2 * np.pi * t)
+            slope += d.kink * np.where(t < d.kink_at, 1 / d.kink_at, -1 / (1 - d.kink_at))
         return (self._full * self._thickness * slope / self.levels).astype(np.float32)
 
     def gray_of(self, magnitude: Array) -> Array:
@@ -185,7 +186,8 @@ class Drive:
         if d is None:
             return t
         bend = -d.s_curvature * np.sin(2 * np.pi * t) / (2 * np.pi)
-        return t + bend + d.lopsidedness * np.sin(np.pi * t) ** 2
+        kink = d.kink * np.where(t < d.kink_at, t / d.kink_at, (1 - t) / (1 - d.kink_at))
+        return t + bend + d.lopsidedness * np.sin(np.pi * t) ** 2 + kink
 
     def spread(self, phase: Single) -> Single:
         """Phase on sub-pixels, [qH, qW], of phase a pixel, [H, W]; with the panel's sign."""

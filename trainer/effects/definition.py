@@ -129,7 +129,7 @@ class Effect:
     same_as : str
         The effect that it equals in captures of one colour and plane, where it is no candidate; "" for none.
     free_form : FreeForm or None
-        How the effect's map goes on where its polynomials end.
+        How the effect's map or curve goes on where its polynomials end.
     formula : str
         LaTeX, without dollar signs; "" where none is given.
     description : str

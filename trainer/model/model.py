@@ -32,7 +32,7 @@ class EffectInstance:
     errors : dict of float64 arrays or None
         Standard errors, shaped as `values`; None where nothing was fitted.
     nodes : float64 array [m, n] or None
-        Of the free-form map that is added to the polynomials, in the unit of the effect's `free_form`.
+        Of the free-form map or curves that are added to the polynomials, in the unit of the effect's `free_form`.
     """
 
     effect: Effect

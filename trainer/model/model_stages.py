@@ -10,7 +10,6 @@ import numpy as np
 import torch
 
 from trainer.captures.bench_file import Bench
-from trainer.effects.free_form import surface_over
 from trainer.effects.own_effect import applied
 from trainer.model.model import EffectInstance, Model
 from trainer.prediction.free_stages import with_learned
@@ -72,8 +71,8 @@ def stages_for(scene: Scene, present: tuple[EffectInstance, ...], tensors: Any =
         name = one.effect.stage
         stage = applied(one.effect, getattr(stages, name), arguments)
         if one.nodes is not None and one.effect.free_form is not None:
-            surface = surface_over(stage, torch.as_tensor(one.nodes, dtype=scene.dtype))
-            stage = one.effect.free_form.apply(stage, surface)
+            nodes = torch.as_tensor(one.nodes, dtype=scene.dtype)
+            stage = one.effect.free_form.added(stage, nodes, row)
         stages = replace(stages, **{name: stage})
     return stages
 
