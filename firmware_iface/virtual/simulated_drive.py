@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.virtual.bench_description import BenchDescription
-from firmware_iface.virtual.defects import Convention, Crosstalk, PhaseNonuniformity, PhaseResponse
+from firmware_iface.virtual.defects import Convention, Crosstalk, PhaseNonuniformity, PhaseResponse, Specks
 from firmware_iface.virtual.further_defects import (
     AmplitudeModulation,
     Drivers,
@@ -19,7 +19,7 @@ from firmware_iface.virtual.further_defects import (
     PolarisationLeak,
     SlowResponse,
 )
-from firmware_iface.virtual.simulated_panel import share_grid
+from firmware_iface.virtual.simulated_panel import disc_gain, share_grid
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
@@ -70,6 +70,7 @@ class Drive:
             )
         gain, self._offset = driver_errors(bench.defect(Drivers), panel.height, panel.width)
         self._thickness = _thickness(bench.defect(PhaseNonuniformity), panel.height, panel.width) * gain
+        self._thickness = self._thickness * disc_gain(bench.defect(Specks), panel.height, panel.width)
         slow = bench.defect(SlowResponse)
         self._left = slow.share if slow else 0.0
         self._absorption = bench.defect(AmplitudeModulation)

@@ -86,6 +86,11 @@ class Model:
         field_name = () if self.panel_field is None else (NAME,)
         return (*self.names, *field_name, *(f"learned_{stage}" for stage in self.learned))
 
+    @property
+    def in_time(self) -> bool:
+        """Whether an effect changes from capture to capture with the moment when each was taken."""
+        return any(p.effect.takes_moment for p in self.present)
+
     def instance(self, name: str) -> EffectInstance:
         """The effect of that name, as it is in the model."""
         return next(p for p in self.present if p.effect.name == name)

@@ -34,6 +34,7 @@ def steps_in_gray(one: ProbeMap) -> list[Reading]:
                     -10.0,
                     10.0,
                     "at equal steps of the gray level",
+                    True,
                 ),
             ),
             code=(

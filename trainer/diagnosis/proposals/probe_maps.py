@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -149,6 +149,10 @@ DRIVEN = Place(
     _on_pixels("drive"),
     ("    return drive.scaled(1 + value)",),
 )
+# A shape at the panel times the gray level: the phase that it adds grows with the gray level.
+DRIVEN_BY_GRAY = replace(
+    DRIVEN, title="", name="gray", what=DRIVEN.what + ", so that a shape grows with the gray level"
+)
 GRAY = Place(
     "drive",
     "response, deviation",
@@ -226,7 +230,12 @@ def maps_of(found: ProbeResult, shape: tuple[int, int], signal: float = 1.0) -> 
         ProbeMap(m.place, m.values, m.shape, m.reach, removed * p / whole)
         for m, p in zip(maps, powers, strict=True)
     ]
-    return [*_transmission(weighed, removed), *weighed]
+    return [*_transmission(weighed, removed), *_times_gray(weighed), *weighed]
+
+
+def _times_gray(maps: Sequence[ProbeMap]) -> list[ProbeMap]:
+    """The phase at the panel as the mean over all gray levels of a phase that grows with them."""
+    return [replace(m, place=DRIVEN_BY_GRAY, values=m.values / np.pi) for m in maps if m.place is PHASE]
 
 
 def _transmission(maps: Sequence[ProbeMap], removed: float) -> list[ProbeMap]:
@@ -248,7 +257,7 @@ def _maps_at(place: Place, found: ProbeResult, shape: tuple[int, int]) -> list[P
     if not arrays:
         return []
     if place is GRAY:  # one response for all colours: their mean
-        return [ProbeMap(place, np.mean([a.reshape(-1) for a in arrays], axis=0), (0, 0), (0.0, 0.0))]
+        return [map_at(place, np.mean([a.reshape(-1) for a in arrays], axis=0), shape)]
     values = arrays[0]
     middle = float(np.median(values))
     if place is PASSED:
@@ -257,10 +266,29 @@ def _maps_at(place: Place, found: ProbeResult, shape: tuple[int, int]) -> list[P
         values = values / middle - 1 if middle > 0 else values * 0
     else:
         values = values - middle
+    return [map_at(place, values, shape)]
+
+
+def map_at(place: Place, values: NDArray[np.float64], shape: tuple[int, int], weight: float = 0.0) -> ProbeMap:
+    """A map of a place from the values on a probe's nodes.
+
+    Parameters
+    ----------
+    shape : (int, int), pixels
+        Of the camera or the panel.
+    """
+    if place is GRAY:
+        return ProbeMap(place, values, (0, 0), (0.0, 0.0), weight)
     if place.spread == "pixels":
         # The maps' corners are the corner pixels' centres.
-        return [ProbeMap(place, values, shape, ((shape[0] - 1) / 2, (shape[1] - 1) / 2))]
-    outside = [round((n - 1) / 2 * (1 - 1 / PUPIL_EXTENT)) for n in values.shape]
+        return ProbeMap(place, values, shape, ((shape[0] - 1) / 2, (shape[1] - 1) / 2), weight)
+    outside = outside_band(values.shape)
     rows, columns = (slice(k, n - k) for k, n in zip(outside, values.shape, strict=True))
     reach = [PUPIL_EXTENT * (1 - 2 * k / (n - 1)) for k, n in zip(outside, values.shape, strict=True)]
-    return [ProbeMap(place, values[rows, columns], (0, 0), (reach[0], reach[1]))]
+    return ProbeMap(place, values[rows, columns], (0, 0), (reach[0], reach[1]), weight)
+
+
+def outside_band(nodes: tuple[int, ...]) -> tuple[int, int]:
+    """Rows and columns of the pupil's nodes on each side that lie beyond the panel's band."""
+    rows, columns = (round((n - 1) / 2 * (1 - 1 / PUPIL_EXTENT)) for n in nodes)
+    return rows, columns

@@ -10,7 +10,16 @@ from trainer.captures.bench_file import Bench
 from trainer.diagnosis.probes import ProbeResult
 from trainer.diagnosis.proposals.blob_shape import blobs_in, blobs_of_their_own, more_blobs_in
 from trainer.diagnosis.proposals.gray_shape import steps_in_gray
-from trainer.diagnosis.proposals.probe_maps import GAIN, GRAY, TRANSMISSION, Place, ProbeMap, maps_of
+from trainer.diagnosis.proposals.probe_maps import (
+    DRIVEN_BY_GRAY,
+    GAIN,
+    GRAY,
+    TRANSMISSION,
+    Place,
+    ProbeMap,
+    maps_of,
+)
+from trainer.diagnosis.proposals.product_shape import product_in, strength_of
 from trainer.diagnosis.proposals.reading import Reading, Values
 from trainer.diagnosis.proposals.row_column_shape import rows_and_columns_in
 from trainer.diagnosis.proposals.surface_shape import radial_in, smooth_in, times_surface
@@ -45,7 +54,7 @@ class Candidate:
         parts = [self.place.stage, self.reading.name]
         if self.place.name and self.place not in (GAIN, GRAY):
             parts.insert(1, self.place.name)
-        stem = "_".join(parts)[:36]
+        stem = "_".join(parts)[:48]
         names = [stem, *(f"{stem}_{k}" for k in range(2, 100))]
         return next(n for n in names if n not in taken)
 
@@ -68,13 +77,41 @@ def candidates_of(
     found: list[Candidate] = []
     for k, one in enumerate(maps):
         report(k / len(maps), f"looking at the {one.place.stage} probe")
-        readings = [r for read in _readers(one.place) for r in read(one)]
-        products = [] if one.place is GRAY else [times_surface(one, r) for r in readings if _multiplied(r)]
-        for r in [*readings, *(p for p in products if p is not None)]:
-            if r.explained > max(LEAST, NODES * r.size / one.values.size):
-                found.append(Candidate(one.place, r, one.weight * r.explained))
-    found.sort(key=lambda c: -c.worth)
-    return [c for c in found if c.worth > WEAK * found[0].worth][:MOST]
+        found += [Candidate(one.place, r, one.weight * r.explained) for r in readings_of(one)]
+    return most_promising(found)
+
+
+def readings_of(one: ProbeMap) -> list[Reading]:
+    """Shapes and products of two that explain a part of a map worth a fit, those that explain most first."""
+    readings = [r for read in _readers(one.place) for r in read(one)]
+    seen = [r for r in [*readings, *_products(one, readings)] if _worth_a_fit(one, r)]
+    return sorted(seen, key=lambda r: -r.explained)
+
+
+def most_promising(found: Sequence[Candidate]) -> list[Candidate]:
+    """The candidates that are fitted in a round, those that promise most first."""
+    ordered = sorted(found, key=lambda c: -c.worth)
+    return [c for c in ordered if c.worth > WEAK * ordered[0].worth][:MOST]
+
+
+def _worth_a_fit(one: ProbeMap, reading: Reading) -> bool:
+    return reading.explained > max(LEAST, NODES * reading.size / one.values.size)
+
+
+def _products(one: ProbeMap, readings: Sequence[Reading]) -> list[Reading]:
+    """Products of two shapes: each shape times a surface, and the strongest one times what its strength shows."""
+    firsts = [r for r in readings if _multiplied(r)] if one.place is not GRAY else []
+    products = [times_surface(one, r) for r in firsts]
+    if firsts:
+        first = max(firsts, key=lambda r: r.explained)
+        strength = strength_of(one, first)
+        seconds = [r for read in (waves_in, radial_in, *_repeating(one.place)) for r in read(strength)]
+        products += [product_in(one, first, r) for r in seconds if _worth_a_fit(strength, r)]
+    return [p for p in products if p is not None]
+
+
+def _repeating(place: Place) -> tuple[Read, ...]:
+    return (rows_and_columns_in,) if place.spread == "pixels" else ()
 
 
 def more_of(
@@ -109,6 +146,8 @@ def _readers(place: Place) -> tuple[Read, ...]:
     smooth: tuple[Read, ...] = (waves_in, smooth_in, radial_in)
     if place.spread != "pixels":
         return smooth
+    if place is DRIVEN_BY_GRAY:
+        return (waves_in, rows_and_columns_in, blobs_in)  # smooth ones have a name: phase_nonuniformity
     return (*smooth, rows_and_columns_in, *((blobs_in,) if place is GAIN else ()))
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from runtime.lightpath.legendre import legendre_count, legendre_maps
 from trainer.diagnosis.proposals.probe_maps import ProbeMap
+from trainer.diagnosis.proposals.product_shape import product_in, strength_of
 from trainer.diagnosis.proposals.reading import Array, Number, Reading, share_explained, with_unit
 from trainer.formatting import number
 
@@ -16,9 +17,9 @@ CENTRES = np.linspace(-0.8, 0.8, 9)  # of the half width, where the search for a
 LEGENDRE = "from runtime.lightpath.legendre import legendre_surface"
 
 
-def smooth_in(one: ProbeMap) -> list[Reading]:
+def smooth_in(one: ProbeMap, order: int = ORDER) -> list[Reading]:
     """The low-order surface of a map."""
-    basis = _surfaces(one, ORDER)
+    basis = _surfaces(one, order)
     terms, shape = _fitted(basis, one.values)
     unit, size = one.place.unit, float(np.std(shape))
     return [
@@ -26,7 +27,7 @@ def smooth_in(one: ProbeMap) -> list[Reading]:
             name="surface",
             about="A smooth surface.",
             describe=lambda v: (
-                f"a surface of order {ORDER}, terms of {with_unit(float(np.hypot.reduce(v['terms'])), unit)} in all"
+                f"a surface of order {order}, terms of {with_unit(float(np.hypot.reduce(v['terms'])), unit)} in all"
             ),
             formula=r"v = \sum_k a_k L_k(y, x)",
             numbers=(
@@ -37,7 +38,8 @@ def smooth_in(one: ProbeMap) -> list[Reading]:
                     tuple(terms),
                     0.0,
                     *_range(unit),
-                    f"of Legendre products of orders 1 to {ORDER}",
+                    f"of Legendre products of orders 1 to {order}",
+                    True,
                 ),
             ),
             code=(_surface_line("value", "terms", one),),
@@ -89,6 +91,7 @@ def radial_in(one: ProbeMap) -> list[Reading]:
                     0.0,
                     *_range(unit),
                     "of the even powers of the distance, from the second on",
+                    True,
                 ),
             ),
             code=(
@@ -103,44 +106,8 @@ def radial_in(one: ProbeMap) -> list[Reading]:
 
 def times_surface(one: ProbeMap, first: Reading) -> Reading | None:
     """The product of a shape and a smooth surface, where it explains clearly more of the map than the shape alone."""
-    values = one.values - one.values.mean()
-    pattern = np.asarray(first.found) - np.mean(first.found)
-    basis = np.concatenate([pattern[None], pattern[None] * _surfaces(one, ENVELOPE)])
-    terms, shape = _fitted(basis, values)
-    explained = share_explained(one.values, shape)
-    if not terms or terms[0] <= 0 or explained < first.explained + 0.1 * (1 - first.explained):
-        return None
-    envelope = tuple(t / terms[0] for t in terms[1:])
-    return Reading(
-        name=f"{first.name}_times_surface",
-        about=first.about.rstrip(".") + ", whose strength changes smoothly over the field.",
-        describe=lambda v: (
-            f"{first.describe(v)}; their strength changes by {number(float(np.hypot.reduce(v['envelope'])))} "
-            "over the field"
-        ),
-        formula=first.formula + r";\quad v \to v\left(1 + \sum_k e_k L_k(y, x)\right)",
-        numbers=(
-            *first.numbers,
-            Number(
-                "envelope",
-                "1",
-                0.05,
-                envelope,
-                0.0,
-                -10.0,
-                10.0,
-                f"of Legendre products of orders 1 to {ENVELOPE}",
-            ),
-        ),
-        code=(
-            *first.code,
-            _surface_line("strength", "envelope", one),
-            "    value = value * (1 + strength)",
-        ),
-        found=shape,
-        explained=explained,
-        imports=(*first.imports, LEGENDRE),
-    )
+    (surface,) = smooth_in(strength_of(one, first), ENVELOPE)
+    return product_in(one, first, surface)
 
 
 def _surface_line(name: str, terms: str, one: ProbeMap) -> str:
