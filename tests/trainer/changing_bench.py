@@ -24,14 +24,19 @@ class ChangingHeadset(VirtualHeadset):
     ----------
     defects_at : callable
         `number of captures before -> defects`.
+    still : int
+        Captures at the beginning, which set the exposure, in which nothing changes yet.
     """
 
-    def __init__(self, defects_at: Callable[[int], tuple[Defect, ...]], shape: tuple[int, int] = SHAPE) -> None:
-        self.defects_at = defects_at
+    def __init__(
+        self, defects_at: Callable[[int], tuple[Defect, ...]], still: int, shape: tuple[int, int] = SHAPE
+    ) -> None:
+        self.defects_at, self.still = defects_at, still
         super().__init__(BenchDescription("changing").resized(*shape, 8.0), seed=3)
 
     def _capture(self) -> NDArray[np.uint16]:
-        bench = BenchDescription("changing", defects=self.defects_at(self.captures))
+        number = max(0, self.captures - self.still)
+        bench = BenchDescription("changing", defects=self.defects_at(number))
         now = VirtualHeadset(bench.resized(*self.panel.shape, 8.0), self.seed)
         now.panel, now.lasers, now.camera = self.panel, self.lasers, self.camera
         now.captures, now.plane_mm = self.captures, self.plane_mm
@@ -45,6 +50,6 @@ def captured_while_changing(
     folder: Path, defects_at: Callable[[int], tuple[Defect, ...]], patterns: int = 16
 ) -> CaptureSet:
     """A capture set of such a headset."""
-    headset = ChangingHeadset(defects_at)
+    headset = ChangingHeadset(defects_at, still=patterns)
     acquire_captures(headset, nominal_bench(headset), folder / "captures", patterns=patterns)
     return read_captures(folder / "captures")

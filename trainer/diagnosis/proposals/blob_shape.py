@@ -107,14 +107,26 @@ def _reading(one: ProbeMap, found: Found, own: bool) -> Reading:
     passed: tuple[Number, ...]
     if is_complex:
         passed = (
-            Number("real", "1", 0.05, of_each(inside.real), 1.0, -2.0, 2.0, f"part of what passes {whose}", True),
             Number(
-                "imaginary", "1", 0.05, of_each(inside.imag), 0.0, -2.0, 2.0, f"part of what passes {whose}", True
+                "real", "1", 0.05, of_each(inside.real), 1.0, -2.0, 2.0, f"part of what passes {whose}", True
+            ),
+            Number(
+                "imaginary",
+                "1",
+                0.05,
+                of_each(inside.imag),
+                0.0,
+                -2.0,
+                2.0,
+                f"part of what passes {whose}",
+                True,
             ),
         )
         line = "    inside = torch.complex(real, imaginary)"
     else:
-        passed = (Number("passed", "1", 0.05, of_each(inside.real), 1.0, 0.0, 10.0, f"of the {what} {whose}", True),)
+        passed = (
+            Number("passed", "1", 0.05, of_each(inside.real), 1.0, 0.0, 10.0, f"of the {what} {whose}", True),
+        )
         line = "    inside = passed"
 
     def described(values: Values) -> str:

@@ -138,7 +138,9 @@ def strengths_of(
             weights.append(max(weight, 1e-30))
             values.append(float(slope @ left) / max(weight, 1e-30))
         errors.append(batch.errors(torch.zeros_like(batch.signal)))
-    return Strengths(tuple(moments), np.array(values), np.array(weights)), float(joined(errors).variance.sum())
+    return Strengths(tuple(moments), np.array(values), np.array(weights)), float(
+        joined(errors).variance.sum()
+    )
 
 
 def _places(stage: str) -> list[Place]:

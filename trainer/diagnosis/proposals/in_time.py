@@ -9,16 +9,18 @@ import numpy as np
 from trainer.captures.capture_table import Capture
 from trainer.captures.held_out import CaptureRoles, split
 from trainer.diagnosis.proposals.drifting_maps import FREE, drifting_maps, strengths_of
+from trainer.diagnosis.proposals.gray_shape import smooth_in_gray
 from trainer.diagnosis.proposals.order_shape import LEAST_CAPTURES, Strengths, curves_in
-from trainer.diagnosis.proposals.probe_maps import Place, map_at
+from trainer.diagnosis.proposals.probe_maps import GRAY, Place, map_at
 from trainer.diagnosis.proposals.product_shape import product
 from trainer.diagnosis.proposals.reading import Reading
-from trainer.diagnosis.proposals.shapes_tried import Candidate, readings_of
+from trainer.diagnosis.proposals.shapes_tried import Candidate, single_shapes
 from trainer.effects.definition import STAGES
 from trainer.fitting.pool import Pool
 from trainer.model.model import Model
 
 CAPTURES = 24  # most that strengths are read off
+MOST = 3  # products that are fitted in one round
 STEADY, A_MAP, CURVES = 2, 2, 2  # shapes of the steady probes, shapes of a drifting map, curves of a shape
 
 
@@ -46,12 +48,14 @@ def candidates_in_time(
         return []
     maps = pool.map(drifting_maps, [(roles.folder, ids, model, stage) for stage in STAGES])
     shapes: list[tuple[Place, Reading]] = [
-        (c.place, c.reading) for c in steady if c.place in FREE
+        (c.place, c.reading) for c in steady if c.place in FREE and "_times_" not in c.reading.name
     ][:STEADY]
     for one in (m for found in maps for m in found):
         size = model.bench.camera.shape if one.place.stage == "sensor" else model.bench.panel.shape
-        readings = readings_of(map_at(one.place, one.values, size))
-        shapes += [(one.place, r) for r in readings[:A_MAP]]
+        drifting = map_at(one.place, one.values, size)
+        # A steady curve over gray levels has a name, phase_response; one that drifts has none.
+        curves = smooth_in_gray(drifting) if one.place is GRAY else []
+        shapes += [(one.place, r) for r in [*curves, *single_shapes(drifting)][:A_MAP]]
     tasks = [(roles.folder, ids, model, place, reading.found) for place, reading in shapes]
     found = []
     for (place, reading), (seen, variance) in zip(shapes, pool.map(strengths_of, tasks), strict=True):
@@ -59,7 +63,7 @@ def candidates_in_time(
             whole = product(reading.scaled(size), curve, size * reading.found, reading.explained)
             found.append(Candidate(place, whole, _removed(seen, size * curve.found) / variance))
     found.sort(key=lambda c: -c.worth)
-    return found
+    return found[:MOST]
 
 
 def _removed(seen: Strengths, fitted: np.ndarray) -> float:

@@ -199,7 +199,9 @@ def _swing(clock: Clock, t: Array, seen: Strengths) -> tuple[float, Reading] | N
                 period * 2,
                 "period",
             ),
-            Number("begin", "deg", 3.0, begin, 0.0, -400.0, 400.0, "where the swing stands at the first capture"),
+            Number(
+                "begin", "deg", 3.0, begin, 0.0, -400.0, 400.0, "where the swing stands at the first capture"
+            ),
             Number("rest", "1", 0.05, rest / size, 0.0, -100.0, 100.0, "strength about which it swings"),
         ),
         code=(

@@ -37,6 +37,8 @@ class Place:
         Unit of its coordinates: "pixels", "share of band" or "" for gray levels.
     before, after : tuple of str
         Lines of a file that make the coordinates, and that put `value` in.
+    seen_by : str
+        The stage whose probe shows it; "" for its own.
     """
 
     stage: str
@@ -47,6 +49,12 @@ class Place:
     spread: str
     before: tuple[str, ...]
     after: tuple[str, ...]
+    seen_by: str = ""
+
+    @property
+    def probe(self) -> str:
+        """The stage whose probe shows it."""
+        return self.seen_by or self.stage
 
     @property
     def acts_on(self) -> str:
@@ -150,9 +158,7 @@ DRIVEN = Place(
     ("    return drive.scaled(1 + value)",),
 )
 # A shape at the panel times the gray level: the phase that it adds grows with the gray level.
-DRIVEN_BY_GRAY = replace(
-    DRIVEN, title="", name="gray", what=DRIVEN.what + ", so that a shape grows with the gray level"
-)
+DRIVEN_BY_GRAY = replace(DRIVEN, title="", name="gray", seen_by="panel")
 GRAY = Place(
     "drive",
     "response, deviation",
@@ -269,7 +275,9 @@ def _maps_at(place: Place, found: ProbeResult, shape: tuple[int, int]) -> list[P
     return [map_at(place, values, shape)]
 
 
-def map_at(place: Place, values: NDArray[np.float64], shape: tuple[int, int], weight: float = 0.0) -> ProbeMap:
+def map_at(
+    place: Place, values: NDArray[np.float64], shape: tuple[int, int], weight: float = 0.0
+) -> ProbeMap:
     """A map of a place from the values on a probe's nodes.
 
     Parameters

@@ -18,7 +18,7 @@ from trainer.diagnosis.candidate_fits import CandidateFit, try_effect
 from trainer.diagnosis.probes import ProbeResult, probe
 from trainer.diagnosis.proposals.effect_file import write_effect
 from trainer.diagnosis.proposals.in_time import candidates_in_time
-from trainer.diagnosis.proposals.shapes_tried import Candidate, candidates_of, more_of, most_promising
+from trainer.diagnosis.proposals.shapes_tried import WEAK, Candidate, candidates_of, more_of
 from trainer.diagnosis.ranking import rank
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import Catalogue, load_effects
@@ -139,7 +139,8 @@ class RoundWork:
         signal = float(np.sqrt(before.variance.sum() / max(before.pixels.sum(), 1)))
         steady = candidates_of(telling, model.bench, signal, part_of(report, 0, 0.05))
         report(0.05, "looking at what changes from capture to capture")
-        candidates = most_promising([*steady, *candidates_in_time(self.roles, model, self.pool, steady)])
+        candidates = [*steady, *candidates_in_time(self.roles, model, self.pool, steady)]
+        candidates = [c for c in candidates if c.worth > WEAK * max(o.worth for o in candidates)]
         fits = self._fitted(model, candidates, part_of(report, 0.1, 0.6, "fitting what the probes show"))
         best = self._best(before, fits)
         others = tuple(
@@ -179,7 +180,7 @@ class RoundWork:
         None where neither is clearly better.
         """
         (found,) = self.pool.map(
-            probe, [(self.roles.folder, self._probed, self._held, model, candidate.place.stage)]
+            probe, [(self.roles.folder, self._probed, self._held, model, candidate.place.probe)]
         )
         left = ProbeResult.judged(found, errors)
         values = model.instance(name).values

@@ -109,9 +109,7 @@ class Reading:
 
     def scaled(self, factor: float) -> Reading:
         """The shape at another size."""
-        return replace(
-            self, numbers=tuple(n.scaled(factor) for n in self.numbers), found=factor * self.found
-        )
+        return replace(self, numbers=tuple(n.scaled(factor) for n in self.numbers), found=factor * self.found)
 
 
 def with_unit(value: float, unit: str) -> str:

@@ -28,6 +28,7 @@ from trainer.diagnosis.proposals.wave_shape import waves_in, waves_in_gray
 MOST = 5  # shapes that are fitted in one round
 LEAST = 0.02  # share of a map that a shape must explain
 NODES = 6  # times a shape's numbers over the map's nodes, which it must explain: noise fits as much
+SMOOTH = ("surface", "radial")  # a surface's product with a surface is one again
 WEAK = 0.1  # of the best candidate's worth: what is below is not fitted
 
 Read = Callable[[ProbeMap], list[Reading]]
@@ -78,36 +79,41 @@ def candidates_of(
     for k, one in enumerate(maps):
         report(k / len(maps), f"looking at the {one.place.stage} probe")
         found += [Candidate(one.place, r, one.weight * r.explained) for r in readings_of(one)]
-    return most_promising(found)
+    found.sort(key=lambda c: -c.worth)
+    return [c for c in found if c.worth > WEAK * found[0].worth][:MOST]
 
 
 def readings_of(one: ProbeMap) -> list[Reading]:
-    """Shapes and products of two that explain a part of a map worth a fit, those that explain most first."""
-    readings = [r for read in _readers(one.place) for r in read(one)]
-    seen = [r for r in [*readings, *_products(one, readings)] if _worth_a_fit(one, r)]
-    return sorted(seen, key=lambda r: -r.explained)
+    """Shapes and the best product of two that explain a part of a map worth a fit, those that explain most first."""
+    readings = single_shapes(one)
+    seen = [*readings, *(p for p in _best_product(one, readings) if _worth_a_fit(one, p))]
+    seen.sort(key=lambda r: -r.explained)
+    if one.place is DRIVEN_BY_GRAY:  # smooth ones have a name: phase_nonuniformity
+        return [r for r in seen[:1] if r.name not in SMOOTH]
+    return seen
 
 
-def most_promising(found: Sequence[Candidate]) -> list[Candidate]:
-    """The candidates that are fitted in a round, those that promise most first."""
-    ordered = sorted(found, key=lambda c: -c.worth)
-    return [c for c in ordered if c.worth > WEAK * ordered[0].worth][:MOST]
+def single_shapes(one: ProbeMap) -> list[Reading]:
+    """Shapes that explain a part of a map worth a fit, those that explain most first."""
+    readings = [r for read in _readers(one.place) for r in read(one) if _worth_a_fit(one, r)]
+    return sorted(readings, key=lambda r: -r.explained)
 
 
 def _worth_a_fit(one: ProbeMap, reading: Reading) -> bool:
     return reading.explained > max(LEAST, NODES * reading.size / one.values.size)
 
 
-def _products(one: ProbeMap, readings: Sequence[Reading]) -> list[Reading]:
-    """Products of two shapes: each shape times a surface, and the strongest one times what its strength shows."""
-    firsts = [r for r in readings if _multiplied(r)] if one.place is not GRAY else []
+def _best_product(one: ProbeMap, readings: Sequence[Reading]) -> list[Reading]:
+    """The product of two shapes that explains most: any times a surface, or the first times what its strength shows."""
+    firsts = [r for r in readings if r.name not in (*SMOOTH, "specks")] if one.place is not GRAY else []
     products = [times_surface(one, r) for r in firsts]
     if firsts:
-        first = max(firsts, key=lambda r: r.explained)
-        strength = strength_of(one, first)
+        strength = strength_of(one, firsts[0])
         seconds = [r for read in (waves_in, radial_in, *_repeating(one.place)) for r in read(strength)]
-        products += [product_in(one, first, r) for r in seconds if _worth_a_fit(strength, r)]
-    return [p for p in products if p is not None]
+        products += [product_in(one, firsts[0], r) for r in seconds if _worth_a_fit(strength, r)]
+    found = [p for p in products if p is not None]
+    # A factor of many numbers explains more by chance.
+    return sorted(found, key=lambda p: NODES * p.size / one.values.size - p.explained)[:1]
 
 
 def _repeating(place: Place) -> tuple[Read, ...]:
@@ -146,11 +152,4 @@ def _readers(place: Place) -> tuple[Read, ...]:
     smooth: tuple[Read, ...] = (waves_in, smooth_in, radial_in)
     if place.spread != "pixels":
         return smooth
-    if place is DRIVEN_BY_GRAY:
-        return (waves_in, rows_and_columns_in, blobs_in)  # smooth ones have a name: phase_nonuniformity
-    return (*smooth, rows_and_columns_in, *((blobs_in,) if place is GAIN else ()))
-
-
-def _multiplied(reading: Reading) -> bool:
-    """Whether the shape times a surface is another shape; a surface's own product is one again."""
-    return reading.name not in ("surface", "specks", "radial") and reading.explained > LEAST
+    return (*smooth, rows_and_columns_in, *((blobs_in,) if place in (GAIN, DRIVEN_BY_GRAY) else ()))

@@ -137,10 +137,26 @@ def waves_in_gray(one: ProbeMap) -> list[Reading]:
             formula=r"v = a\cos 2\pi n (g - \tfrac12) + b\sin 2\pi n (g - \tfrac12)",
             numbers=(
                 Number(
-                    "cosine", "rad", 0.02, float(terms[0]), 0.0, -3.0, 3.0, "part that is even about mid-gray", True
+                    "cosine",
+                    "rad",
+                    0.02,
+                    float(terms[0]),
+                    0.0,
+                    -3.0,
+                    3.0,
+                    "part that is even about mid-gray",
+                    True,
                 ),
                 Number(
-                    "sine", "rad", 0.02, float(terms[1]), 0.0, -3.0, 3.0, "part that is odd about mid-gray", True
+                    "sine",
+                    "rad",
+                    0.02,
+                    float(terms[1]),
+                    0.0,
+                    -3.0,
+                    3.0,
+                    "part that is odd about mid-gray",
+                    True,
                 ),
                 Number(
                     "cycles",
