@@ -21,7 +21,7 @@ from trainer.diagnosis.addition import add
 from trainer.diagnosis.proposals.effect_file import write_effect
 from trainer.diagnosis.proposals.in_time import candidates_in_time
 from trainer.diagnosis.proposals.order_shape import ORDER, TIME, Strengths, clock_of, curves_in
-from trainer.diagnosis.proposals.probe_maps import GAIN, PHASE, map_at
+from trainer.diagnosis.proposals.probe_maps import GAIN, OFFSET, PHASE, map_at
 from trainer.diagnosis.proposals.product_shape import product, product_in, strength_of
 from trainer.diagnosis.proposals.proposal_rounds import Proposal
 from trainer.diagnosis.proposals.proposing import Proposals, propose
@@ -220,11 +220,33 @@ def test_a_panel_that_warms_up_is_a_curve_over_gray_levels_that_changes(tmp_path
     assert first.excess_after < 1e-4
 
 
+def test_added_light_that_swings_is_read_with_its_mean(tmp_path: Path) -> None:
+    captures = captured_while_changing(
+        tmp_path,
+        lambda n: (
+            make_defect(
+                "stray_light", glow_counts=60 * (1 + math.sin(2 * math.pi * n / 7.3)), second_glow_counts=0.0
+            ),
+        ),
+    )
+    model = add(captures, Model(captures.bench), catalogue()["stray_light"]).model
+    with open_pool(1) as pool:
+        found = candidates_in_time(capture_roles(captures), model, pool, [])
+    assert (found[0].place, found[0].reading.name) == (OFFSET, "surface_times_swing")
+    assert float(found[0].reading.starts["swing"]) == pytest.approx(7.3, rel=0.02)
+    y, x = pixels()
+    glow = np.exp(-((x / 48 - 0.5) ** 2 + (y / 36 + 0.35) ** 2) / 0.36)
+    seen = np.asarray(found[0].reading.found)
+    assert seen.mean() > 0 and np.corrcoef(seen.ravel(), glow.ravel())[0, 1] > 0.95
+
+
 @pytest.mark.parametrize(
     ("defect", "name"),
     [
         ({"kind": "fringes", "fade": 0.8}, "sensor_fringes_times_surface"),
-        ({"kind": "stripes", "fade": 0.9}, "panel_amplitude_columns_times_surface"),
+        pytest.param(
+            {"kind": "stripes", "fade": 0.9}, "panel_amplitude_columns_times_surface", marks=pytest.mark.slow
+        ),
     ],
 )
 def test_shapes_that_fade_over_the_field_are_products(defect: dict, name: str, tmp_path: Path) -> None:
@@ -234,6 +256,7 @@ def test_shapes_that_fade_over_the_field_are_products(defect: dict, name: str, t
     assert first.excess_after < 1.5e-4
 
 
+@pytest.mark.slow
 def test_bubbles_are_specks_times_the_gray_level(tmp_path: Path) -> None:
     bubbles = make_defect(
         "specks",

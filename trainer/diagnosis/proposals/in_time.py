@@ -11,16 +11,18 @@ from trainer.captures.held_out import CaptureRoles, split
 from trainer.diagnosis.proposals.drifting_maps import FREE, drifting_maps, strengths_of
 from trainer.diagnosis.proposals.gray_shape import smooth_in_gray
 from trainer.diagnosis.proposals.order_shape import LEAST_CAPTURES, Strengths, curves_in
-from trainer.diagnosis.proposals.probe_maps import GRAY, Place, map_at
+from trainer.diagnosis.proposals.probe_maps import GRAY, OFFSET, Place, ProbeMap, map_at
 from trainer.diagnosis.proposals.product_shape import product
 from trainer.diagnosis.proposals.reading import Reading
 from trainer.diagnosis.proposals.shapes_tried import Candidate, single_shapes
+from trainer.diagnosis.proposals.surface_shape import smooth_in
 from trainer.effects.definition import STAGES
 from trainer.fitting.pool import Pool
 from trainer.model.model import Model
 
 CAPTURES = 24  # most that strengths are read off
 MOST = 3  # products that are fitted in one round
+LIGHT_ORDER = 4  # of added light that changes
 STEADY, A_MAP, CURVES = 2, 2, 2  # shapes of the steady probes, shapes of a drifting map, curves of a shape
 
 
@@ -53,9 +55,9 @@ def candidates_in_time(
     for one in (m for found in maps for m in found):
         size = model.bench.camera.shape if one.place.stage == "sensor" else model.bench.panel.shape
         drifting = map_at(one.place, one.values, size)
-        # A steady curve over gray levels has a name, phase_response; one that drifts has none.
-        curves = smooth_in_gray(drifting) if one.place is GRAY else []
-        shapes += [(one.place, r) for r in [*curves, *single_shapes(drifting)][:A_MAP]]
+        named = _named_when_steady(drifting)
+        others = [r for r in single_shapes(drifting) if r.name not in (n.name for n in named)]
+        shapes += [(one.place, r) for r in [*named, *others][:A_MAP]]
     tasks = [(roles.folder, ids, model, place, reading.found) for place, reading in shapes]
     found = []
     for (place, reading), (seen, variance) in zip(shapes, pool.map(strengths_of, tasks), strict=True):
@@ -64,6 +66,13 @@ def candidates_in_time(
             found.append(Candidate(place, whole, _removed(seen, size * curve.found) / variance))
     found.sort(key=lambda c: -c.worth)
     return found[:MOST]
+
+
+def _named_when_steady(one: ProbeMap) -> list[Reading]:
+    """Shapes that have a name where they are steady, `phase_response` and `stray_light`, and none where they drift."""
+    if one.place is GRAY:
+        return smooth_in_gray(one)
+    return smooth_in(one, LIGHT_ORDER, lowest=0) if one.place is OFFSET else []
 
 
 def _removed(seen: Strengths, fitted: np.ndarray) -> float:

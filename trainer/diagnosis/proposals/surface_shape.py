@@ -17,10 +17,15 @@ CENTRES = np.linspace(-0.8, 0.8, 9)  # of the half width, where the search for a
 LEGENDRE = "from runtime.lightpath.legendre import legendre_surface"
 
 
-def smooth_in(one: ProbeMap, order: int = ORDER) -> list[Reading]:
-    """The low-order surface of a map."""
-    basis = _surfaces(one, order)
-    terms, shape = _fitted(basis, one.values)
+def smooth_in(one: ProbeMap, order: int = ORDER, lowest: int = 1) -> list[Reading]:
+    """The low-order surface of a map, with its mean where `lowest` is 0."""
+    basis = _surfaces(one, order, lowest)
+    if lowest:
+        terms, shape = _fitted(basis, one.values)
+    else:
+        flat = basis.reshape(len(basis), -1)
+        terms = [float(t) for t in np.linalg.lstsq(flat.T, one.values.reshape(-1), rcond=None)[0]]
+        shape = np.tensordot(terms, basis, axes=1)
     unit, size = one.place.unit, float(np.std(shape))
     return [
         Reading(
@@ -38,11 +43,11 @@ def smooth_in(one: ProbeMap, order: int = ORDER) -> list[Reading]:
                     tuple(terms),
                     0.0,
                     *_range(unit),
-                    f"of Legendre products of orders 1 to {order}",
+                    f"of Legendre products of orders {lowest} to {order}",
                     True,
                 ),
             ),
-            code=(_surface_line("value", "terms", one),),
+            code=(_surface_line("value", "terms", one, lowest),),
             found=shape,
             explained=share_explained(one.values, shape),
             imports=(LEGENDRE,),
@@ -110,19 +115,20 @@ def times_surface(one: ProbeMap, first: Reading) -> Reading | None:
     return product_in(one, first, surface)
 
 
-def _surface_line(name: str, terms: str, one: ProbeMap) -> str:
+def _surface_line(name: str, terms: str, one: ProbeMap, lowest: int) -> str:
     """The line of a file that makes a surface: coordinates run over -1 .. 1."""
+    mean = "" if lowest else ", lowest=0"
     if one.place.spread == "pixels":
         stage = one.place.stage
-        return f"    {name} = legendre_surface({terms}, {stage}.y, {stage}.x)"
-    return f"    {name} = legendre_surface({terms}, torch.clamp(y, -1, 1), torch.clamp(x, -1, 1))"
+        return f"    {name} = legendre_surface({terms}, {stage}.y, {stage}.x{mean})"
+    return f"    {name} = legendre_surface({terms}, torch.clamp(y, -1, 1), torch.clamp(x, -1, 1){mean})"
 
 
-def _surfaces(one: ProbeMap, order: int) -> Array:
+def _surfaces(one: ProbeMap, order: int, lowest: int = 1) -> Array:
     y, x = one.grid
     half = (one.shape[0] / 2, one.shape[1] / 2) if one.place.spread == "pixels" else (1.0, 1.0)
-    maps = np.asarray(legendre_maps(y[:, :1] / half[0], x[:1, :] / half[1], order))
-    return maps.reshape(legendre_count(order), *one.values.shape)
+    maps = np.asarray(legendre_maps(y[:, :1] / half[0], x[:1, :] / half[1], order, lowest))
+    return maps.reshape(legendre_count(order, lowest), *one.values.shape)
 
 
 def _powers(y: Array, x: Array, radius: float) -> Array:
