@@ -61,9 +61,9 @@ def candidates_in_time(
     tasks = [(roles.folder, ids, model, place, reading.found) for place, reading in shapes]
     found = []
     for (place, reading), (seen, variance) in zip(shapes, pool.map(strengths_of, tasks), strict=True):
-        for size, curve in curves_in(seen)[:CURVES]:
-            whole = product(reading.scaled(size), curve, size * reading.found, reading.explained)
-            found.append(Candidate(place, whole, _removed(seen, size * curve.found) / variance))
+        for strength, curve in curves_in(seen)[:CURVES]:
+            whole = product(reading.scaled(strength), curve, strength * reading.found, reading.explained)
+            found.append(Candidate(place, whole, _removed(seen, strength * curve.found) / variance))
     found.sort(key=lambda c: -c.worth)
     return found[:MOST]
 
