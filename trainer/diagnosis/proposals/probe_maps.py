@@ -213,7 +213,9 @@ class ProbeMap:
         return tuple(self.values.shape) == self.shape
 
 
-def maps_of(found: ProbeResult, shape: tuple[int, int], signal: float = 1.0) -> list[ProbeMap]:
+def maps_of(
+    found: ProbeResult, shape: tuple[int, int], signal: float = 1.0, phase_sign: int = 1
+) -> list[ProbeMap]:
     """The maps of a probe that an effect could replace, each with its weight.
 
     Parameters
@@ -223,6 +225,8 @@ def maps_of(found: ProbeResult, shape: tuple[int, int], signal: float = 1.0) -> 
         Of the camera for the sensor's probe, of the panel otherwise.
     signal : float, counts
         Standard deviation of the measured signal, against which added counts are weighed.
+    phase_sign : int
+        -1 where more gray means less phase.
     """
     maps = [m for place in PLACES if place.stage == found.stage for m in _maps_at(place, found, shape)]
     powers = [
@@ -236,12 +240,14 @@ def maps_of(found: ProbeResult, shape: tuple[int, int], signal: float = 1.0) -> 
         ProbeMap(m.place, m.values, m.shape, m.reach, removed * p / whole)
         for m, p in zip(maps, powers, strict=True)
     ]
-    return [*_transmission(weighed, removed), *_times_gray(weighed), *weighed]
+    return [*_transmission(weighed, removed), *_times_gray(weighed, phase_sign), *weighed]
 
 
-def _times_gray(maps: Sequence[ProbeMap]) -> list[ProbeMap]:
-    """The phase at the panel as the mean over all gray levels of a phase that grows with them."""
-    return [replace(m, place=DRIVEN_BY_GRAY, values=m.values / np.pi) for m in maps if m.place is PHASE]
+def _times_gray(maps: Sequence[ProbeMap], sign: int) -> list[ProbeMap]:
+    """The phase at the panel as the mean over all gray levels, of half a wave, of a phase that grows with them."""
+    return [
+        replace(m, place=DRIVEN_BY_GRAY, values=sign * m.values / np.pi) for m in maps if m.place is PHASE
+    ]
 
 
 def _transmission(maps: Sequence[ProbeMap], removed: float) -> list[ProbeMap]:

@@ -141,7 +141,7 @@ def more_of(
 
 def _maps(probes: Sequence[ProbeResult], bench: Bench, signal: float) -> list[ProbeMap]:
     shapes = {p.stage: bench.camera.shape if p.stage == "sensor" else bench.panel.shape for p in probes}
-    return [m for p in probes for m in maps_of(p, shapes[p.stage], signal)]
+    return [m for p in probes for m in maps_of(p, shapes[p.stage], signal, bench.panel.phase_sign)]
 
 
 def _readers(place: Place) -> tuple[Read, ...]:
