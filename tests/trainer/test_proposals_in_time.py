@@ -240,13 +240,12 @@ def test_added_light_that_swings_is_read_with_its_mean(tmp_path: Path) -> None:
     assert seen.mean() > 0 and np.corrcoef(seen.ravel(), glow.ravel())[0, 1] > 0.95
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("defect", "name"),
     [
         ({"kind": "fringes", "fade": 0.8}, "sensor_fringes_times_surface"),
-        pytest.param(
-            {"kind": "stripes", "fade": 0.9}, "panel_amplitude_columns_times_surface", marks=pytest.mark.slow
-        ),
+        ({"kind": "stripes", "fade": 0.9}, "panel_amplitude_columns_times_surface"),
     ],
 )
 def test_shapes_that_fade_over_the_field_are_products(defect: dict, name: str, tmp_path: Path) -> None:
