@@ -59,9 +59,10 @@ def change_of(step: Mapping[str, Any]) -> str:
     Parameters
     ----------
     step : mapping
-        A step of `explain --json` or a record of a model's history: `added`, `removed` and `refined`, where given.
+        A step of `explain --json` or a record of a model's history: `added`, `removed`, and `refined` with `form`,
+        where given.
     """
-    signs = (("+", "added"), ("−", "removed"), ("map of", "refined"))
+    signs = (("+", "added"), ("−", "removed"), (f"{step.get('form', 'map')} of", "refined"))
     return " ".join(f"{sign} {step[key]}" for sign, key in signs if step.get(key))
 
 

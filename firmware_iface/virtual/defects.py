@@ -44,6 +44,10 @@ class PhaseResponse(Defect):
     lopsidedness: float = parameter(0.02, "bulge of the curve, share of full phase", -0.08, 0.08)
     reference_nm: float = parameter(520.0, "wavelength at which the gain holds", 200, 2000)
     dispersion: float = parameter(1.1, "exponent of reference over wavelength", 0, 4)
+    kink: float = parameter(
+        0.0, "height of a kink, share of full phase: the curve is bent at one level", -0.2, 0.2
+    )
+    kink_at: float = parameter(0.4, "share of the gray levels where the kink is", 0.1, 0.9)
 
 
 @dataclass(frozen=True)
@@ -272,6 +276,9 @@ class Specks(Defect):
     largest_radius_px: float = parameter(5.0, "radius", 0.1, 100)
     transmission: float = parameter(0.15, "amplitude that passes a disc", 0, 1)
     phase_deg: float = parameter(60.0, "delay of the light that passes")
+    phase_gain: float = parameter(
+        1.0, "a disc's phase over the pattern's, as a bubble in the cell makes it", 0, 3
+    )
     places: int = parameter(1, "seed of the places", 0)
 
 
@@ -285,6 +292,7 @@ class Fringes(Defect):
     period_px: float = parameter(17.0, "period at the centre", 2.1, 5000)
     angle_deg: float = parameter(33.0, "direction of the fringes' normal from x")
     chirp: float = parameter(0.3, "relative change of frequency from centre to edge", -0.9, 0.9)
+    fade: float = parameter(0.0, "relative change of the contrast from the centre to the right edge", -1, 1)
 
 
 @dataclass(frozen=True)
@@ -294,6 +302,7 @@ class Stripes(Defect):
     kind = "stripes"
     stage = "panel"
     rms: float = parameter(0.16, "standard deviation of a column's amplitude", 0, 1)
+    fade: float = parameter(0.0, "relative change of the errors from the centre to the lower edge", -1, 1)
     places: int = parameter(1, "seed of the columns' errors", 0)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.virtual.bench_description import BenchDescription
-from firmware_iface.virtual.defects import Convention, Crosstalk, PhaseNonuniformity, PhaseResponse
+from firmware_iface.virtual.defects import Convention, Crosstalk, PhaseNonuniformity, PhaseResponse, Specks
 from firmware_iface.virtual.further_defects import (
     AmplitudeModulation,
     Drivers,
@@ -19,7 +19,7 @@ from firmware_iface.virtual.further_defects import (
     PolarisationLeak,
     SlowResponse,
 )
-from firmware_iface.virtual.simulated_panel import share_grid
+from firmware_iface.virtual.simulated_panel import disc_gain, share_grid
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
@@ -75,6 +75,7 @@ class Drive:
             )
         gain, self._offset = driver_errors(bench.defect(Drivers), panel.height, panel.width)
         self._thickness = _thickness(bench.defect(PhaseNonuniformity), panel.height, panel.width) * gain
+        self._thickness = self._thickness * disc_gain(bench.defect(Specks), panel.height, panel.width)
         slow = bench.defect(SlowResponse)
         self._left = slow.share if slow else 0.0
         self._absorption = bench.defect(AmplitudeModulation)
@@ -153,6 +154,7 @@ class Drive:
         slope = np.ones_like(t)
         if d:
             slope += -d.s_curvature * np.cos(2 * np.pi * t) + np.pi * d.lopsidedness * np.sin(2 * np.pi * t)
+            slope += d.kink * np.where(t < d.kink_at, 1 / d.kink_at, -1 / (1 - d.kink_at))
         return (self._full * self._thickness * slope / self.levels).astype(np.float32)
 
     def gray_of(self, magnitude: Array) -> Array:
@@ -197,7 +199,8 @@ class Drive:
         if d is None:
             return t
         bend = -d.s_curvature * np.sin(2 * np.pi * t) / (2 * np.pi)
-        return t + bend + d.lopsidedness * np.sin(np.pi * t) ** 2
+        kink = d.kink * np.where(t < d.kink_at, t / d.kink_at, (1 - t) / (1 - d.kink_at))
+        return t + bend + d.lopsidedness * np.sin(np.pi * t) ** 2 + kink
 
     def spread(self, phase: Single) -> Single:
         """Phase on sub-pixels, [qH, qW], of phase a pixel, [H, W]; with the panel's sign."""

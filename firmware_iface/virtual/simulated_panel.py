@@ -5,6 +5,8 @@ Arrays are [row, column]; [H, W] is panel pixels, [qH, qW] sub-pixels. Shares ru
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -54,7 +56,7 @@ class Surface:
         fill = leak.fill_factor if leak else bench.panel.fill_factor
         active = active_area(fill, q)
         covered = np.tile(active, (h, w))
-        amplitude = beam * _stripes(bench.defect(Stripes), w, q)
+        amplitude = beam * _stripes(bench.defect(Stripes), h, w, q)
         path = panel_path_nm(bench.defect(PanelWavefront), h * q, w * q, w / h)
         surface = amplitude * turn * np.exp(2j * np.pi * path / wavelength_nm)
         surface = surface * _dust(bench.defect(Specks), h, w, q)
@@ -117,24 +119,40 @@ def panel_path_nm(d: PanelWavefront | None, height: int, width: int, aspect: flo
     return path
 
 
-def _stripes(d: Stripes | None, width: int, q: int) -> Array:
+def _stripes(d: Stripes | None, height: int, width: int, q: int) -> Array:
     if d is None:
         return np.ones((1, 1))
-    columns = 1 + d.rms * np.random.default_rng([d.places, 17]).standard_normal(width)
-    return np.repeat(np.clip(columns, 0, None), q)[None, :]
+    errors = d.rms * np.random.default_rng([d.places, 17]).standard_normal(width)
+    rows = 1 + d.fade * share_grid(height * q, 1)[0] if d.fade else np.ones((1, 1))
+    return np.clip(1 + rows * np.repeat(errors, q)[None, :], 0, None)
+
+
+def disc_gain(d: Specks | None, height: int, width: int) -> Array:
+    """The phase's gain over the panel's pixels where discs have one of their own, [height, width]."""
+    if d is None or d.phase_gain == 1:
+        return np.ones((1, 1))
+    gain = np.ones((height, width))
+    for covered in discs(d, height, width, 4):
+        gain *= 1 + covered.reshape(height, 4, width, 4).mean((1, 3)) * (d.phase_gain - 1)
+    return gain
 
 
 def _dust(d: Specks | None, height: int, width: int, q: int) -> Complex128:
     if d is None:
         return np.ones((1, 1), np.complex128)
-    rng = np.random.default_rng([d.places, 29])
     out = np.ones((height * q, width * q), np.complex128)
     inside = d.transmission * np.exp(1j * np.deg2rad(d.phase_deg))
+    for covered in discs(d, height, width, q):
+        out *= 1 + covered * (inside - 1)
+    return out
+
+
+def discs(d: Specks, height: int, width: int, q: int) -> Iterator[Array]:
+    """Share of each sub-pixel that each disc covers, [height q, width q]."""
+    rng = np.random.default_rng([d.places, 29])
     y = (np.arange(height * q) + 0.5)[:, None] / q
     x = (np.arange(width * q) + 0.5)[None, :] / q
     for _ in range(d.count):
         cy, cx = rng.uniform(0, height), rng.uniform(0, width)
         radius = d.smallest_radius_px * (d.largest_radius_px / d.smallest_radius_px) ** rng.uniform()
-        covered = np.clip((radius - np.hypot(y - cy, x - cx)) * q + 0.5, 0, 1)
-        out *= 1 + covered * (inside - 1)
-    return out
+        yield np.clip((radius - np.hypot(y - cy, x - cx)) * q + 0.5, 0, 1)

@@ -241,7 +241,8 @@ def fringes(d: Fringes | None, height: int, width: int) -> Array:
     turn = np.deg2rad(d.angle_deg)
     t = x * width / 2 * np.cos(turn) + y * height / 2 * np.sin(turn)
     half = np.hypot(height, width) / 2
-    return 1 + d.contrast * np.cos(2 * np.pi / d.period_px * (t + d.chirp * t**2 / (2 * half)) + 0.5)
+    contrast = d.contrast * (1 + d.fade * x)
+    return 1 + contrast * np.cos(2 * np.pi / d.period_px * (t + d.chirp * t**2 / (2 * half)) + 0.5)
 
 
 def stray_counts(d: StrayLight | None, height: int, width: int) -> Array:

@@ -13,7 +13,8 @@ from firmware_iface.virtual.bench_description import CameraDescription, ChannelD
 from firmware_iface.virtual.bench_optics import BenchOptics
 from firmware_iface.virtual.iris_opening import iris_opening
 from firmware_iface.virtual.rough_surface import rough_surface, spline_weights
-from firmware_iface.virtual.simulated_panel import beam_amplitude, panel_path_nm
+from firmware_iface.virtual.simulated_panel import Surface, beam_amplitude, disc_gain, panel_path_nm
+from firmware_iface.virtual.simulated_sensor import fringes
 from tests.firmware_iface.padded_light import samples
 
 H, W, Z = 48, 64, 12.0
@@ -449,3 +450,27 @@ def test_the_oracle_allows_for_what_the_drive_does():
         for name, one in (("true", true), ("ideal", VirtualHeadset(small())))
     }
     assert found["true"] < 0.7 * found["ideal"]
+
+
+def test_a_kink_in_the_phase_response_has_its_slopes():
+    kink = make_defect("phase_response", gain=1.0, kink=0.1, kink_at=0.25, **LINEAR)
+    drive = BenchOptics(small(kink)).drive("green")
+    gray = np.arange(256.0)[None, :]
+    turned = drive.turned(gray)[0]
+    assert turned[64] == pytest.approx(0.25 + 0.1)
+    assert np.diff(turned)[[10, 200]] * 256 == pytest.approx([1 + 0.4, 1 - 0.1 / 0.75])
+    assert drive.slope(gray)[0, [10, 200]] * 128 / np.pi == pytest.approx([1 + 0.4, 1 - 0.1 / 0.75], rel=1e-5)
+
+
+def test_fringes_and_stripes_fade_and_a_discs_phase_has_a_gain():
+    gain = fringes(make_defect("fringes", fade=1.0, period_px=4.0, chirp=0.0), H, W)
+    assert np.std(gain[:, -4:]) == pytest.approx(2 * 0.22 / np.sqrt(2), rel=0.1)
+    assert np.std(gain[:, :4]) < 0.02
+    stripes = Surface(small(make_defect("stripes", fade=1.0)), 520.0).lit
+    assert np.std(np.abs(stripes[0])) < 0.01 < 0.2 < np.std(np.abs(stripes[-1]))
+    radii = {"smallest_radius_px": 6.0, "largest_radius_px": 6.0}
+    disc = make_defect("specks", count=1, places=3, phase_gain=0.5, **radii)
+    found = disc_gain(disc, H, W)
+    assert (found.min(), found.max()) == (0.5, 1.0)
+    assert np.isclose(found, 0.5).mean() == pytest.approx(np.pi * 36 / (H * W), rel=0.2)
+    assert disc_gain(make_defect("specks"), H, W).shape == (1, 1)

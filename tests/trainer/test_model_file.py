@@ -127,6 +127,28 @@ def test_a_free_form_map_comes_back_and_the_text_tells_of_it(tmp_path: Path) -> 
     assert "7 x 9 nodes of a bicubic spline, in rad" in (tmp_path / "m.toml").read_text(encoding="utf-8")
 
 
+@pytest.mark.parametrize("rows", [1, 2])
+def test_a_free_form_curve_comes_back_and_is_no_map(tmp_path: Path, rows: int) -> None:
+    on, effect = bench("red", "green"), catalogue()["phase_response"]
+    nodes = np.random.default_rng(0).normal(size=(rows, 12))
+    model = Model(on, (replace(absent(effect, on), nodes=nodes),))
+    path = tmp_path / "m.toml"
+    write_model(path, model)
+    assert_same(model, read_model(path, catalogue()))
+    text = path.read_text(encoding="utf-8")
+    assert "12 nodes of a cubic spline, in rad" in text
+    path.write_text(text.replace("curve = { array", "map = { array"), encoding="utf-8")
+    with pytest.raises(InputError, match="this effect has no map"):
+        read_model(path, catalogue())
+
+
+def test_a_curve_of_more_rows_than_colours_is_refused(tmp_path: Path) -> None:
+    on, effect = bench("red", "green"), catalogue()["phase_response"]
+    write_model(tmp_path / "m.toml", Model(on, (replace(absent(effect, on), nodes=np.zeros((3, 12))),)))
+    with pytest.raises(InputError, match="a row a colour, of at least 4 finite"):
+        read_model(tmp_path / "m.toml", catalogue())
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [("3.0", "write { array = ... }"), ('{ array = "gone" }', "gone"), (None, "at least 4 x 4 finite")],

@@ -16,7 +16,7 @@ from runtime.excess import PredictionErrors, prediction_errors
 from runtime.lightpath.grid import MARGIN
 from trainer.captures.bench_file import Bench
 from trainer.captures.capture_set import CaptureSet
-from trainer.captures.capture_table import Capture
+from trainer.captures.capture_table import Capture, Moment
 from trainer.captures.held_out import scenes
 from trainer.captures.smoothing import smoothed
 
@@ -50,6 +50,8 @@ class Batch:
         Standard deviation of the Gaussian that `signal` was smoothed with, and predictions must be; 0 for none.
     seen : Tensor [B, h, w] or None
         The mask before smoothing.
+    moments : tuple of Moment
+        When each capture was taken; () where they were not.
     """
 
     channel: str
@@ -63,6 +65,7 @@ class Batch:
     shown_before: Callable[[], Tensor]
     smoothing_px: float = 0.0
     seen: Tensor | None = None
+    moments: tuple[Moment, ...] = ()
 
     def smoothed(self, sigma_px: float) -> Batch:
         """The batch with smoothed pictures: what is left of speckle that is a pixel off are spots, edges, brightness.
@@ -86,7 +89,15 @@ class Batch:
         tensors = {k: getattr(self, k)[places] for k in ("gray", "signal", "mask", "noise", "exposure")}
         seen = None if self.seen is None else self.seen[places]
         ids = tuple(self.ids[k] for k in places)
-        return replace(self, ids=ids, shown_before=lambda: self.shown_before()[places], seen=seen, **tensors)
+        moments = tuple(self.moments[k] for k in places) if self.moments else ()
+        return replace(
+            self,
+            ids=ids,
+            shown_before=lambda: self.shown_before()[places],
+            seen=seen,
+            moments=moments,
+            **tensors,
+        )
 
     def as_compared(self, counts: Tensor) -> Tensor:
         """Predicted counts [B, h, w] as `signal` is: smoothed where it is smoothed."""
@@ -166,7 +177,14 @@ def load_batch(captures: CaptureSet, chosen: list[Capture], dtype: torch.dtype =
         torch.as_tensor(np.stack(variances), dtype=dtype),
         torch.tensor([c.exposure_ms for c in chosen], dtype=dtype),
         cache(lambda: _shown_before(captures, chosen)),
+        moments=moments_of(captures, chosen),
     )
+
+
+def moments_of(captures: CaptureSet, chosen: Iterable[Capture]) -> tuple[Moment, ...]:
+    """When captures were taken."""
+    order = {c.capture: k for k, c in enumerate(captures.captures)}
+    return tuple(Moment(float(order[c.capture]), c.time_s) for c in chosen)
 
 
 def _shown_before(captures: CaptureSet, chosen: list[Capture]) -> Tensor:

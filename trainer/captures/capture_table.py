@@ -18,6 +18,22 @@ KNOWN = (*REQUIRED, "plane_mm", "pattern", "exposure_ms", "time_s", "bracket")
 
 
 @dataclass(frozen=True)
+class Moment:
+    """When a capture was taken.
+
+    Attributes
+    ----------
+    number : float
+        Captures of the set that were taken before it; a bracket is one capture.
+    time_s : float, s
+        From the first capture; the row's number where the set does not give it.
+    """
+
+    number: float
+    time_s: float
+
+
+@dataclass(frozen=True)
 class Capture:
     """One row of captures.csv, or the rows of one exposure bracket.
 

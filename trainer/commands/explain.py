@@ -191,7 +191,7 @@ def _other_change(step: Result) -> str:
     """What a step without a new effect did, in words; "" for the first one."""
     if step.get("removed"):
         return f"without {step['removed']}"
-    return f"map of {step['refined']}" if step.get("refined") else ""
+    return f"{step.get('form', 'map')} of {step['refined']}" if step.get("refined") else ""
 
 
 def _explained(result: Result) -> str:

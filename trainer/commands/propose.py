@@ -108,7 +108,8 @@ proposes nothing. Where something is missing that the catalogue does not name, i
 
   1. it looks at the stages' fitted free-form probes for shapes: fringes with period, direction, chirp and bend; what
      each column or row has of its own, or what repeats every 2, 3 or 4; specks with places and sizes; functions of
-     the distance from a centre; smooth surfaces; functions of the gray level; and such a shape times a surface;
+     the distance from a centre; smooth surfaces; functions of the gray level; and products of two: a shape times
+     another, times the gray level, or times a function of the captures' order or time;
   2. it writes each shape as an effect's file, fits it like any effect, and judges it on held-out captures;
   3. it accepts the best one if it is worth adding, fits the probes again on what is left, and begins again.
 

@@ -1,4 +1,4 @@
-"""Adding one effect to a model: fitted from a start, its order raised, its map gone on in free form where that pays."""
+"""Adding one effect to a model: fitted from a start, its order raised, gone on in free form where that pays."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def add(
     report(0.3, f"fitting {effect.name}")
     added = add_from(roles, model, start)
     after = evaluate_captures(captures, roles.held_out, added)
-    report(0.7, f"looking whether the map of {effect.name} goes on")
+    report(0.7, f"looking whether {effect.name} goes on in free form")
     limits = Thresholds()
     added, after = gone_on(roles, added, effect.name, after, limits) or (added, after)
     added = recorded(added, effect.name, after)
@@ -107,7 +107,7 @@ def add_from(roles: CaptureRoles, model: Model, start: EffectInstance) -> Model:
 def gone_on(
     roles: CaptureRoles, model: Model, name: str, errors: PredictionErrors, thresholds: Thresholds
 ) -> tuple[Model, PredictionErrors] | None:
-    """The model with an effect's map gone on in free form, and its held-out errors, where held-out captures say so.
+    """The model with an effect's map or curve gone on in free form, and its held-out errors, where these say so.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def gone_on(
     Returns
     -------
     (Model, PredictionErrors) or None
-        None where the effect has no map, or where nothing is left that a map is worth.
+        None where the effect has no free form, or where nothing is left that one is worth.
     """
     present = model.instance(name)
     if present.effect.free_form is None or present.nodes is not None or not roles.is_held_out:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from trainer.fitting.gains import with_gains
 from trainer.fitting.pool import Pool
 from trainer.fitting.predictor import evaluate_captures
 from trainer.fitting.refit import next_order
-from trainer.model.history import recorded
+from trainer.model.history import form_of, recorded
 from trainer.model.model import EffectInstance, Model
 
 MOST_EFFECTS = 8  # an explanation longer than this explains nothing
@@ -46,7 +46,9 @@ class ExplanationStep:
     removed : str or None
         The effect that was taken out.
     refined : str or None
-        The effect of an earlier step whose map went on in free form.
+        The effect of an earlier step whose map or curve went on in free form.
+    form : mapping
+        The key `form`, where it is a curve.
     """
 
     added: str | None
@@ -54,12 +56,13 @@ class ExplanationStep:
     indistinguishable_from: tuple[str, ...] = ()
     removed: str | None = None
     refined: str | None = None
+    form: Mapping[str, str] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
         """A row of the key `steps` of `explain --json`.
 
-        Keys `added`, `nrmse`, `excess` and `indistinguishable_from`; `removed` only where an effect was taken out, and
-        `refined` only where the map of an earlier one went on in free form.
+        Keys `added`, `nrmse`, `excess` and `indistinguishable_from`; `removed` only where an effect was taken out,
+        `refined` only where the map or curve of an earlier one went on in free form, and `form` where that is a curve.
         """
         record: dict[str, Any] = {
             "added": self.added,
@@ -71,6 +74,7 @@ class ExplanationStep:
             record["removed"] = self.removed
         if self.refined:
             record["refined"] = self.refined
+            record.update(self.form)
         return record
 
 
@@ -197,13 +201,13 @@ def explain(
         if best is None or len(model.names) >= MOST_EFFECTS:
             went_on = None
             if found.verdict == "outside_catalogue" and not below_the_noise(errors):
-                report_share(0.9, "looking whether maps go on")
+                report_share(0.9, "looking whether maps and curves go on")
                 went_on = _any_gone_on(roles, model, errors, found.thresholds)
             if went_on is None:
                 break
             name, model, errors = went_on
             model = recorded(model, None, errors, refined=name)
-            steps.append(ExplanationStep(None, errors, refined=name))
+            steps.append(ExplanationStep(None, errors, refined=name, form=form_of(model, name)))
             if save:
                 save(model)
             continue
@@ -277,7 +281,7 @@ def _rival(found: Diagnosis) -> RankedEffect | None:
 def _any_gone_on(
     roles: CaptureRoles, model: Model, errors: PredictionErrors, thresholds: Thresholds
 ) -> tuple[str, Model, PredictionErrors] | None:
-    """The effect whose map, gone on in free form, leaves least, if there is one that is worth it."""
+    """The effect whose map or curve, gone on in free form, leaves least, if there is one that is worth it."""
     found = []
     for name in can_go_on(model):
         further = gone_on(roles, model, name, errors, thresholds)

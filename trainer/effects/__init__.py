@@ -1,5 +1,6 @@
 """Named physical effects, and all that an effect of your own needs: `from trainer.effects import Parameter, effect`."""
 
+from trainer.captures.capture_table import Moment
 from trainer.effects.definition import STAGES, Effect, Parameter, effect
 from trainer.effects.discs import discs
 from trainer.effects.effect_catalogue import Catalogue, catalogue, find_effect
@@ -14,6 +15,7 @@ __all__ = [
     "Drive",
     "Effect",
     "Evidence",
+    "Moment",
     "Panel",
     "Parameter",
     "Pupil",

@@ -126,10 +126,12 @@ class Effect:
         "built in", or the file that defines it.
     takes_order : bool
         `apply` takes the effect's order as the keyword `order`.
+    takes_moment : bool
+        `apply` takes when a capture was taken as the keyword `moment`: the effect changes from capture to capture.
     same_as : str
         The effect that it equals in captures of one colour and plane, where it is no candidate; "" for none.
     free_form : FreeForm or None
-        How the effect's map goes on where its polynomials end.
+        How the effect's map or curve goes on where its polynomials end.
     formula : str
         LaTeX, without dollar signs; "" where none is given.
     description : str
@@ -151,6 +153,7 @@ class Effect:
     measure: Callable[..., dict[str, Any]] | None = None
     source: str = "built in"
     takes_order: bool = False
+    takes_moment: bool = False
     same_as: str = ""
     free_form: FreeForm | None = None
     formula: str = ""
@@ -180,8 +183,8 @@ def effect(
     """Make an effect of a function: its name is the function's, its description the docstring's first line.
 
     The function takes the stage, then its parameters in their order. A keyword-only argument `order` receives the
-    effect's order. The docstring's further paragraphs are the effect's description, and its section `References`
-    its references.
+    effect's order, and `moment` when the capture was taken (`trainer.captures.capture_table.Moment`). The docstring's
+    further paragraphs are the effect's description, and its section `References` its references.
 
     Parameters
     ----------
@@ -211,8 +214,8 @@ def effect(
         if not parameters:
             raise InputError(f"effect '{name}': give it at least one Parameter")
         arguments = list(inspect.signature(function).parameters.values())[1:]
-        takes_order = any(a.name == "order" and a.kind is a.KEYWORD_ONLY for a in arguments)
-        taken = [a.name for a in arguments if not (takes_order and a.name == "order")]
+        given = {a.name for a in arguments if a.kind is a.KEYWORD_ONLY} & {"order", "moment"}
+        taken = [a.name for a in arguments if a.name not in given]
         named = [p.name for p in parameters]
         if taken != named:
             raise InputError(
@@ -235,7 +238,8 @@ def effect(
             rugged,
             measure,
             source,
-            takes_order,
+            "order" in given,
+            "moment" in given,
             same_as,
             free_form,
             formula.strip(),

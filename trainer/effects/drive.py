@@ -10,7 +10,7 @@ from torch import Tensor
 
 from runtime.lightpath.legendre import legendre_count, legendre_curve, legendre_surface
 from trainer.effects.definition import Parameter, effect
-from trainer.effects.free_form import FreeForm
+from trainer.effects.free_form import FreeForm, along
 from trainer.effects.term_names import curve_terms, driver_terms, surface_terms
 from trainer.prediction.stages import Drive
 
@@ -18,10 +18,16 @@ SUB_PIXELS = 4  # of a pixel along each axis; 3 leave an excess of 9e-4, 5 gain 
 REACH = 2  # neighbours on either side that act on a pixel
 
 
+def _bent(drive: Drive, deviation: Tensor) -> Drive:
+    bend = along(deviation, drive.level / drive.level[-1])
+    return replace(drive, response=drive.response + drive.sign * bend)
+
+
 @effect(
     stage="drive",
     acts_on="display",
     orders=(2, 4, 6, 10, 16),
+    free_form=FreeForm(_bent, "rad", 0.05, curve=True),
     parameters=[
         Parameter(
             "gain",

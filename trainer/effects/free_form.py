@@ -1,4 +1,4 @@
-"""Free-form maps: how an effect's map goes on where its polynomials end."""
+"""Free form: how an effect's map or curve goes on where its polynomials end."""
 
 from __future__ import annotations
 
@@ -9,29 +9,62 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from runtime.lightpath.spline_maps import node_weights, weights_at
 from trainer.prediction.free_stages import PUPIL_EXTENT
 from trainer.prediction.stages import Pupil
 
+SAMPLES = 2049  # of a curve between 0 and 1; straight lines join them
+
 
 @dataclass(frozen=True)
 class FreeForm:
-    """A bicubic spline that is added to an effect's polynomials.
+    """A cubic spline that is added to an effect's polynomials: over a map, or along a curve.
 
     Attributes
     ----------
     apply : callable
-        `(stage, surface) -> stage`, with the surface over the stage's own grid, in `unit`.
+        `(stage, values) -> stage`. Values, in `unit`: of a map over the stage's own grid, or SAMPLES of a curve evenly
+        from 0 to 1 (`along` reads between them).
     unit : str
     scale : float
         A node of this size is small but visible; fits step in units of it.
+    curve : bool
+        Along a share from 0 to 1, of the gray levels or of full scale, and 0 at its beginning.
     """
 
     apply: Callable[[Any, Tensor], Any]
     unit: str
     scale: float
+    curve: bool = False
+
+    def added(self, stage: Any, nodes: Tensor, colour: int) -> Any:
+        """The stage with what the nodes [m, n] make; a curve's rows are one for all colours, or one for each."""
+        if not self.curve:
+            return self.apply(stage, surface_over(stage, nodes))
+        row = nodes[colour if nodes.shape[0] > 1 else 0]
+        values = _over_pixels(SAMPLES, nodes.shape[1]).to(nodes.dtype) @ row
+        return self.apply(stage, values - values[0])
+
+    @property
+    def form(self) -> str:
+        """ "map" or "curve"."""
+        return "curve" if self.curve else "map"
+
+
+def along(curve: Tensor, share: Tensor) -> Tensor:
+    """A curve's values at shares; beyond 0 and 1 those of its ends."""
+    place = torch.clamp(share, 0, 1) * (SAMPLES - 1)
+    below = torch.clamp(place.detach().long(), max=SAMPLES - 2)
+    return curve[below] + (place - below) * (curve[below + 1] - curve[below])
+
+
+def on_other_curve_nodes(nodes: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """The `count` nodes a row that give nearly the same curves as nodes [curves, n]."""
+    there, here = _over_pixels(SAMPLES, count).numpy(), _over_pixels(SAMPLES, nodes.shape[1]).numpy()
+    return np.asarray(nodes @ np.linalg.lstsq(there, here, rcond=None)[0].T)
 
 
 def surface_over(stage: Any, nodes: Tensor) -> Tensor:

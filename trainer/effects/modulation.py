@@ -9,6 +9,7 @@ from torch import Tensor
 
 from runtime.lightpath.legendre import legendre_curve
 from trainer.effects.definition import Parameter, effect
+from trainer.effects.free_form import FreeForm, along
 from trainer.effects.term_names import bent_curve_terms
 from trainer.prediction.stages import Drive
 
@@ -20,10 +21,15 @@ SWING_SHARES = (0.294, 0.412, 0.294)
 SELDOM = 1e-3
 
 
+def _absorbing(drive: Drive, change: Tensor) -> Drive:
+    return drive.modulated(torch.clamp(1 + along(change, drive.level / drive.level[-1]), min=0))
+
+
 @effect(
     stage="drive",
     acts_on="display",
     orders=(1, 2, 4, 6),
+    free_form=FreeForm(_absorbing, "1", 0.02, curve=True),
     parameters=[
         Parameter(
             "amplitude",

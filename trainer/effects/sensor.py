@@ -10,7 +10,7 @@ from torch import Tensor
 
 from runtime.lightpath.legendre import legendre_count, legendre_curve, legendre_surface
 from trainer.effects.definition import Parameter, effect
-from trainer.effects.free_form import FreeForm
+from trainer.effects.free_form import FreeForm, along
 from trainer.effects.pupil import kernel_transfer
 from trainer.effects.starts import gain_spread, ghost_starts, registration_starts
 from trainer.effects.term_names import curve_terms, distortion_terms, surface_terms, surface_terms_with_mean
@@ -235,10 +235,15 @@ def stray_light(sensor: Sensor, counts: Tensor) -> Sensor:
     return sensor.brightened(legendre_surface(counts, sensor.y, sensor.x, lowest=0))
 
 
+def _bent(sensor: Sensor, deviation: Tensor) -> Sensor:
+    return sensor.responding(lambda share: share + along(deviation, share))
+
+
 @effect(
     stage="sensor",
     acts_on="camera",
     orders=(2, 4, 6, 10),
+    free_form=FreeForm(_bent, "1", 0.01, curve=True),
     parameters=[
         Parameter(
             "bend",

@@ -11,6 +11,7 @@ import torch
 from trainer.captures.bench_file import Bench, Camera, Channel, Iris, Panel
 from trainer.captures.camera_noise import noise_variance
 from trainer.captures.capture_set import CaptureSet, read_captures
+from trainer.captures.capture_table import Moment
 from trainer.captures.capture_writer import CaptureWriter
 from trainer.captures.patterns import choose_patterns
 from trainer.effects.definition import Effect
@@ -19,6 +20,7 @@ from trainer.model.model_stages import scene_for, stages_for
 from trainer.prediction.predict import counts, light_on_camera, trace
 
 BRIGHTNESS = 0.13  # mean signal, share of full scale
+SECOND = Moment(1.0, 1.0)  # when predictions stand that are of no capture
 
 ParameterValues = Mapping[str, float | np.ndarray]
 
@@ -86,7 +88,8 @@ def captures_with(
     rng = np.random.default_rng(seed)
     with CaptureWriter(folder, bench) as writer, torch.no_grad():
         for number, pattern in enumerate(choose_patterns(bench, "green", bench.distance_mm, patterns, seed)):
-            signal = _predict(model, model.present, gray=pattern.gray)[0].double().numpy()
+            moment = Moment(float(number), float(number))
+            signal = _predict(model, model.present, gray=pattern.gray, moment=moment)[0].double().numpy()
             noisy = signal + np.sqrt(noise_variance(signal, bench.camera)) * rng.standard_normal(signal.shape)
             raw = np.clip(np.rint(noisy + bench.camera.black_level), 0, bench.camera.saturation)
             writer.add(pattern.gray, raw.astype(np.uint16), "green", pattern=f"{number:03d}")
@@ -98,13 +101,14 @@ def _predict(
     present: tuple[EffectInstance, ...],
     tensors: Mapping[str, Mapping[str, torch.Tensor]] | None = None,
     gray: np.ndarray | None = None,
+    moment: Moment = SECOND,
 ) -> torch.Tensor:
     """Counts above black [1, h, w] on the model's own grid, with only some of its effects."""
     bench = model.bench
     if gray is None:
         gray = np.random.default_rng(1).integers(0, 256, bench.panel.shape)
     scene = scene_for(model, bench.channels[0].name, bench.distance_mm)
-    stages = stages_for(scene, present, tensors)
+    stages = stages_for(scene, present, tensors, moment)
     point = trace(scene, stages, torch.as_tensor(gray.astype(np.int64))[None])
     gain = torch.full((1, 1, 1), BRIGHTNESS * bench.camera.full_scale)
     return counts(scene, stages, light_on_camera(scene, stages, point.image), gain, None)

@@ -1,4 +1,4 @@
-"""Maps of effects that go on in free form, as bicubic splines, where their polynomials end.
+"""Maps and curves of effects that go on in free form, as cubic splines, where their polynomials end.
 
 The nodes are fitted by L-BFGS through the light path's adjoint, from coarse to fine, in turn with all the model's
 other numbers. Captures that the gradient does not use say when to stop and how many nodes the data can tell.
@@ -16,24 +16,26 @@ from runtime.excess import joined
 from runtime.lightpath.spline_maps import nodes_over, on_other_nodes
 from runtime.program.progress import Progress, no_progress
 from trainer.captures.batches import Batch
-from trainer.effects.free_form import FreeForm, grid_of, surface_over
+from trainer.effects.free_form import grid_of, on_other_curve_nodes
 from trainer.fitting.free_form_maps import FreeFormBatch, descend
 from trainer.fitting.gauss_newton import fit
 from trainer.fitting.predictor import Predictor
-from trainer.model.model import Model
+from trainer.model.model import EffectInstance, Model
 from trainer.prediction.free_stages import FreeFormStage, Tensors
 from trainer.prediction.scene import Stages
 
 PARTS = (18, 36, 72)  # of the grid's shorter side between nodes, coarse to fine
 LEAST_SPACING = 6  # samples between nodes: finer than that is no smooth map
+CURVE_NODES = (27, 51, 99)  # of a curve, coarse to fine: the coarsest is finer than the polynomials
 ITERATIONS, ROUNDS = 6, 5  # between two checks of the captures that say when to stop; most checks
+CURVE_ITERATIONS, CURVE_ROUNDS = 10, 12  # a curve's nodes differ much in how many pixels they touch
 FIRST_GAIN = 0.25  # share of the error that the coarsest map must remove for the polynomials to have ended
 FINER_GAIN = 0.05  # share that more nodes must remove to be kept
 REFIT_ITERATIONS = 3
 
 
 def can_go_on(model: Model) -> tuple[str, ...]:
-    """Names of a model's effects whose maps may go on in free form."""
+    """Names of a model's effects whose maps or curves may go on in free form."""
     return tuple(p.effect.name for p in model.present if p.effect.free_form is not None)
 
 
@@ -44,7 +46,7 @@ def with_free_form(
     stopping: Sequence[Batch],
     progress: Progress | None = None,
 ) -> Model | None:
-    """The model with an effect's map gone on in free form, and everything else refitted with it.
+    """The model with an effect's map or curve gone on in free form, and everything else refitted with it.
 
     Parameters
     ----------
@@ -60,15 +62,14 @@ def with_free_form(
     Returns
     -------
     Model or None
-        None where a coarse map does not remove a quarter of the error: the polynomials have not ended.
+        None where coarse nodes do not remove a quarter of the error: the polynomials have not ended.
     """
     report = progress or no_progress
     best, least = model, _excess(model, stopping)
-    grid = _grid(model, name, fitted[0])
-    spacings = sorted({max(min(grid) / parts, LEAST_SPACING) for parts in PARTS}, reverse=True)
-    for level, spacing in enumerate(spacings):
-        report(level / len(spacings))
-        trial = _descended(best, name, spacing, fitted, stopping)
+    shapes = _node_shapes(model, name, fitted[0])
+    for level, shape in enumerate(shapes):
+        report(level / len(shapes))
+        trial = _descended(best, name, shape, fitted, stopping)
         trial = fit(trial, trial.names, fitted, iterations=REFIT_ITERATIONS).model
         excess = _excess(trial, stopping)
         if least - excess < (FIRST_GAIN if level == 0 else FINER_GAIN) * abs(least):
@@ -78,7 +79,7 @@ def with_free_form(
 
 
 def refined(model: Model, fitted: Sequence[Batch], stopping: Sequence[Batch]) -> Model:
-    """The model with its free-form maps fitted again, each on the nodes that it has."""
+    """The model with its free-form maps and curves fitted again, each on the nodes that it has."""
     for present in model.present:
         if present.nodes is not None:
             model = _descended(model, present.effect.name, None, fitted, stopping)
@@ -86,25 +87,44 @@ def refined(model: Model, fitted: Sequence[Batch], stopping: Sequence[Batch]) ->
 
 
 def _descended(
-    model: Model, name: str, spacing: float | None, fitted: Sequence[Batch], stopping: Sequence[Batch]
+    model: Model,
+    name: str,
+    shape: tuple[int, int] | None,
+    fitted: Sequence[Batch],
+    stopping: Sequence[Batch],
 ) -> Model:
-    """The model with one effect's nodes fitted, on a grid of some spacing or on the nodes that they have."""
+    """The model with one effect's nodes fitted, on as many nodes as are given or on those that it has."""
     present = model.instance(name)
-    form = present.effect.free_form
-    assert form is not None
-    stage = present.effect.stage
-    if spacing is not None:
-        grid = _grid(model, name, fitted[0])
-        shape = nodes_over(grid, spacing)
-        before = np.zeros(shape) if present.nodes is None else on_other_nodes(present.nodes, shape, grid)
-        present = replace(present, nodes=before)
+    if shape is not None:
+        present = replace(present, nodes=_on_nodes(present, shape, _grid(model, name, fitted[0])))
         model = model.having(present)
     assert present.nodes is not None
-    free = _stage_of(form, stage, present.nodes.shape)
     parts = [[FreeFormBatch(model, b) for b in batches] for batches in (fitted, stopping)]
     scale = sum(float(b.errors(torch.zeros_like(b.signal)).variance.sum()) for b in fitted)
-    found = descend(free, parts[0], parts[1], scale, ITERATIONS, ROUNDS)
+    curve = present.effect.free_form is not None and present.effect.free_form.curve
+    iterations, rounds = (CURVE_ITERATIONS, CURVE_ROUNDS) if curve else (ITERATIONS, ROUNDS)
+    found = descend(_stage_of(model, present), parts[0], parts[1], scale, iterations, rounds)
     return model.having(replace(present, nodes=present.nodes + found["nodes"].double().numpy()))
+
+
+def _node_shapes(model: Model, name: str, batch: Batch) -> list[tuple[int, int]]:
+    """Rows and columns of nodes to try, coarse to fine; of a curve, a row for all colours or one for each."""
+    effect = model.instance(name).effect
+    if effect.free_form is not None and effect.free_form.curve:
+        rows = len(model.bench.channels) if any(p.per_channel for p in effect.parameters) else 1
+        return [(rows, count) for count in CURVE_NODES]
+    grid = _grid(model, name, batch)
+    spacings = sorted({max(min(grid) / parts, LEAST_SPACING) for parts in PARTS}, reverse=True)
+    return [nodes_over(grid, spacing) for spacing in spacings]
+
+
+def _on_nodes(present: EffectInstance, shape: tuple[int, int], grid: tuple[int, int]) -> np.ndarray:
+    """An effect's nodes on as many others; zero where it has none."""
+    if present.nodes is None:
+        return np.zeros(shape)
+    if present.effect.free_form is not None and present.effect.free_form.curve:
+        return on_other_curve_nodes(present.nodes, shape[1])
+    return on_other_nodes(present.nodes, shape, grid)
 
 
 def _grid(model: Model, name: str, batch: Batch) -> tuple[int, int]:
@@ -113,14 +133,19 @@ def _grid(model: Model, name: str, batch: Batch) -> tuple[int, int]:
     return grid_of(getattr(stages, model.instance(name).effect.stage))
 
 
-def _stage_of(form: FreeForm, stage: str, nodes: tuple[int, ...]) -> FreeFormStage:
+def _stage_of(model: Model, present: EffectInstance) -> FreeFormStage:
+    """The stage at which an effect's nodes are free."""
+    form, stage, nodes = present.effect.free_form, present.effect.stage, present.nodes
+    assert form is not None and nodes is not None
+    colours = [c.name for c in model.bench.channels]
+
     def apply(stages: Stages, maps: Tensors) -> Stages:
         one = getattr(stages, stage)
-        return replace(stages, **{stage: form.apply(one, surface_over(one, maps["nodes"]))})
+        return replace(stages, **{stage: form.added(one, maps["nodes"], colours.index(one.channel))})
 
     # A step of the optimiser's variables is one of many nodes at once.
-    unit = 5 * form.scale * float(np.sqrt(np.prod(nodes)))
-    return FreeFormStage(stage, {"nodes": (tuple(nodes), unit)}, apply, lambda maps: [])
+    unit = 5 * form.scale * float(np.sqrt(nodes.size))
+    return FreeFormStage(stage, {"nodes": (nodes.shape, unit)}, apply, lambda maps: [])
 
 
 def _excess(model: Model, batches: Sequence[Batch]) -> float:

@@ -37,7 +37,8 @@ class FreeFormBatch:
         self.predictor = Predictor(model, batch)
         self.batch = batch
         self.weight = batch.mask if inverse_variance is None else batch.mask * inverse_variance
-        self.stages = self.predictor.stages(model)
+        shared = [stages for _, stages in self.predictor.parts(model)]
+        self.stages = shared if model.in_time else shared * len(batch.ids)
         self.gain = model.gain[batch.channel] * batch.exposure[:, None, None]
         with torch.no_grad():
             self.base = self.predictor.trace(model)
@@ -45,7 +46,7 @@ class FreeFormBatch:
     def predict(self, free: FreeFormStage, tensors: Tensors, k: int) -> Tensor:
         """Counts [1, h, w] of capture k."""
         scene, gray = self.predictor.scene, self.batch.gray[k : k + 1]
-        stages = free.apply(self.stages, tensors)
+        stages = free.apply(self.stages[k], tensors)
         before = Trace(self.base.spectrum[k : k + 1], self.base.image[k : k + 1])
         if free.irradiance is None:
             earlier = self.predictor.earlier(stages, k)

@@ -25,12 +25,16 @@ def with_gain(model: Model, predictors: Sequence[Predictor], lights: Sequence[Te
     for k, predictor in enumerate(predictors):
         batch = predictor.batch
         unit = replace(model, gain={batch.channel: 1.0})
-        stages = predictor.stages(unit)
-        linear = replace(stages.sensor, offset=None, response=None, free_capture_gain=False)
         light = predictor.light(unit, predictor.trace(unit)) if lights is None else lights[k]
         exposed = batch.exposure[:, None, None]
-        one = batch.as_compared(counts(predictor.scene, replace(stages, sensor=linear), light, exposed, None))
-        light_counts = batch.signal if stages.sensor.offset is None else batch.signal - stages.sensor.offset
+        ones, signals = [], []
+        for part, stages in predictor.parts(unit):
+            linear = replace(stages.sensor, offset=None, response=None, free_capture_gain=False)
+            plain = replace(stages, sensor=linear)
+            ones.append(counts(predictor.scene, plain, light[part], exposed[part], None))
+            signal, added = batch.signal[part], stages.sensor.offset
+            signals.append(signal if added is None else signal - added)
+        one, light_counts = batch.as_compared(torch.cat(ones)), torch.cat(signals)
         total = sums.setdefault(batch.channel, [0.0, 0.0])
         total[0] += float((batch.mask * light_counts * one).sum(dtype=torch.float64))
         total[1] += float((batch.mask * one**2).sum(dtype=torch.float64))

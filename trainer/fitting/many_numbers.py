@@ -176,7 +176,8 @@ class ManySlopes:
             tensors.setdefault(name, {})[parameter] = value
         batch, before = q.batch, Trace(point.spectrum[k : k + 1], point.image[k : k + 1])
         with torch.enable_grad():
-            stages = stages_of(q.scene, self.model, tensors)
+            moment = batch.moments[k] if batch.moments else None
+            stages = stages_of(q.scene, self.model, tensors, moment)
             earlier = q.earlier(stages, k)
             image = trace(q.scene, stages, batch.gray[k : k + 1], self.first, before, earlier).image
             gain = self.model.gain[batch.channel] * batch.exposure[k : k + 1, None, None]

@@ -24,9 +24,16 @@ class Predictor:
         self.scene: Scene = scene_for(model, batch.channel, batch.plane_mm, batch.signal.dtype)
         self.batch = batch
 
-    def stages(self, model: Model) -> Stages:
-        """The scene's stages under a model."""
-        return stages_of(self.scene, model)
+    def stages(self, model: Model, k: int = 0) -> Stages:
+        """The scene's stages under a model, at the moment of capture k."""
+        moments = self.batch.moments
+        return stages_of(self.scene, model, moment=moments[k] if moments else None)
+
+    def parts(self, model: Model) -> list[tuple[slice, Stages]]:
+        """Captures of the batch that share their stages, with these: all, or each where the model changes in time."""
+        if not model.in_time:
+            return [(slice(None), self.stages(model))]
+        return [(slice(k, k + 1), self.stages(model, k)) for k in range(len(self.batch.ids))]
 
     def trace(self, model: Model, start: str = "drive", before: Trace | None = None) -> Trace:
         """Spectrum and irradiance of the batch, a capture at a time to stay in the processor's cache.
@@ -40,9 +47,10 @@ class Predictor:
         """
         if before is not None and start == "sensor":
             return before
-        stages = self.stages(model)
+        shared = None if model.in_time else self.stages(model)
         parts = []
         for k in range(self.batch.gray.shape[0]):
+            stages = shared or self.stages(model, k)
             one = None if before is None else Trace(before.spectrum[k : k + 1], before.image[k : k + 1])
             gray, earlier = self.batch.gray[k : k + 1], self.earlier(stages, k)
             parts.append(trace(self.scene, stages, gray, start, one, earlier))
@@ -54,14 +62,22 @@ class Predictor:
 
     def light(self, model: Model, point: Trace) -> Tensor:
         """Irradiance on the camera [B, h, w]."""
-        measured = (self.batch.signal, self.batch.mask)
-        return light_on_camera(self.scene, self.stages(model), point.image, measured)
+        batch = self.batch
+        found = [
+            light_on_camera(self.scene, stages, point.image[part], (batch.signal[part], batch.mask[part]))
+            for part, stages in self.parts(model)
+        ]
+        return found[0] if len(found) == 1 else torch.cat(found)
 
     def counts(self, model: Model, light: Tensor) -> Tensor:
         """Counts above black [B, h, w], from the irradiance on the camera [B, h, w]."""
-        gain = model.gain[self.batch.channel] * self.batch.exposure[:, None, None]
-        measured = (self.batch.signal, self.batch.mask)
-        return self.batch.as_compared(counts(self.scene, self.stages(model), light, gain, measured))
+        batch = self.batch
+        gain = model.gain[batch.channel] * batch.exposure[:, None, None]
+        found = [
+            counts(self.scene, stages, light[part], gain[part], (batch.signal[part], batch.mask[part]))
+            for part, stages in self.parts(model)
+        ]
+        return batch.as_compared(found[0] if len(found) == 1 else torch.cat(found))
 
     def predict(self, model: Model, start: str = "drive", before: Trace | None = None) -> Tensor:
         """Counts above black [B, h, w], from stage `start` on."""

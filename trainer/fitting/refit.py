@@ -15,7 +15,8 @@ from trainer.fitting.predictor import Predictor
 from trainer.fitting.start_points import pattern_search
 from trainer.model.model import EffectInstance, Model, raised
 
-POLYNOMIALS = 6  # order from which a map goes on in free form, where its effect has one
+# Order from which a map goes on in free form, where its effect has one: terms grow as its square.
+POLYNOMIALS = 6
 SEARCH_PIXELS = 2 * 240 * 320  # of a scene, at least one capture: a pattern search need only come near
 SEARCH_SCENES = 3
 LEAST_EXPECTED = (
@@ -55,7 +56,8 @@ def least_for_order(excess: float) -> float:
 def next_order(present: EffectInstance) -> int | None:
     """The order that an effect's map or curve is raised to next; None where there is none, or free form goes on."""
     higher = [o for o in present.effect.orders if o > present.order]
-    ended = present.effect.free_form is not None and present.order >= POLYNOMIALS
+    form = present.effect.free_form
+    ended = form is not None and not form.curve and present.order >= POLYNOMIALS
     return None if not higher or ended or present.nodes is not None else higher[0]
 
 

@@ -20,7 +20,9 @@ from runtime.bundle.light_path_arrays import pack_light_paths
 from runtime.lightpath.grid import Grid
 from runtime.lightpath.light_path import LightPath
 from runtime.program.version import installed_version
+from trainer.captures.batches import moments_of
 from trainer.captures.capture_set import CaptureSet
+from trainer.captures.capture_table import Moment
 from trainer.captures.held_out import scenes
 from trainer.effects.definition import Effect
 from trainer.model.model import Model
@@ -67,10 +69,19 @@ def export_bundle(
             "method under [propagation] in the model file"
         )
     exported = acting_on_display(model)
-    left_out = [p.effect for p in model.present if p.effect.acts_on != "display"]
+    # What changes from capture to capture stays as it was last; without captures nothing is known of it.
+    last = moments_of(captures, captures.captures[-1:])[0] if captures else None
+    if last is None:
+        exported = replace(exported, present=tuple(p for p in exported.present if not p.effect.takes_moment))
+    left_out = [p.effect for p in model.present if p.effect.name not in exported.names]
     scene_list = _colours_and_planes(model, captures)
     baked = [
-        (channel, plane, model.bench.channel(channel).wavelength_nm, baked_path(exported, channel, plane))
+        (
+            channel,
+            plane,
+            model.bench.channel(channel).wavelength_nm,
+            baked_path(exported, channel, plane, last),
+        )
         for channel, plane in scene_list
     ]
     records, arrays = pack_light_paths(baked)
@@ -165,11 +176,17 @@ def acting_on_display(model: Model) -> Model:
     )
 
 
-def baked_path(model: Model, channel: str, plane_mm: float) -> LightPath:
-    """A model's light path for one colour and plane, as float32 and complex64 NumPy arrays."""
+def baked_path(model: Model, channel: str, plane_mm: float, moment: Moment | None = None) -> LightPath:
+    """A model's light path for one colour and plane, as float32 and complex64 NumPy arrays.
+
+    Parameters
+    ----------
+    moment : Moment, optional
+        At which effects that change from capture to capture are taken; without it they are left out.
+    """
     with torch.no_grad():
         scene = scene_for(model, channel, plane_mm, torch.float64)
-        path = light_path(scene, stages_of(scene, model))
+        path = light_path(scene, stages_of(scene, model, moment=moment))
     return LightPath(**{f.name: _single(getattr(path, f.name)) for f in fields(path)})
 
 

@@ -28,7 +28,7 @@ def recorded(
     dropped : str, optional
         The effect that was taken out.
     refined : str, optional
-        The effect whose map went on in free form.
+        The effect whose map or curve went on in free form.
     """
     record: dict[str, Any] = {
         "added": name or "",
@@ -39,4 +39,11 @@ def recorded(
         record["removed"] = dropped
     if refined:
         record["refined"] = refined
+        record.update(form_of(model, refined))
     return replace(model, history=(*model.history, record))
+
+
+def form_of(model: Model, refined: str) -> dict[str, str]:
+    """The key `form` of a record, where what went on is no map but a curve."""
+    free = model.instance(refined).effect.free_form
+    return {"form": free.form} if free is not None and free.curve else {}

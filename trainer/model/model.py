@@ -32,7 +32,7 @@ class EffectInstance:
     errors : dict of float64 arrays or None
         Standard errors, shaped as `values`; None where nothing was fitted.
     nodes : float64 array [m, n] or None
-        Of the free-form map that is added to the polynomials, in the unit of the effect's `free_form`.
+        Of the free-form map or curves that are added to the polynomials, in the unit of the effect's `free_form`.
     """
 
     effect: Effect
@@ -85,6 +85,11 @@ class Model:
         """Names of all that a network learns beyond: the effects, the learned field, what was learned at stages."""
         field_name = () if self.panel_field is None else (NAME,)
         return (*self.names, *field_name, *(f"learned_{stage}" for stage in self.learned))
+
+    @property
+    def in_time(self) -> bool:
+        """Whether an effect changes from capture to capture with the moment when each was taken."""
+        return any(p.effect.takes_moment for p in self.present)
 
     def instance(self, name: str) -> EffectInstance:
         """The effect of that name, as it is in the model."""

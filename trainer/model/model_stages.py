@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from trainer.captures.bench_file import Bench
-from trainer.effects.free_form import surface_over
+from trainer.captures.capture_table import Moment
 from trainer.effects.own_effect import applied
 from trainer.model.model import EffectInstance, Model
 from trainer.prediction.free_stages import with_learned
@@ -42,7 +42,9 @@ def scene_for(model: Model, channel: str, plane_mm: float, dtype: torch.dtype = 
     )
 
 
-def stages_for(scene: Scene, present: tuple[EffectInstance, ...], tensors: Any = None) -> Stages:
+def stages_for(
+    scene: Scene, present: tuple[EffectInstance, ...], tensors: Any = None, moment: Moment | None = None
+) -> Stages:
     """The scene's stages with effects applied in the order of `present`.
 
     Per-channel parameters are cut to the scene's own colour.
@@ -51,6 +53,8 @@ def stages_for(scene: Scene, present: tuple[EffectInstance, ...], tensors: Any =
     ----------
     tensors : mapping, optional
         {effect name: {parameter: tensor}} of values to differentiate; the others are taken from `present`.
+    moment : Moment, optional
+        When the capture was taken; without it, effects that change from capture to capture are left out.
 
     Raises
     ------
@@ -60,6 +64,8 @@ def stages_for(scene: Scene, present: tuple[EffectInstance, ...], tensors: Any =
     stages = bare_stages(scene)
     row = scene.channel_row()
     for one in present:
+        if one.effect.takes_moment and moment is None:
+            continue
         given = (tensors or {}).get(one.effect.name, {})
         arguments: dict[str, Any] = {}
         for p in one.effect.parameters:
@@ -69,24 +75,27 @@ def stages_for(scene: Scene, present: tuple[EffectInstance, ...], tensors: Any =
             arguments[p.name] = value[row] if p.per_channel else value
         if one.effect.takes_order:
             arguments["order"] = one.order
+        if one.effect.takes_moment:
+            arguments["moment"] = moment
         name = one.effect.stage
         stage = applied(one.effect, getattr(stages, name), arguments)
         if one.nodes is not None and one.effect.free_form is not None:
-            surface = surface_over(stage, torch.as_tensor(one.nodes, dtype=scene.dtype))
-            stage = one.effect.free_form.apply(stage, surface)
+            nodes = torch.as_tensor(one.nodes, dtype=scene.dtype)
+            stage = one.effect.free_form.added(stage, nodes, row)
         stages = replace(stages, **{name: stage})
     return stages
 
 
-def stages_of(scene: Scene, model: Model, tensors: Any = None) -> Stages:
+def stages_of(scene: Scene, model: Model, tensors: Any = None, moment: Moment | None = None) -> Stages:
     """The scene's stages under a model: its effects, and what was learned at the panel and other stages after them.
 
     Parameters
     ----------
     tensors : mapping, optional
+    moment : Moment, optional
         As in `stages_for`.
     """
-    stages = stages_for(scene, model.present, tensors)
+    stages = stages_for(scene, model.present, tensors, moment)
     field = {} if model.panel_field is None else {"panel": model.panel_field}
     for stage, maps in {**field, **model.learned}.items():
         stages = with_learned(stages, model.bench, stage, maps)

@@ -15,7 +15,7 @@ from trainer.captures.bench_file import Bench, read_bench
 from trainer.effects.definition import Effect, Parameter
 from trainer.effects.effect_catalogue import Catalogue, find_effect
 from trainer.model.model import EffectInstance, Model
-from trainer.model.model_text import MAP, allowed
+from trainer.model.model_text import CURVE, MAP, allowed
 from trainer.prediction.free_stages import LEARNED, LEARNED_STAGES, learned_stage
 from trainer.prediction.panel_field import NAME, UNITS
 
@@ -158,7 +158,7 @@ def _effect(
         effect = find_effect(known, name)
     except InputError as error:
         raise InputError(f"{error}; an effect that is not built in needs its file, with --effects") from None
-    only_keys(row, ("name", "order", MAP, "parameters"), f"effect '{name}': ")
+    only_keys(row, ("name", "order", MAP, CURVE, "parameters"), f"effect '{name}': ")
     order = row.get("order")
     if type(order) is not int or order not in effect.orders:
         orders = ", ".join(map(str, effect.orders))
@@ -178,19 +178,28 @@ def _effect(
         values[p.name] = _numbers(table.get("value"), f"{where}.value", p, order, bench, arrays)
         if "error" in table:
             errors[p.name] = _numbers(table["error"], f"{where}.error", p, order, bench, arrays)
-    nodes = _nodes(row[MAP], effect, arrays) if MAP in row else None
+    nodes = None
+    for key in (MAP, CURVE):
+        if key in row:
+            nodes = _nodes(row[key], key, effect, bench, arrays)
     return EffectInstance(effect, order, values, errors or None, nodes)
 
 
-def _nodes(given: Any, effect: Effect, arrays: Arrays) -> np.ndarray:
-    """The nodes of an effect's free-form map."""
-    where = f"effect '{effect.name}': {MAP}"
-    if effect.free_form is None:
-        raise InputError(f"{where} is given, and this effect has no map: take it out")
+def _nodes(given: Any, key: str, effect: Effect, bench: Bench, arrays: Arrays) -> np.ndarray:
+    """The nodes of an effect's free-form map or curve."""
+    where = f"effect '{effect.name}': {key}"
+    form = effect.free_form
+    if form is None or form.form != key:
+        raise InputError(f"{where} is given, and this effect has no {key}: take it out")
     array = _array(given, where, arrays)
     if array is None:
         raise InputError(f"{where} is {shown(given)}: write {{ array = ... }}, or take it out")
-    if array.ndim != 2 or min(array.shape) < 4 or not np.isfinite(array).all():
+    fits = array.ndim == 2 and array.shape[1] >= 4 and np.isfinite(array).all()
+    if form.curve and not (fits and array.shape[0] in (1, len(bench.channels))):
+        raise InputError(
+            f"{where} is not a row, or a row a colour, of at least 4 finite numbers: fit it again"
+        )
+    if not form.curve and not (fits and array.shape[0] >= 4):
         raise InputError(f"{where} is not a table of at least 4 x 4 finite numbers: fit it again")
     return array.astype(np.float64)
 

@@ -25,7 +25,7 @@ from trainer.prediction.panel_field import NAME
 
 LONGEST = 128  # numbers of an array that stay in the text: every built-in map and curve does
 WIDTH = 110
-MAP = "map"  # key of an effect's free-form map
+MAP, CURVE = "map", "curve"  # keys of an effect's free form
 
 Store = Callable[[str, np.ndarray], str]
 
@@ -169,12 +169,12 @@ def _effect(present: EffectInstance, bench: Bench, store: Store) -> str:
         order += f"  # one of {', '.join(map(str, effect.orders))}; each order has its own number of terms"
     lines.append(order)
     if present.nodes is not None and effect.free_form is not None:
-        name = store(f"{effect.name}.{MAP}", np.asarray(present.nodes, np.float64))
-        rows, columns = present.nodes.shape
-        unit = "" if effect.free_form.unit == "1" else f", in {effect.free_form.unit}"
+        form, (rows, columns) = effect.free_form, present.nodes.shape
+        name = store(f"{effect.name}.{form.form}", np.asarray(present.nodes, np.float64))
+        unit = "" if form.unit == "1" else f", in {form.unit}"
+        nodes = f"{columns} nodes of a cubic" if form.curve else f"{rows} x {columns} nodes of a bicubic"
         lines.append(
-            f"{MAP} = {{ array = {literal(name)} }}  # goes on where the polynomials end: {rows} x {columns} "
-            f"nodes of a bicubic spline{unit}"
+            f"{form.form} = {{ array = {literal(name)} }}  # goes on where the polynomials end: {nodes} spline{unit}"
         )
     for parameter in effect.parameters:
         lines += ["", *_parameter(present, parameter, bench, store)]

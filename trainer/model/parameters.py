@@ -54,8 +54,8 @@ def describe(present: EffectInstance, bench: Bench) -> str:
         else:
             size, error = float(np.sqrt((away**2).sum())), float(np.sqrt((errors**2).mean()))
             words.append(f"{label} {measured(size, error, p.unit)} in {values.size} terms")
-    if present.nodes is not None:
-        words.append(
-            f"order {present.order} and a map of {present.nodes.shape[0]} x {present.nodes.shape[1]} nodes"
-        )
+    if present.nodes is not None and present.effect.free_form is not None:
+        form, (rows, columns) = present.effect.free_form, present.nodes.shape
+        grid = f"{columns}" if form.curve else f"{rows} x {columns}"
+        words.append(f"order {present.order} and a {form.form} of {grid} nodes")
     return ", ".join(words) or "at its absent values"

@@ -211,5 +211,6 @@ def display_irradiance(model: Model, batch: Batch) -> Tensor:
     shown = acting_on_display(model)
     scene = scene_for(shown, batch.channel, batch.plane_mm)
     with torch.no_grad():
-        path = light_path(scene, stages_of(scene, shown))
+        moment = batch.moments[0] if batch.moments else None
+        path = light_path(scene, stages_of(scene, shown, moment=moment))
         return pixel_irradiance(path, irradiance(path, panel_phase(path, batch.gray[:1])))[0]

@@ -103,17 +103,30 @@ def _reading(one: ProbeMap, found: Found, own: bool) -> Reading:
         return (float(value),) * count if own else float(value)
 
     whose = "of each disc" if own else "of the discs"
+    what = "phase" if one.place.stage == "drive" else "light"
     passed: tuple[Number, ...]
     if is_complex:
         passed = (
-            Number("real", "1", 0.05, of_each(inside.real), 1.0, -2.0, 2.0, f"part of what passes {whose}"),
             Number(
-                "imaginary", "1", 0.05, of_each(inside.imag), 0.0, -2.0, 2.0, f"part of what passes {whose}"
+                "real", "1", 0.05, of_each(inside.real), 1.0, -2.0, 2.0, f"part of what passes {whose}", True
+            ),
+            Number(
+                "imaginary",
+                "1",
+                0.05,
+                of_each(inside.imag),
+                0.0,
+                -2.0,
+                2.0,
+                f"part of what passes {whose}",
+                True,
             ),
         )
         line = "    inside = torch.complex(real, imaginary)"
     else:
-        passed = (Number("passed", "1", 0.05, of_each(inside.real), 1.0, 0.0, 10.0, f"light {whose}"),)
+        passed = (
+            Number("passed", "1", 0.05, of_each(inside.real), 1.0, 0.0, 10.0, f"of the {what} {whose}", True),
+        )
         line = "    inside = passed"
 
     def described(values: Values) -> str:
@@ -122,7 +135,7 @@ def _reading(one: ProbeMap, found: Found, own: bool) -> Reading:
         )
         if not is_complex:
             passed_light = number(float(np.mean(values["passed"])))
-            return f"{count} specks of {radius} {spread} that pass {passed_light} of the light"
+            return f"{count} specks of {radius} {spread} that pass {passed_light} of the {what}"
         factor = complex(np.mean(values["real"]), np.mean(values["imaginary"]))
         turn = number(math.degrees(np.angle(factor)))
         size = number(abs(factor))

@@ -38,14 +38,16 @@ def effect_text(name: str, place: Place, reading: Reading, values: Values | None
     """The text of an effect's file, as from `write_effect`."""
     stage = place.stage
     stage_type = stage.capitalize()
-    arguments = ", ".join(f"{n.name}: Tensor" for n in reading.numbers)
     body = [*place.before, *reading.code, *place.after]
     code = "\n".join(body)
+    in_time = "moment." in code
+    taken = [*(f"{n.name}: Tensor" for n in reading.numbers), *(["*", "moment: Moment"] if in_time else [])]
+    arguments = ", ".join(taken)
     imports = ["import math"] if "math." in code else []
     imports += ["from collections.abc import Sequence"]
     imports += ["from dataclasses import replace"] if "replace(" in code else []
     imports += ["from typing import Any"]
-    names = ["Parameter", stage_type, "effect"]
+    names = ["Parameter", stage_type, "effect", *(["Moment"] if in_time else [])]
     further = []
     for line in reading.imports:
         if line.startswith("from trainer.effects import "):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,8 @@ class Place:
         Unit of its coordinates: "pixels", "share of band" or "" for gray levels.
     before, after : tuple of str
         Lines of a file that make the coordinates, and that put `value` in.
+    seen_by : str
+        The stage whose probe shows it; "" for its own.
     """
 
     stage: str
@@ -47,6 +49,12 @@ class Place:
     spread: str
     before: tuple[str, ...]
     after: tuple[str, ...]
+    seen_by: str = ""
+
+    @property
+    def probe(self) -> str:
+        """The stage whose probe shows it."""
+        return self.seen_by or self.stage
 
     @property
     def acts_on(self) -> str:
@@ -149,6 +157,8 @@ DRIVEN = Place(
     _on_pixels("drive"),
     ("    return drive.scaled(1 + value)",),
 )
+# A shape at the panel times the gray level: the phase that it adds grows with the gray level.
+DRIVEN_BY_GRAY = replace(DRIVEN, title="", name="gray", seen_by="panel")
 GRAY = Place(
     "drive",
     "response, deviation",
@@ -203,7 +213,9 @@ class ProbeMap:
         return tuple(self.values.shape) == self.shape
 
 
-def maps_of(found: ProbeResult, shape: tuple[int, int], signal: float = 1.0) -> list[ProbeMap]:
+def maps_of(
+    found: ProbeResult, shape: tuple[int, int], signal: float = 1.0, phase_sign: int = 1
+) -> list[ProbeMap]:
     """The maps of a probe that an effect could replace, each with its weight.
 
     Parameters
@@ -213,6 +225,8 @@ def maps_of(found: ProbeResult, shape: tuple[int, int], signal: float = 1.0) -> 
         Of the camera for the sensor's probe, of the panel otherwise.
     signal : float, counts
         Standard deviation of the measured signal, against which added counts are weighed.
+    phase_sign : int
+        -1 where more gray means less phase.
     """
     maps = [m for place in PLACES if place.stage == found.stage for m in _maps_at(place, found, shape)]
     powers = [
@@ -226,7 +240,14 @@ def maps_of(found: ProbeResult, shape: tuple[int, int], signal: float = 1.0) -> 
         ProbeMap(m.place, m.values, m.shape, m.reach, removed * p / whole)
         for m, p in zip(maps, powers, strict=True)
     ]
-    return [*_transmission(weighed, removed), *weighed]
+    return [*_transmission(weighed, removed), *_times_gray(weighed, phase_sign), *weighed]
+
+
+def _times_gray(maps: Sequence[ProbeMap], sign: int) -> list[ProbeMap]:
+    """The phase at the panel as the mean over all gray levels, of half a wave, of a phase that grows with them."""
+    return [
+        replace(m, place=DRIVEN_BY_GRAY, values=sign * m.values / np.pi) for m in maps if m.place is PHASE
+    ]
 
 
 def _transmission(maps: Sequence[ProbeMap], removed: float) -> list[ProbeMap]:
@@ -248,7 +269,7 @@ def _maps_at(place: Place, found: ProbeResult, shape: tuple[int, int]) -> list[P
     if not arrays:
         return []
     if place is GRAY:  # one response for all colours: their mean
-        return [ProbeMap(place, np.mean([a.reshape(-1) for a in arrays], axis=0), (0, 0), (0.0, 0.0))]
+        return [map_at(place, np.mean([a.reshape(-1) for a in arrays], axis=0), shape)]
     values = arrays[0]
     middle = float(np.median(values))
     if place is PASSED:
@@ -257,10 +278,31 @@ def _maps_at(place: Place, found: ProbeResult, shape: tuple[int, int]) -> list[P
         values = values / middle - 1 if middle > 0 else values * 0
     else:
         values = values - middle
+    return [map_at(place, values, shape)]
+
+
+def map_at(
+    place: Place, values: NDArray[np.float64], shape: tuple[int, int], weight: float = 0.0
+) -> ProbeMap:
+    """A map of a place from the values on a probe's nodes.
+
+    Parameters
+    ----------
+    shape : (int, int), pixels
+        Of the camera or the panel.
+    """
+    if place is GRAY:
+        return ProbeMap(place, values, (0, 0), (0.0, 0.0), weight)
     if place.spread == "pixels":
         # The maps' corners are the corner pixels' centres.
-        return [ProbeMap(place, values, shape, ((shape[0] - 1) / 2, (shape[1] - 1) / 2))]
-    outside = [round((n - 1) / 2 * (1 - 1 / PUPIL_EXTENT)) for n in values.shape]
+        return ProbeMap(place, values, shape, ((shape[0] - 1) / 2, (shape[1] - 1) / 2), weight)
+    outside = outside_band(values.shape)
     rows, columns = (slice(k, n - k) for k, n in zip(outside, values.shape, strict=True))
     reach = [PUPIL_EXTENT * (1 - 2 * k / (n - 1)) for k, n in zip(outside, values.shape, strict=True)]
-    return [ProbeMap(place, values[rows, columns], (0, 0), (reach[0], reach[1]))]
+    return ProbeMap(place, values[rows, columns], (0, 0), (reach[0], reach[1]), weight)
+
+
+def outside_band(nodes: tuple[int, ...]) -> tuple[int, int]:
+    """Rows and columns of the pupil's nodes on each side that lie beyond the panel's band."""
+    rows, columns = (round((n - 1) / 2 * (1 - 1 / PUPIL_EXTENT)) for n in nodes)
+    return rows, columns

@@ -17,7 +17,8 @@ from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.candidate_fits import CandidateFit, try_effect
 from trainer.diagnosis.probes import ProbeResult, probe
 from trainer.diagnosis.proposals.effect_file import write_effect
-from trainer.diagnosis.proposals.shapes_tried import Candidate, candidates_of, more_of
+from trainer.diagnosis.proposals.in_time import candidates_in_time
+from trainer.diagnosis.proposals.shapes_tried import WEAK, Candidate, candidates_of, more_of
 from trainer.diagnosis.ranking import rank
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import Catalogue, load_effects
@@ -136,7 +137,10 @@ class RoundWork:
             p for p in probes if self.thresholds.worth_adding(p.removed, self.ideal_excess, len(probes))
         ]
         signal = float(np.sqrt(before.variance.sum() / max(before.pixels.sum(), 1)))
-        candidates = candidates_of(telling, model.bench, signal, part_of(report, 0, 0.1))
+        steady = candidates_of(telling, model.bench, signal, part_of(report, 0, 0.05))
+        report(0.05, "looking at what changes from capture to capture")
+        candidates = [*steady, *candidates_in_time(self.roles, model, self.pool, steady)]
+        candidates = [c for c in candidates if c.worth > WEAK * max(o.worth for o in candidates)]
         fits = self._fitted(model, candidates, part_of(report, 0.1, 0.6, "fitting what the probes show"))
         best = self._best(before, fits)
         others = tuple(
@@ -163,7 +167,8 @@ class RoundWork:
         """A fitted model with all of its effects fitted together, where that is better; and its errors."""
         if len(fit.model.names) < 2:
             return fit.model, fit.held_out
-        joint = settled(fit.model, load(self.roles.captures, self.roles.fitted)).model
+        rows = self.roles.probed if fit.model.in_time else self.roles.fitted
+        joint = settled(fit.model, load(self.roles.captures, rows)).model
         after = evaluate_captures(self.roles.captures, self.roles.held_out, joint)
         return (joint, after) if after.excess < fit.held_out.excess else (fit.model, fit.held_out)
 
@@ -175,7 +180,7 @@ class RoundWork:
         None where neither is clearly better.
         """
         (found,) = self.pool.map(
-            probe, [(self.roles.folder, self._probed, self._held, model, candidate.place.stage)]
+            probe, [(self.roles.folder, self._probed, self._held, model, candidate.place.probe)]
         )
         left = ProbeResult.judged(found, errors)
         values = model.instance(name).values
@@ -221,7 +226,7 @@ class RoundWork:
         self, model: Model, candidates: Sequence[Candidate], report: Progress, name: str = ""
     ) -> Fits:
         """Candidates as effects in the model, by name; those whose file does not load or fit are left out."""
-        ids = tuple(c.capture for c in self.roles.fitted)
+        few, more = (tuple(c.capture for c in rows) for rows in (self.roles.fitted, self.roles.probed))
         named: dict[str, Candidate] = {}
         tasks = []
         for candidate in candidates:
@@ -236,6 +241,7 @@ class RoundWork:
                 continue
             named[own] = candidate
             start = instance_with(effect, model.bench, candidate.reading.starts)
+            ids = more if effect.takes_moment else few
             tasks.append((self.roles.folder, ids, self._held, model, start, False, ITERATIONS))
         results = self.pool.map(try_draft, tasks, lambda done: report(done / max(1, len(tasks))))
         return {f.effect: (named[f.effect], f) for f in results if f is not None}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,8 @@ class Number:
     low, high : float
         Physical range.
     about : str
+    grows : bool
+        It is part of the shape's size: its distance from `absent` grows with it.
     """
 
     name: str
@@ -41,11 +43,20 @@ class Number:
     low: float = -10.0
     high: float = 10.0
     about: str = ""
+    grows: bool = False
 
     @property
     def size(self) -> int:
         """How many numbers it is."""
         return len(self.start) if isinstance(self.start, tuple) else 1
+
+    def scaled(self, factor: float) -> Number:
+        """The number as a shape of another size has it."""
+        if not self.grows:
+            return self
+        if isinstance(self.start, tuple):
+            return replace(self, start=tuple(self.absent + factor * (v - self.absent) for v in self.start))
+        return replace(self, start=self.absent + factor * (self.start - self.absent))
 
 
 @dataclass(frozen=True)
@@ -71,6 +82,8 @@ class Reading:
         Share of the map's variance.
     imports : tuple of str
         Lines that `code` needs beyond torch.
+    whole : bool
+        As a factor it is the other shape's whole strength; otherwise its relative change.
     """
 
     name: str
@@ -82,6 +95,7 @@ class Reading:
     found: Array
     explained: float
     imports: tuple[str, ...] = ()
+    whole: bool = False
 
     @property
     def starts(self) -> dict[str, Any]:
@@ -92,6 +106,10 @@ class Reading:
     def size(self) -> int:
         """How many numbers it has."""
         return sum(n.size for n in self.numbers)
+
+    def scaled(self, factor: float) -> Reading:
+        """The shape at another size."""
+        return replace(self, numbers=tuple(n.scaled(factor) for n in self.numbers), found=factor * self.found)
 
 
 def with_unit(value: float, unit: str) -> str:

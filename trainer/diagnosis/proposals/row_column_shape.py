@@ -42,6 +42,7 @@ def _each(one: ProbeMap, kind: str, axis: int, profile: Array) -> Reading:
                 0.0,
                 *_range(unit),
                 f"of each {kind}",
+                True,
             ),
         ),
         code=(f"    value = each[{'None, :' if axis else ':, None'}].expand(rows, columns)",),
@@ -74,6 +75,7 @@ def _repeating(one: ProbeMap, kind: str, axis: int, profile: Array, every: int) 
                 0.0,
                 *_range(unit),
                 f"of the second {kind} of each group and those after it; the first has 0",
+                True,
             ),
         ),
         code=(

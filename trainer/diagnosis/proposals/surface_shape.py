@@ -6,6 +6,7 @@ import numpy as np
 
 from runtime.lightpath.legendre import legendre_count, legendre_maps
 from trainer.diagnosis.proposals.probe_maps import ProbeMap
+from trainer.diagnosis.proposals.product_shape import product_in, strength_of
 from trainer.diagnosis.proposals.reading import Array, Number, Reading, share_explained, with_unit
 from trainer.formatting import number
 
@@ -16,17 +17,22 @@ CENTRES = np.linspace(-0.8, 0.8, 9)  # of the half width, where the search for a
 LEGENDRE = "from runtime.lightpath.legendre import legendre_surface"
 
 
-def smooth_in(one: ProbeMap) -> list[Reading]:
-    """The low-order surface of a map."""
-    basis = _surfaces(one, ORDER)
-    terms, shape = _fitted(basis, one.values)
+def smooth_in(one: ProbeMap, order: int = ORDER, lowest: int = 1) -> list[Reading]:
+    """The low-order surface of a map, with its mean where `lowest` is 0."""
+    basis = _surfaces(one, order, lowest)
+    if lowest:
+        terms, shape = _fitted(basis, one.values)
+    else:
+        flat = basis.reshape(len(basis), -1)
+        terms = [float(t) for t in np.linalg.lstsq(flat.T, one.values.reshape(-1), rcond=None)[0]]
+        shape = np.tensordot(terms, basis, axes=1)
     unit, size = one.place.unit, float(np.std(shape))
     return [
         Reading(
             name="surface",
             about="A smooth surface.",
             describe=lambda v: (
-                f"a surface of order {ORDER}, terms of {with_unit(float(np.hypot.reduce(v['terms'])), unit)} in all"
+                f"a surface of order {order}, terms of {with_unit(float(np.hypot.reduce(v['terms'])), unit)} in all"
             ),
             formula=r"v = \sum_k a_k L_k(y, x)",
             numbers=(
@@ -37,10 +43,11 @@ def smooth_in(one: ProbeMap) -> list[Reading]:
                     tuple(terms),
                     0.0,
                     *_range(unit),
-                    f"of Legendre products of orders 1 to {ORDER}",
+                    f"of Legendre products of orders {lowest} to {order}",
+                    True,
                 ),
             ),
-            code=(_surface_line("value", "terms", one),),
+            code=(_surface_line("value", "terms", one, lowest),),
             found=shape,
             explained=share_explained(one.values, shape),
             imports=(LEGENDRE,),
@@ -89,6 +96,7 @@ def radial_in(one: ProbeMap) -> list[Reading]:
                     0.0,
                     *_range(unit),
                     "of the even powers of the distance, from the second on",
+                    True,
                 ),
             ),
             code=(
@@ -103,59 +111,24 @@ def radial_in(one: ProbeMap) -> list[Reading]:
 
 def times_surface(one: ProbeMap, first: Reading) -> Reading | None:
     """The product of a shape and a smooth surface, where it explains clearly more of the map than the shape alone."""
-    values = one.values - one.values.mean()
-    pattern = np.asarray(first.found) - np.mean(first.found)
-    basis = np.concatenate([pattern[None], pattern[None] * _surfaces(one, ENVELOPE)])
-    terms, shape = _fitted(basis, values)
-    explained = share_explained(one.values, shape)
-    if not terms or terms[0] <= 0 or explained < first.explained + 0.1 * (1 - first.explained):
-        return None
-    envelope = tuple(t / terms[0] for t in terms[1:])
-    return Reading(
-        name=f"{first.name}_times_surface",
-        about=first.about.rstrip(".") + ", whose strength changes smoothly over the field.",
-        describe=lambda v: (
-            f"{first.describe(v)}; their strength changes by {number(float(np.hypot.reduce(v['envelope'])))} "
-            "over the field"
-        ),
-        formula=first.formula + r";\quad v \to v\left(1 + \sum_k e_k L_k(y, x)\right)",
-        numbers=(
-            *first.numbers,
-            Number(
-                "envelope",
-                "1",
-                0.05,
-                envelope,
-                0.0,
-                -10.0,
-                10.0,
-                f"of Legendre products of orders 1 to {ENVELOPE}",
-            ),
-        ),
-        code=(
-            *first.code,
-            _surface_line("strength", "envelope", one),
-            "    value = value * (1 + strength)",
-        ),
-        found=shape,
-        explained=explained,
-        imports=(*first.imports, LEGENDRE),
-    )
+    (surface,) = smooth_in(strength_of(one, first), ENVELOPE)
+    return product_in(one, first, surface)
 
 
-def _surface_line(name: str, terms: str, one: ProbeMap) -> str:
+def _surface_line(name: str, terms: str, one: ProbeMap, lowest: int) -> str:
     """The line of a file that makes a surface: coordinates run over -1 .. 1."""
+    mean = "" if lowest else ", lowest=0"
     if one.place.spread == "pixels":
         stage = one.place.stage
-        return f"    {name} = legendre_surface({terms}, {stage}.y, {stage}.x)"
-    return f"    {name} = legendre_surface({terms}, torch.clamp(y, -1, 1), torch.clamp(x, -1, 1))"
+        return f"    {name} = legendre_surface({terms}, {stage}.y, {stage}.x{mean})"
+    return f"    {name} = legendre_surface({terms}, torch.clamp(y, -1, 1), torch.clamp(x, -1, 1){mean})"
 
 
-def _surfaces(one: ProbeMap, order: int) -> Array:
+def _surfaces(one: ProbeMap, order: int, lowest: int = 1) -> Array:
     y, x = one.grid
     half = (one.shape[0] / 2, one.shape[1] / 2) if one.place.spread == "pixels" else (1.0, 1.0)
-    maps = np.asarray(legendre_maps(y[:, :1] / half[0], x[:1, :] / half[1], order))
-    return maps.reshape(legendre_count(order), *one.values.shape)
+    maps = np.asarray(legendre_maps(y[:, :1] / half[0], x[:1, :] / half[1], order, lowest))
+    return maps.reshape(legendre_count(order, lowest), *one.values.shape)
 
 
 def _powers(y: Array, x: Array, radius: float) -> Array:

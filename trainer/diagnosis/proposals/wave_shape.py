@@ -60,8 +60,8 @@ def _reading(one: ProbeMap, seen: tuple[float, ...], shape: Array) -> Reading:
         formula=r"v = a\cos\varphi + b\sin\varphi,\quad "
         r"\varphi = \frac{2\pi}{p}\left(t + \frac{c\,t^2 + d\,s^2}{2R}\right)",
         numbers=(
-            Number("cosine", unit, amplitude_scale, cosine, 0.0, -most, most, "even about the centre"),
-            Number("sine", unit, amplitude_scale, sine, 0.0, -most, most, "odd about the centre"),
+            Number("cosine", unit, amplitude_scale, cosine, 0.0, -most, most, "even about the centre", True),
+            Number("sine", unit, amplitude_scale, sine, 0.0, -most, most, "odd about the centre", True),
             Number(
                 "period",
                 spread,
@@ -137,10 +137,26 @@ def waves_in_gray(one: ProbeMap) -> list[Reading]:
             formula=r"v = a\cos 2\pi n (g - \tfrac12) + b\sin 2\pi n (g - \tfrac12)",
             numbers=(
                 Number(
-                    "cosine", "rad", 0.02, float(terms[0]), 0.0, -3.0, 3.0, "part that is even about mid-gray"
+                    "cosine",
+                    "rad",
+                    0.02,
+                    float(terms[0]),
+                    0.0,
+                    -3.0,
+                    3.0,
+                    "part that is even about mid-gray",
+                    True,
                 ),
                 Number(
-                    "sine", "rad", 0.02, float(terms[1]), 0.0, -3.0, 3.0, "part that is odd about mid-gray"
+                    "sine",
+                    "rad",
+                    0.02,
+                    float(terms[1]),
+                    0.0,
+                    -3.0,
+                    3.0,
+                    "part that is odd about mid-gray",
+                    True,
                 ),
                 Number(
                     "cycles",
