@@ -30,8 +30,8 @@ from runtime.solver.first_phases import FirstPhases
 from runtime.solver.objective import Objective, needs_fine_grid
 from runtime.solver.penalty import PENALTIES
 from runtime.solver.quality import Quality, qualities_of
-from runtime.solver.retrieval_methods import METHODS, OLDER_NAMES, Method
-from runtime.solver.soft_levels import FEW, SHARPNESS, SoftLevels, levels_a_turn
+from runtime.solver.retrieval_methods import DESCENTS, METHODS, OLDER_NAMES, Method
+from runtime.solver.soft_levels import SoftLevels, stages_of
 from runtime.solver.solution import Solution
 from runtime.solver.solver_input import (
     check_approximator,
@@ -127,9 +127,10 @@ class Solver:
         self.objective = Objective(
             self.stacks, 2 if fine else 1, penalty, self.region, in_the_loop, self.on, frames
         )
-        if frames > 1 and min(map(levels_a_turn, self.drives)) <= FEW:
+        stages = stages_of(self.drives, frames) if method in DESCENTS else ()
+        if stages:
             on, objective = self.on, self.objective
-            objective.rounding = SoftLevels(self.drives, objective.shape, objective.strip, on)
+            objective.rounding = SoftLevels(self.drives, objective.shape, objective.strip, on, stages)
         self.first = FirstPhases(self.objective, self.stacks, self.drives, initialiser)
         made = METHODS[method]
         self.method: Method | None = made(self.objective, self.drives, **options) if made else None
@@ -140,6 +141,7 @@ class Solver:
         xp, real = self.on.xp, self.stacks[0][0].response.dtype
         whole = self.objective.shape
         self.phases = [xp.zeros(whole, real) for _ in range(3)]
+        self.begun_from: Any = xp.zeros(whole, real) if stages else None
         self.grays = [np.zeros(whole, np.uint8) for _ in range(2)]
         self.before = np.zeros(self.shape, real)
         self.solved = 0
@@ -261,7 +263,12 @@ class Solver:
             iterations = ITERATIONS if deadline_ms is None else _ENDLESS
         history: list[float] = []
         rounding = self.objective.rounding
-        stages = (0.0,) if rounding is None else SHARPNESS if iterations else SHARPNESS[-1:]
+        stages: tuple[float, ...] = (0.0,)
+        at_first = (math.inf, -math.inf)
+        if rounding is not None:
+            at_first = self._rounded(self.phases[0])
+            self.begun_from[...] = self.phases[0]
+            stages = rounding.stages if iterations else rounding.stages[-1:]
         for stage, sharpness in enumerate(stages, 1):
             if rounding is not None:
                 rounding.sharpness = sharpness
@@ -270,9 +277,11 @@ class Solver:
         clock = time.perf_counter()
         expected = max(history)
         if rounding is not None:
-            rounding.sharpness = math.inf
-            self.objective.look(self.best)
-            expected = self.objective.psnr_db
+            loss, expected = self._rounded(self.best)
+            if (
+                loss > at_first[0]
+            ):  # a descent that is cut short, or goes on for long, can end below its start
+                self.best[...], expected = self.begun_from, at_first[1]
         self.grays.reverse()
         for drive, phase, gray in zip(self.drives, self.best, self.grays[0], strict=True):
             drive.gray(self.on.to_host(phase), gray)
@@ -284,6 +293,12 @@ class Solver:
         self.solved += 1
         judge = partial(self._judged, self.grays[0], targets, self.solved)
         return Solution(gray, phase, tuple(history), expected, 1e3 * (done - begun), judge)
+
+    def _rounded(self, phase: Any) -> tuple[float, float]:
+        """The loss and the PSNR (dB) of the panel's levels that are nearest to a phase."""
+        assert self.objective.rounding is not None
+        self.objective.rounding.sharpness = math.inf
+        return self.objective.look(phase), self.objective.psnr_db
 
     def _descend(
         self,
