@@ -41,6 +41,11 @@ class FirstPhases:
     ------
     InputError
         For a network that does not fit the panel.
+
+    Attributes
+    ----------
+    fits : bool
+        Whether the last start was made for the picture that the solver has solved last.
     """
 
     def __init__(
@@ -62,12 +67,21 @@ class FirstPhases:
             self.noise = noise.astype(stacks[0][0].response.dtype)
         self.initialiser = None if initialiser is None else Initialiser(initialiser, self.shape)
         self.amplitude = np.zeros(self.shape, stacks[0][0].response.dtype)
+        self.made = objective.backend.xp.zeros(objective.shape, stacks[0][0].response.dtype)
+        self.fits = False
 
     def cold(self, targets: np.ndarray, phases: Array, soon: bool = False) -> None:
         """Fill `phases` (rad), a pattern each, from targets [C, K, H, W] alone, not from the picture before.
 
         With `soon`, for few iterations.
         """
+        self._make(targets, phases, soon)
+        self.made[...] = phases
+        self.fits = (
+            soon or self.frames == 1
+        )  # several patterns of a video are made `soon`, others are no like of them
+
+    def _make(self, targets: np.ndarray, phases: Array, soon: bool) -> None:
         for c, (drive, start) in enumerate(zip(self.drives, self.starts, strict=True)):
             phase, *others = phases[c * self.frames : (c + 1) * self.frames]
             np.multiply(
@@ -98,9 +112,18 @@ class FirstPhases:
             other[...] = self.backend.xp.asarray(drive.held(self.backend.to_host(other)))
 
     def warm(
-        self, before: Array, motion: tuple[int, int], targets: np.ndarray, phases: Array, room: Array
+        self,
+        before: Array,
+        motion: tuple[int, int],
+        targets: np.ndarray,
+        phases: Array,
+        room: Array,
+        still: bool,
     ) -> None:
         """Fill `phases` with those of the frame before, moved as its content has moved.
+
+        Where content comes in and along the edges, the pattern stays where it is and changes as its start does from
+        frame to frame: so it keeps what the descent has found there, most of all against the panel's end.
 
         Parameters
         ----------
@@ -112,10 +135,21 @@ class FirstPhases:
             Of this frame: where content comes in, the start is cold.
         phases, room : float array [C N, H, W], rad
             The result, and room to work in.
+        still : bool
+            Whether this frame is the same picture as the one before.
         """
         shifted(before, motion, phases)
-        if any(motion):
-            self.cold(targets, room, soon=True)
-            for n, (phase, fresh) in enumerate(zip(phases, room, strict=True)):
-                for part in renewed(motion, self.starts[n // self.frames].edges, self.shape):
-                    phase[part] = fresh[part]
+        if not any(motion):
+            self.fits = self.fits and still
+            return
+        self._make(targets, room, soon=True)
+        for n, (phase, fresh) in enumerate(zip(phases, room, strict=True)):
+            drive, edges = self.drives[n // self.frames], self.starts[n // self.frames].edges
+            near = all(2 * abs(step) <= edge for step, edge in zip(motion, edges, strict=True))
+            for part in renewed(motion, edges, self.shape):
+                phase[part] = fresh[part]
+                if self.fits and near and not drive.bounded:  # the sum may lie out of a bounded panel's range
+                    phase[part] += before[n][part]
+                    phase[part] -= self.made[n][part]
+        self.made[...] = room
+        self.fits = True

@@ -242,4 +242,5 @@ METHODS: dict[str, Any] = {
     "gerchberg_saxton": GerchbergSaxton,
     "double_phase": None,  # the start alone
 }
+DESCENTS = ("bfgs", "adam")  # go down the objective's gradient, so they take several patterns and few levels
 OLDER_NAMES = {"default": "bfgs"}  # still accepted

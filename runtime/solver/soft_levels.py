@@ -20,6 +20,9 @@ Array = Any
 
 FEW = 64  # levels a turn; of four patterns, rounding at the end loses 4 dB at 8, 1.7 at 16, 0.2 at 64, 0.1 at 128
 SHARPNESS = (1.0, 2.0, 4.0, 8.0, 16.0)  # one stage each: fewer, or twice as many, were worse
+# One pattern has no other to make up for its rounding: soft levels pay up to 16 a turn, and in few stages.
+FEW_ALONE = 16  # at 32, rounding at the end is ahead until 40 iterations
+SHARPNESS_ALONE = (1.0, 6.0)  # ahead of rounding from one iteration on; the five stages only from six on
 SAME = 1e-4  # rad: levels nearer than this are one
 
 
@@ -35,11 +38,13 @@ class SoftLevels:
     rows : int
         Of a strip.
     backend : Backend
+    stages : tuple of float
+        Sharpness of the stages of a descent.
 
     Attributes
     ----------
     sharpness : float
-        0: phases stay as they are; infinite: they are rounded.
+        Near 0: phases stay as they are; infinite: they are rounded.
     phase, slope : float array [patterns, H, W]
         What `round` fills: rounded phase (rad), and its derivative over the phase.
 
@@ -49,11 +54,16 @@ class SoftLevels:
     """
 
     def __init__(
-        self, drives: Sequence[DriveRange], shape: tuple[int, ...], rows: int, backend: Backend
+        self,
+        drives: Sequence[DriveRange],
+        shape: tuple[int, ...],
+        rows: int,
+        backend: Backend,
+        stages: tuple[float, ...] = SHARPNESS,
     ) -> None:
         xp = backend.xp
         real = drives[0].sorted.dtype
-        self.backend, self.rows, self.sharpness = backend, rows, SHARPNESS[0]
+        self.backend, self.rows, self.stages, self.sharpness = backend, rows, stages, stages[0]
         self.phase, self.slope = xp.zeros(shape, real), xp.zeros(shape, real)
         self.drives = drives
         self.levels = [xp.asarray(distinct(drive.sorted)) for drive in drives]
@@ -93,6 +103,12 @@ class SoftLevels:
 def distinct(phases: np.ndarray) -> np.ndarray:
     """Sorted phases (rad) without those that repeat the one before."""
     return phases[np.concatenate([[True], np.diff(phases) > SAME])]
+
+
+def stages_of(drives: Sequence[DriveRange], frames: int) -> tuple[float, ...]:
+    """Sharpness of each stage of a descent, for N patterns a picture; none where rounding at the end is as good."""
+    few, stages = (FEW, SHARPNESS) if frames > 1 else (FEW_ALONE, SHARPNESS_ALONE)
+    return stages if min(map(levels_a_turn, drives)) <= few else ()
 
 
 def levels_a_turn(drive: DriveRange) -> int:

@@ -30,8 +30,8 @@ from runtime.solver.first_phases import FirstPhases
 from runtime.solver.objective import Objective, needs_fine_grid
 from runtime.solver.penalty import PENALTIES
 from runtime.solver.quality import Quality, qualities_of
-from runtime.solver.retrieval_methods import METHODS, OLDER_NAMES, Method
-from runtime.solver.soft_levels import FEW, SHARPNESS, SoftLevels, levels_a_turn
+from runtime.solver.retrieval_methods import DESCENTS, METHODS, OLDER_NAMES, Method
+from runtime.solver.soft_levels import SoftLevels, stages_of
 from runtime.solver.solution import Solution
 from runtime.solver.solver_input import (
     check_approximator,
@@ -47,6 +47,7 @@ IterationReport = Callable[[int, float], None]
 GRIDS = ("panel", "fine")
 WAYS = ("gradient", "predistorted")
 ITERATIONS = 20
+COMPARED = 8  # every so many pixels, an axis, tell whether a picture is another one
 _ENDLESS = 1 << 30
 
 
@@ -127,9 +128,10 @@ class Solver:
         self.objective = Objective(
             self.stacks, 2 if fine else 1, penalty, self.region, in_the_loop, self.on, frames
         )
-        if frames > 1 and min(map(levels_a_turn, self.drives)) <= FEW:
+        stages = stages_of(self.drives, frames) if method in DESCENTS else ()
+        if stages:
             on, objective = self.on, self.objective
-            objective.rounding = SoftLevels(self.drives, objective.shape, objective.strip, on)
+            objective.rounding = SoftLevels(self.drives, objective.shape, objective.strip, on, stages)
         self.first = FirstPhases(self.objective, self.stacks, self.drives, initialiser)
         made = METHODS[method]
         self.method: Method | None = made(self.objective, self.drives, **options) if made else None
@@ -140,6 +142,7 @@ class Solver:
         xp, real = self.on.xp, self.stacks[0][0].response.dtype
         whole = self.objective.shape
         self.phases = [xp.zeros(whole, real) for _ in range(3)]
+        self.begun_from: Any = xp.zeros(whole, real) if stages else None
         self.grays = [np.zeros(whole, np.uint8) for _ in range(2)]
         self.before = np.zeros(self.shape, real)
         self.solved = 0
@@ -189,6 +192,7 @@ class Solver:
             self.first.cold(optics_targets, phase)
         else:
             phase[...] = self.on.xp.asarray(np.reshape(start, phase.shape))
+            self.first.fits = self.first.fits and self._is_still(targets)
         return self._improve(targets, begun, iterations, deadline_ms, progress)
 
     def frame(
@@ -219,7 +223,7 @@ class Solver:
             first = next(k for k, phase in enumerate(self.phases) if phase is not self.best)
             self.phases[0], self.phases[first] = self.phases[first], self.phases[0]
             room = next(phase for phase in self.phases[1:] if phase is not self.best)
-            self.first.warm(self.best, motion, optics_targets, self.phases[0], room)
+            self.first.warm(self.best, motion, optics_targets, self.phases[0], room, self._is_still(targets))
         else:
             self.first.cold(optics_targets, self.phases[0], soon=True)
         return self._improve(targets, begun, iterations, deadline_ms, None)
@@ -234,6 +238,7 @@ class Solver:
             self.first.cold(self._aim(targets), self.phases[0])
             self._improve(targets, begun, 3, None, None)
         self.before, self.best[...], self.follows = before, best, follows
+        self.first.fits = False
 
     def _begun(
         self, target: np.ndarray, iterations: int | None, deadline_ms: float | None
@@ -261,7 +266,12 @@ class Solver:
             iterations = ITERATIONS if deadline_ms is None else _ENDLESS
         history: list[float] = []
         rounding = self.objective.rounding
-        stages = (0.0,) if rounding is None else SHARPNESS if iterations else SHARPNESS[-1:]
+        stages: tuple[float, ...] = (0.0,)
+        at_first = (math.inf, -math.inf)
+        if rounding is not None:
+            at_first = self._rounded(self.phases[0])
+            self.begun_from[...] = self.phases[0]
+            stages = rounding.stages if iterations else rounding.stages[-1:]
         for stage, sharpness in enumerate(stages, 1):
             if rounding is not None:
                 rounding.sharpness = sharpness
@@ -270,9 +280,11 @@ class Solver:
         clock = time.perf_counter()
         expected = max(history)
         if rounding is not None:
-            rounding.sharpness = math.inf
-            self.objective.look(self.best)
-            expected = self.objective.psnr_db
+            loss, expected = self._rounded(self.best)
+            if (
+                loss > at_first[0]
+            ):  # a descent that is cut short, or goes on for long, can end below its start
+                self.best[...], expected = self.begun_from, at_first[1]
         self.grays.reverse()
         for drive, phase, gray in zip(self.drives, self.best, self.grays[0], strict=True):
             drive.gray(self.on.to_host(phase), gray)
@@ -284,6 +296,12 @@ class Solver:
         self.solved += 1
         judge = partial(self._judged, self.grays[0], targets, self.solved)
         return Solution(gray, phase, tuple(history), expected, 1e3 * (done - begun), judge)
+
+    def _rounded(self, phase: Any) -> tuple[float, float]:
+        """The loss and the PSNR (dB) of the panel's levels that are nearest to a phase."""
+        assert self.objective.rounding is not None
+        self.objective.rounding.sharpness = math.inf
+        return self.objective.look(phase), self.objective.psnr_db
 
     def _descend(
         self,
@@ -330,6 +348,11 @@ class Solver:
             shown_by_optics = predistorted(self.approximator, targets)
         self.objective.aim(shown_by_optics if self.through == "predistorted" else targets)
         return shown_by_optics
+
+    def _is_still(self, targets: np.ndarray) -> bool:
+        """Whether targets [C, K, H, W] are of the picture solved before, judged by some of its pixels."""
+        some = (slice(None, None, COMPARED), slice(None, None, COMPARED))
+        return bool(np.array_equal(targets[0, 0][some], self.before[some]))
 
     def _judged(self, patterns: np.ndarray, targets: np.ndarray, number: int) -> tuple[Quality, ...]:
         if self.solved > number + 1:

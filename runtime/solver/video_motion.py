@@ -25,10 +25,10 @@ def shifted(before: Array, motion: tuple[int, int], out: Array) -> None:
 
 
 def renewed(motion: tuple[int, int], edges: tuple[int, int], shape: tuple[int, int]) -> list[tuple[Any, ...]]:
-    """The parts of a panel [..., H, W] that get a new start where content moves.
+    """The parts of a panel [..., H, W] that are not moved with the content, but get a start of their own.
 
     Where content comes in, the frame before has nothing for it. Along its edges a pattern compensates for the
-    panel's end, which does not move. Without a new start, both grow into speckle within a few frames.
+    panel's end, which does not move. Moved, both grow into speckle within a few frames.
 
     Parameters
     ----------

@@ -51,8 +51,47 @@ def test_one_frame_is_the_solve_without_frames(ideal: LightPath, levels: int) ->
     assert one.gray.shape == SHAPE
     np.testing.assert_array_equal(one.gray, plain.gray)
     assert one.psnr_db == plain.psnr_db
-    assert one.expected_psnr_db == max(one.psnr_db)
+    if levels == 256:  # rounded at the end
+        assert one.expected_psnr_db == max(one.psnr_db)
+    else:  # in the loop
+        assert one.expected_psnr_db == pytest.approx(one.quality.psnr_db, abs=0.2)
     np.testing.assert_array_equal(one.gray, DriveRange(path).gray(one.phase))
+
+
+@pytest.mark.parametrize("iterations, ahead", [(1, -0.1), (20, 0.3), (60, 0.7)])
+def test_few_levels_are_in_the_loop_of_one_pattern(
+    ideal: LightPath, sixteen: LightPath, iterations: int, ahead: float
+) -> None:
+    """Against 256 levels' phase rounded at the end."""
+    gains = []
+    for seed in (0, 3, 5):
+        target = scene(SHAPE, seed)
+        after = DriveRange(sixteen).gray(solve(ideal, target, iterations).phase)
+        rounded = quality(shown(sixteen, after), target).psnr_db
+        gains.append(solve(sixteen, target, iterations).quality.psnr_db - rounded)
+    assert np.mean(gains) > ahead
+
+
+@pytest.mark.parametrize("iterations", [1, 20])
+def test_a_still_picture_of_few_levels_never_gets_worse(sixteen: LightPath, iterations: int) -> None:
+    target, solver = scene(SHAPE), Solver(sixteen)
+    psnr, expected = [], []
+    for _ in range(12):
+        solution = solver.frame(target, iterations)
+        psnr.append(solution.quality.psnr_db)
+        expected.append(solution.expected_psnr_db)
+    assert min(np.diff(expected)) > -1e-3
+    assert min(np.diff(psnr)) > -0.1
+    assert psnr[-1] > psnr[0] + 0.3
+
+
+def test_a_descent_never_ends_below_its_start(sixteen: LightPath) -> None:
+    target = scene(SHAPE)
+    good = Solver(sixteen).solve(target, 60)
+    for method, iterations in (("bfgs", 2), ("adam", 3)):
+        again = Solver(sixteen, method=method).solve(target, iterations, start=good.phase)
+        assert again.expected_psnr_db > good.expected_psnr_db - 1e-3
+        assert again.quality.psnr_db > good.quality.psnr_db - 1e-3
 
 
 def test_the_quality_is_that_of_the_mean_of_the_irradiances(ideal: LightPath) -> None:
