@@ -8,15 +8,18 @@ import numpy as np
 import pytest
 
 from runtime.lightpath.legendre import legendre_count
+from tests.trainer.hidden import bench_file
+from trainer.captures.acquire import acquire_from
 from trainer.captures.batches import Batch, load
-from trainer.captures.capture_set import CaptureSet
+from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.effects import catalogue
 from trainer.effects.testing import captures_with
 from trainer.fitting.gauss_newton import fit
-from trainer.fitting.refit import least_for_order, raise_order
+from trainer.fitting.refit import least_for_order, raise_orders
 from trainer.model.model import EffectInstance, Model, absent, instance_with
 
 KNOWN = catalogue()
+LEAK = ("leak_real", "leak_imaginary")
 
 
 def batches_of(captures: CaptureSet) -> list[Batch]:
@@ -62,9 +65,41 @@ def test_an_order_is_raised_as_far_as_the_captures_ask_and_no_farther(tmp_path: 
     batches = batches_of(captures)
     lowest = fit(Model(captures.bench).having(absent(effect, captures.bench)), ["vignetting"], batches)
     assert lowest.model.present[0].order == 2
-    best = raise_order(lowest, "vignetting", batches, least_for_order)
+    best = raise_orders(lowest, ["vignetting"], batches, least_for_order)
     assert best.model.present[0].order == 4
     assert best.model.present[0].values["log_gain"] == pytest.approx(terms, abs=3e-3)
+
+
+def test_orders_of_two_effects_are_raised_together(tmp_path: Path) -> None:
+    effect = KNOWN["vignetting"]
+    terms = np.zeros(legendre_count(4))
+    terms[[0, 4, -1]] = 0.2, -0.15, 0.1
+    captures = captures_with(tmp_path, effect, {"log_gain": terms}, patterns=3, order=4)
+    batches = batches_of(captures)
+    model = Model(captures.bench)
+    for name in ("vignetting", "stray_light"):
+        model = model.having(absent(KNOWN[name], captures.bench))
+    best = raise_orders(fit(model, model.names, batches), model.names, batches, least_for_order).model
+    assert best.instance("vignetting").order == 4
+    assert best.instance("stray_light").order == 1  # nothing asks for more
+
+
+def test_dead_space_and_a_flat_first_surface_are_found_beside_a_bent_panel(tmp_path: Path) -> None:
+    bent = 'kind = "panel_wavefront"\npeak_to_valley_nm = 700'
+    acquire_from(str(bench_file(tmp_path, bent, 'kind = "zero_order"')), tmp_path / "captures")
+    captures = read_captures(tmp_path / "captures")
+    batches = batches_of(captures)
+    model = Model(captures.bench)
+    for name, order in (("panel_wavefront", 6), ("zero_order", 0)):
+        model = model.having(absent(KNOWN[name], captures.bench, order))
+    one = fit(model, model.names, batches)
+    both = raise_orders(one, model.names, batches, least_for_order)
+    present = both.model.instance("zero_order")
+    assert present.order > 0
+    flat, leak = (np.hypot(*v) for v in (present.values["flat_leak"], [present.values[k] for k in LEAK]))
+    # What the bench has: 0.15 from its surface, and 0.7 of the tenth of the area that is dead.
+    assert flat == pytest.approx(0.15, rel=0.2) and leak == pytest.approx(0.07, rel=0.3)
+    assert both.errors.excess < 0.1 * one.errors.excess
 
 
 def test_a_value_stays_in_its_physical_range(tmp_path: Path) -> None:

@@ -323,6 +323,13 @@ def test_what_a_person_writes_is_read(tmp_path: Path) -> None:
     assert model.present[1].errors is None
 
 
+def test_a_parameter_that_a_file_of_before_lacks_is_absent(tmp_path: Path) -> None:
+    start = GOOD.index("[effect.parameters.gain]")
+    end = GOOD.index("[effect.parameters.curvature]")
+    model = read_text(tmp_path, GOOD[:start] + GOOD[end:])
+    assert model.present[0].values["gain"].tolist() == [1.0, 1.0]
+
+
 @pytest.mark.parametrize(
     ("change", "by", "message"),
     [

@@ -18,7 +18,7 @@ from trainer.fitting.free_form_effects import refined, with_free_form
 from trainer.fitting.gains import with_gains
 from trainer.fitting.gauss_newton import with_measured_values
 from trainer.fitting.predictor import evaluate_captures
-from trainer.fitting.refit import fit_from, least_for_order, raise_order, settled
+from trainer.fitting.refit import fit_from, least_for_order, raise_orders, settled
 from trainer.model.history import recorded
 from trainer.model.model import EffectInstance, Model
 from trainer.model.parameters import json_values
@@ -96,7 +96,7 @@ def add_from(roles: CaptureRoles, model: Model, start: EffectInstance) -> Model:
     batches = load(roles.captures, roles.fitted)
     name = start.effect.name
     fitted = fit_from(model, start, batches)
-    fitted = raise_order(fitted, name, batches, least_for_order)
+    fitted = raise_orders(fitted, [name], batches, least_for_order)
     model = settled(fitted.model, batches).model if len(fitted.model.names) > 1 else fitted.model
     by_pixel = [p.effect.name for p in model.present if any(q.per_pixel for q in p.effect.parameters)]
     if by_pixel:  # a number for each pixel asks for all pictures that there are

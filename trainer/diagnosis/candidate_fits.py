@@ -10,7 +10,7 @@ from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet, chosen, opened
 from trainer.fitting.gauss_newton import fit
 from trainer.fitting.predictor import evaluate_captures
-from trainer.fitting.refit import fit_from, least_for_order, raise_order, settled
+from trainer.fitting.refit import fit_from, least_for_order, raise_orders, settled
 from trainer.model.model import EffectInstance, Model
 
 
@@ -58,7 +58,7 @@ def try_effect(
     name = start.effect.name
     fitted = fit_from(model, start, batches, iterations)
     if raising:
-        fitted = raise_order(fitted, name, batches, least_for_order)
+        fitted = raise_orders(fitted, [name], batches, least_for_order)
     return _judged(name, fitted.model, captures, held_ids)
 
 
@@ -86,7 +86,7 @@ def try_further(
     batches = load(captures, chosen(captures, ids))
     fitted = fit(model, [name], batches, iterations=8)
     if raising:
-        fitted = raise_order(fitted, name, batches, least_for_order)
+        fitted = raise_orders(fitted, [name], batches, least_for_order)
     return _judged(name, fitted.model, captures, held_ids)
 
 

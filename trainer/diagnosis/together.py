@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from runtime.excess import PredictionErrors
 from runtime.program.progress import Progress, no_progress, part_of
 from trainer.captures.batches import load
 from trainer.captures.held_out import CaptureRoles
+from trainer.diagnosis.addition import gone_on
 from trainer.diagnosis.screen import ScreenResult
 from trainer.diagnosis.unnecessary import without_one
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import Catalogue
 from trainer.fitting.gains import with_gains
+from trainer.fitting.gauss_newton import fit
 from trainer.fitting.joint_start import joint_start
 from trainer.fitting.pool import Pool
 from trainer.fitting.predictor import evaluate_captures
-from trainer.fitting.refit import settled
 from trainer.model.model import Model
 
 FAR = 0.3  # held-out excess from which several strong effects may hide one another
@@ -76,10 +77,13 @@ def explain_together(
     if min((s.after for s in screened), default=errors.excess) < HELPS * errors.excess:
         return None
     batches = load(roles.captures, roles.fitted)
-    joint = settled(joint_start(model, known, batches, part_of(report, 0.0, 0.6)).model, batches).model
+    joint = joint_start(model, known, batches, part_of(report, 0.0, 0.6))
+    joint = fit(joint, joint.names, batches).model
     after = evaluate_captures(roles.captures, roles.held_out, joint)
     if after.excess > HELPS * errors.excess:
         return None
+    report(0.7, "looking whether maps go on")
+    joint, after = _with_maps(roles, joint, after, thresholds)
     report(0.8, "leaving out effects that are not needed")
     names = joint.names
     while smaller := without_one(roles, joint, after, names, thresholds, errors.excess, pool, thorough=False):
@@ -88,13 +92,32 @@ def explain_together(
     return JointExplanation(joint, _ladder(roles, joint, after))
 
 
+def _with_maps(
+    roles: CaptureRoles, model: Model, errors: PredictionErrors, thresholds: Thresholds
+) -> tuple[Model, PredictionErrors]:
+    """The model with those of its maps gone on in free form that pay: what one hides, the next may show."""
+    tried: list[str] = []
+    while rest := [n for n in _maps_to_go_on(model) if n not in tried]:
+        further = gone_on(roles, model, rest[0], errors, thresholds)
+        tried = [*tried, rest[0]] if further is None else []
+        model, errors = further or (model, errors)
+    return model, errors
+
+
+def _maps_to_go_on(model: Model) -> list[str]:
+    """Names of effects whose maps are polynomials alone and have a free form."""
+    forms = [(p.effect.name, p.effect.free_form) for p in model.present if p.nodes is None]
+    return [name for name, form in forms if form is not None and not form.curve]
+
+
 def _ladder(
     roles: CaptureRoles, model: Model, errors: PredictionErrors
 ) -> tuple[tuple[str, PredictionErrors], ...]:
     """From the whole model down, each time without the effect that is missed least."""
     steps = []
     while model.names:
-        rest = [with_gains(roles.captures, model.without(name), roles.fitted) for name in model.names]
+        bare = replace(model, gain={})
+        rest = [with_gains(roles.captures, bare.without(name), roles.fitted) for name in model.names]
         without = [evaluate_captures(roles.captures, roles.held_out, one) for one in rest]
         least = min(range(len(rest)), key=lambda k: without[k].excess)
         steps.append((model.names[least], errors))

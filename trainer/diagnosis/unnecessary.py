@@ -5,18 +5,27 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from runtime.excess import PredictionErrors, removed_excess
+import torch
+
+from runtime.excess import PredictionErrors, joined, removed_excess
 from trainer.captures.batches import load
 from trainer.captures.capture_set import chosen, opened
 from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.verdict import Thresholds
-from trainer.fitting.gauss_newton import fit
+from trainer.fitting.gauss_newton import HOLD, fit
+from trainer.fitting.jacobian import away_from_absent, keys_of, remaining, stacked
+from trainer.fitting.least_squares_gain import with_gain
+from trainer.fitting.many_numbers import has_many
 from trainer.fitting.pool import Pool
-from trainer.fitting.predictor import evaluate_captures
-from trainer.fitting.refit import settled
+from trainer.fitting.predictor import Predictor, evaluate_captures, excess_on
+from trainer.fitting.refit import settled, telling
 from trainer.model.model import Model
 
 FEW_STEPS = 3
+# An effect is needed where the most telling capture of each colour and plane says so: where it changes that picture, in
+# a way that a straight-line step of the others could not, by CHANGES times what is left or makes a difference, or where
+# the others, fitted to that capture alone, leave NEEDED times as much there. All captures leave no less.
+CHANGES, NEEDED = 30.0, 10.0
 
 
 def without_one(
@@ -45,28 +54,54 @@ def without_one(
         What was left out, and the model without it, refitted.
     """
     ids, held = (tuple(c.capture for c in rows) for rows in (roles.fitted, roles.held_out))
+    least = thresholds.least(ideal_excess)
+    names = _in_doubt(roles, model, names, least) if names else []
     raising = thorough and not thresholds.complete(errors.excess, ideal_excess)
     for first in range(0, len(names), pool.workers):  # as many at a time as there are processes
         some = names[first : first + pool.workers]
-        tasks = [
-            (roles.folder, ids, held, model.without(name), raising, 12 if thorough else FEW_STEPS)
-            for name in some
-        ]
-        for name, (fitted, without) in zip(some, pool.map_here_if_one(refitted, tasks), strict=True):
-            if not thresholds.worth_adding(removed_excess(without, errors), ideal_excess, 1):
-                return name, fitted, without
+        iterations = 12 if thorough else FEW_STEPS
+        tasks = [(roles.folder, ids, held, model, name, raising, iterations, least) for name in some]
+        for name, found in zip(some, pool.map_here_if_one(fitted_without, tasks), strict=True):
+            if found is not None and not thresholds.worth_adding(
+                removed_excess(found[1], errors), ideal_excess, 1
+            ):
+                return name, *found
     return None
 
 
-def refitted(
+@torch.no_grad()
+def _in_doubt(roles: CaptureRoles, model: Model, names: Sequence[str], least: float) -> list[str]:
+    """Those of the named effects that are not clearly needed."""
+    batches = [telling(model, b, 1) for b in load(roles.captures, roles.fitted)]
+    predictors = [Predictor(model, b) for b in batches]
+    keys = keys_of(model, [n for n in model.names if not has_many(model.instance(n))])
+    _, slopes = stacked(model, keys, predictors, [p.trace(model) for p in predictors])
+    away = torch.as_tensor([away_from_absent(model, key) for key in keys], dtype=slopes.dtype)
+    scale = float(joined([b.errors(torch.zeros_like(b.signal)) for b in batches]).variance.sum())
+    matters = max(excess_on(model, batches), least)
+    doubted = []
+    for name in names:
+        own = [k for k, key in enumerate(keys) if key[0] == name]
+        others = [k for k in range(len(slopes)) if k not in own]
+        changed = remaining(away[own] @ slopes[own], slopes[others]) if own else 0.0
+        if changed < CHANGES * scale * matters:
+            doubted.append(name)
+    return doubted
+
+
+def fitted_without(
     folder: Path,
     ids: tuple[str, ...],
     held_ids: tuple[str, ...],
     model: Model,
+    name: str,
     raising: bool,
     iterations: int,
-) -> tuple[Model, PredictionErrors]:
-    """A model with all of its effects fitted together, and its errors on held-out captures: a task for any process.
+    least: float,
+) -> tuple[Model, PredictionErrors] | None:
+    """A model without one effect, the others fitted together, and its errors on held-out captures.
+
+    A task for any process.
 
     Parameters
     ----------
@@ -78,8 +113,21 @@ def refitted(
         Raise orders as far as that helps.
     iterations : int
         Of the fit, where orders are not raised.
+    least : float
+        Excess that makes no difference.
+
+    Returns
+    -------
+    (Model, PredictionErrors) or None
+        None where a few captures show already that the model needs the effect.
     """
     captures = opened(folder)
     batches = load(captures, chosen(captures, ids))
-    fitted = settled(model, batches) if raising else fit(model, model.names, batches, iterations)
+    rest = model.without(name)
+    rest = with_gain(rest, [Predictor(rest, b) for b in batches])  # it may have had the gains' work
+    few = [telling(rest, b, 1) for b in batches]
+    left = fit(rest, rest.names, few, FEW_STEPS, hold=HOLD).errors.excess
+    if left > NEEDED * max(excess_on(model, few), least):
+        return None
+    fitted = settled(rest, batches) if raising else fit(rest, rest.names, batches, iterations)
     return fitted.model, evaluate_captures(captures, chosen(captures, held_ids), fitted.model)

@@ -60,19 +60,36 @@ from trainer.prediction.stages import Panel
             typical=(-10, 10),
             terms=surface_terms,
         ),
+        Parameter(
+            "flat_leak",
+            "1",
+            scale=0.02,
+            low=-1,
+            high=1,
+            count=lambda order: 2 if order else 0,
+            about="a second leak that is flat whatever the panel's wavefront, of the beam's amplitude",
+            typical=(-0.3, 0.3),
+            terms=lambda order: ("real", "imaginary") if order else (),
+        ),
     ],
     formula=(
-        r"u = S\,e^{j\varphi} * \mathrm{rect}_{\sqrt{F}} + \ell\,S\,e^{j\psi(x,y)}, \qquad"
+        r"u = S\,e^{j\varphi} * \mathrm{rect}_{\sqrt{F}} + \ell\,S\,e^{j\psi(x,y)} + f\,|S|, \qquad"
         r" \ell = \ell_\mathrm{r} + j\,\ell_\mathrm{i}"
     ),
 )
 def zero_order(
-    panel: Panel, leak_real: Tensor, leak_imaginary: Tensor, fill_factor: Tensor, leak_wavefront: Tensor
+    panel: Panel,
+    leak_real: Tensor,
+    leak_imaginary: Tensor,
+    fill_factor: Tensor,
+    leak_wavefront: Tensor,
+    flat_leak: Tensor,
 ) -> Panel:
     """Light that the pattern does not modulate: dead space between pixels, first-surface reflection.
 
     Dead space between the pixels and the panel's first surface reflect light that no pattern reaches. It crosses
-    the picture as a plane wave and interferes with it.
+    the picture as a plane wave and interferes with it. Dead space has the panel's own wavefront; the first surface of a
+    panel that is bent inside may be flat.
 
     References
     ----------
@@ -84,6 +101,8 @@ def zero_order(
     if leak_wavefront.shape[0]:
         phase = legendre_surface(leak_wavefront, panel.y, panel.x)
         leak = leak * torch.polar(torch.ones_like(phase), phase)
+    if flat_leak.shape[0]:
+        panel = panel.reflecting(panel.source.abs() * torch.complex(flat_leak[0], flat_leak[1]))
     return replace(panel.leaking(leak), aperture=torch.stack((side, side)))
 
 

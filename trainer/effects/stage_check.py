@@ -138,7 +138,7 @@ def _drive(drive: Drive) -> dict[str, _Wanted]:
 def _panel(panel: Panel) -> dict[str, _Wanted]:
     surface = tuple(panel.y.shape)
     field = _Wanted(surface, f"[H, W] = {list(surface)}", complex=True)
-    return {"source": field, "leak": field, "aperture": _Wanted((2,), "[2]", exact=True)}
+    return {"source": field, "leak": field, "reflected": field, "aperture": _Wanted((2,), "[2]", exact=True)}
 
 
 def _pupil(pupil: Pupil) -> dict[str, _Wanted]:

@@ -12,14 +12,13 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from runtime.excess import joined
 from runtime.lightpath.spline_maps import nodes_over, on_other_nodes
 from runtime.program.progress import Progress, no_progress
 from trainer.captures.batches import Batch
 from trainer.effects.free_form import grid_of, on_other_curve_nodes
 from trainer.fitting.free_form_maps import FreeFormBatch, descend
 from trainer.fitting.gauss_newton import fit
-from trainer.fitting.predictor import Predictor
+from trainer.fitting.predictor import Predictor, excess_on
 from trainer.model.model import EffectInstance, Model
 from trainer.prediction.free_stages import FreeFormStage, Tensors
 from trainer.prediction.scene import Stages
@@ -65,13 +64,13 @@ def with_free_form(
         None where coarse nodes do not remove a quarter of the error: the polynomials have not ended.
     """
     report = progress or no_progress
-    best, least = model, _excess(model, stopping)
+    best, least = model, excess_on(model, stopping)
     shapes = _node_shapes(model, name, fitted[0])
     for level, shape in enumerate(shapes):
         report(level / len(shapes))
         trial = _descended(best, name, shape, fitted, stopping)
         trial = fit(trial, trial.names, fitted, iterations=REFIT_ITERATIONS).model
-        excess = _excess(trial, stopping)
+        excess = excess_on(trial, stopping)
         if least - excess < (FIRST_GAIN if level == 0 else FINER_GAIN) * abs(least):
             break
         best, least = trial, excess
@@ -146,8 +145,3 @@ def _stage_of(model: Model, present: EffectInstance) -> FreeFormStage:
     # A step of the optimiser's variables is one of many nodes at once.
     unit = 5 * form.scale * float(np.sqrt(nodes.size))
     return FreeFormStage(stage, {"nodes": (nodes.shape, unit)}, apply, lambda maps: [])
-
-
-def _excess(model: Model, batches: Sequence[Batch]) -> float:
-    with torch.no_grad():
-        return joined([b.errors(Predictor(model, b).predict(model)) for b in batches]).excess

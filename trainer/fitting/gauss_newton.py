@@ -10,24 +10,26 @@ An effect of more than 100 numbers has no such table: its part of each step come
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from runtime.excess import PredictionErrors
+from runtime.excess import PredictionErrors, joined
 from runtime.program.progress import Progress
 from trainer.captures.batches import Batch
 from trainer.effects.definition import STAGES
 from trainer.effects.evidence import Evidence
 from trainer.effects.own_effect import measured_by
-from trainer.fitting.jacobian import keys_of, slopes_of, stepped, weighted_residuals
+from trainer.fitting.jacobian import away_from_absent, keys_of, slopes_of, stepped, weighted_residuals
 from trainer.fitting.least_squares_gain import with_gain
 from trainer.fitting.many_numbers import ManySlopes, has_many
 from trainer.fitting.predictor import Predictor, lights_of
 from trainer.model.model import Model, Values
+
+HOLD = 0.01  # `hold` of fits far from the truth
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,8 @@ def fit(
     iterations: int = 12,
     tolerance: float = 1e-3,
     progress: Progress | None = None,
+    hold: float = 0.0,
+    fixed: Collection[tuple[str, str]] = (),
 ) -> FitResult:
     """Fit the named effects of a model, and the gains, to batches.
 
@@ -71,12 +75,18 @@ def fit(
         Names of the effects to fit; the others keep their values.
     progress : callable, optional
         Called with the share of the iterations that is done.
+    hold : float
+        Each number at the end of its typical range adds this share of the excess to what a step minimises. Far from the
+        truth, shift and tilt, or distance, curvature and magnification, change pictures alike: of numbers that do as
+        well, those nearest to "absent" are found. For tables of derivatives only, as `fixed` is.
+    fixed : collection of (str, str)
+        Effects and those of their parameters that keep their values.
     """
     with torch.no_grad():
         many = tuple(n for n in free if has_many(model.instance(n)))
         if many:
             return _fit_many(model, tuple(free), many, batches, iterations, tolerance, progress)
-        return _fit(model, tuple(free), batches, iterations, tolerance, progress)
+        return _fit(model, tuple(free), batches, iterations, tolerance, progress, hold, fixed)
 
 
 def _fit(
@@ -86,9 +96,13 @@ def _fit(
     iterations: int,
     tolerance: float,
     progress: Progress | None,
+    hold: float,
+    fixed: Collection[tuple[str, str]],
 ) -> FitResult:
     predictors = [Predictor(model, b) for b in batches]
-    keys = keys_of(model, free)
+    keys = tuple(key for key in keys_of(model, free) if key[:2] not in fixed)
+    ranges = _typical_ranges(model, keys)
+    scale = float(joined([b.errors(torch.zeros_like(b.signal)) for b in batches]).variance.sum())
     first = min((model.instance(n).effect.stage for n in free), key=STAGES.index, default="sensor")
     points = [p.trace(model) for p in predictors]
     if not model.gain or any(b.channel not in model.gain for b in batches):
@@ -102,12 +116,18 @@ def _fit(
             progress(iteration / iterations)
         before = errors.excess
         normal, gradient = _normal(slopes), _gradient(slopes, residuals)
+        pull = hold * max(before, 0.0)
+        away = _away(model, keys, ranges)
+        if pull:
+            normal[range(len(keys)), range(len(keys))] += pull * scale / ranges**2
+            gradient[: len(keys)] -= pull * scale * away / ranges
         accepted = False
         for _ in range(6 if fresh else 1):
             trial = _moved(model, keys, channels, _solve(normal, gradient, damping))
             trial_points = [p.trace(trial, first, t) for p, t in zip(predictors, points, strict=True)]
             trial_residuals, trial_errors = weighted_residuals(trial, predictors, trial_points)
-            if trial_errors.excess < before:
+            paid = pull * float((_away(trial, keys, ranges) ** 2 - away**2).sum()) if pull else 0.0
+            if trial_errors.excess + paid < before:
                 accepted = True
                 break
             damping = max(damping, 1e-4) * 8
@@ -204,6 +224,21 @@ def with_measured_values(model: Model, free: Sequence[str], batches: Sequence[Ba
         values = {n: np.full_like(v, read[n]) if n in read else v for n, v in present.values.items()}
         model = model.having(replace(present, values=values))
     return model
+
+
+def _typical_ranges(model: Model, keys: tuple[tuple[str, str, int], ...]) -> np.ndarray:
+    """How far from "absent" each number's typical range reaches."""
+    found = []
+    for name, parameter, _ in keys:
+        p = model.instance(name).effect.parameter(parameter)
+        absent = p.absent_value(model.bench)
+        found.append(20 * p.scale if p.typical is None else max(abs(end - absent) for end in p.typical))
+    return np.array(found)
+
+
+def _away(model: Model, keys: tuple[tuple[str, str, int], ...], ranges: np.ndarray) -> np.ndarray:
+    """How far from "absent" each number is, in units of its typical range."""
+    return np.array([away_from_absent(model, key) for key in keys]) / ranges
 
 
 def _normal(slopes: list[Tensor]) -> np.ndarray:

@@ -40,6 +40,14 @@ def stepped(model: Model, key: tuple[str, str, int], change: float) -> Model:
     return model.having(replace(present, values={**present.values, parameter: values}))
 
 
+def away_from_absent(model: Model, key: tuple[str, str, int]) -> float:
+    """How far one number of one effect is from its value where the effect is not there; physical units."""
+    name, parameter, index = key
+    present = model.instance(name)
+    absent = present.effect.parameter(parameter).absent_value(model.bench)
+    return float(present.values[parameter].reshape(-1)[index]) - absent
+
+
 def column_step(model: Model, key: tuple[str, str, int]) -> float:
     """Step of the secant for one number, towards the inside of its range; physical units."""
     present = model.instance(key[0])

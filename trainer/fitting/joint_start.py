@@ -2,11 +2,12 @@
 
 Speckle that is a pixel off says nothing, and no effect helps alone. What survives smoothing says where the picture is,
 how bright it is from place to place, and where it is bent: so registration, beam, distance, wavefront and response are
-fitted together to pictures that are smoothed less and less.
+fitted together to pictures that are smoothed less and less, and to fewer of them the more each one says.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -16,50 +17,70 @@ from trainer.captures.batches import Batch
 from trainer.effects.effect_catalogue import Catalogue
 from trainer.effects.evidence import Evidence
 from trainer.effects.own_effect import starts_of
-from trainer.fitting.gauss_newton import FitResult, fit
+from trainer.fitting.gauss_newton import HOLD, fit, with_measured_values
 from trainer.fitting.least_squares_gain import with_gain
 from trainer.fitting.predictor import Predictor, lights_of
+from trainer.fitting.refit import least_for_order, raise_orders, telling
 from trainer.fitting.start_points import start_cost
 from trainer.model.model import Model, absent, instance_with
 
 TOGETHER = ("misregistration", "illumination", "panel_wavefront", "distance", "phase_response", "zero_order")
+# Where the panel is bent, only a leak that is flat tells curvature from distance and size. A leak of any shape would
+# take up what the panel's own shape still lacks.
+ORDERS = {"zero_order": 2}
+FIXED = (("zero_order", "leak_wavefront"),)
+AT_LAST = ("laser_drift",)  # while pictures do not fit, a gain for each only takes up what is wrong
 SMOOTHING_PX = (8.0, 4.0, 2.0, 1.0)
-ITERATIONS = 6
+ITERATIONS, TOLERANCE = 6, 0.05
+NUMBERS = 1000  # independent ones that the pictures should hold, smoothed as they are
 
 
 def joint_start(
     model: Model, known: Catalogue, batches: Sequence[Batch], progress: Progress | None = None
-) -> FitResult:
-    """The model with the effects that most benches have, fitted together from coarse to fine.
+) -> Model:
+    """The model with the effects that most benches have, fitted together from coarse to fine, their orders raised.
 
     Parameters
     ----------
     known : Catalogue
-        Effects of TOGETHER that it lacks are left out.
+        Effects of TOGETHER and AT_LAST that it lacks are left out.
     progress : callable, optional
         Called with the share that is done and what is being done.
 
     Returns
     -------
-    FitResult
-        On `batches` as they are.
+    Model
+        Fitted to a few of the captures.
     """
     report = progress or no_progress
     names = [n for n in TOGETHER if n in known and n not in model.names]
+    late = [n for n in AT_LAST if n in known and n not in model.names]
     for name in names:
-        model = model.having(absent(known[name], model.bench))
+        model = model.having(absent(known[name], model.bench, ORDERS.get(name)))
     for k, sigma in enumerate(SMOOTHING_PX):
         report(
             k / (len(SMOOTHING_PX) + 1),
             f"fitting {len(names)} effects together, smoothed by {sigma:g} pixels",
         )
-        coarse = [b.smoothed(sigma) for b in batches]
+        coarse = [_some(model, b, sigma).smoothed(sigma) for b in batches]
         if k == 0:
             for name in names:
                 model = _best_start(model, name, coarse)
-        model = fit(model, model.names, coarse, ITERATIONS, tolerance=1e-2).model
+        model = fit(model, model.names, coarse, ITERATIONS, TOLERANCE, None, HOLD, FIXED).model
     report(len(SMOOTHING_PX) / (len(SMOOTHING_PX) + 1), f"fitting {len(names)} effects together")
-    return fit(model, model.names, batches)
+    few = [_some(model, b, 0.0) for b in batches]
+    fitted = fit(model, model.names, few, ITERATIONS, TOLERANCE, None, HOLD, FIXED)
+    model = raise_orders(fitted, model.names, few, least_for_order, HOLD, FIXED).model
+    for name in late:
+        model = with_measured_values(model.having(absent(known[name], model.bench)), [name], batches)
+    return model
+
+
+def _some(model: Model, batch: Batch, sigma_px: float) -> Batch:
+    """So many of a batch's captures, those of which the model leaves most unexplained, that they say NUMBERS."""
+    spot = max(1.0, 4 * math.pi * sigma_px**2)  # pixels of a Gaussian's square
+    count = math.ceil(NUMBERS * spot / batch.signal[0].numel())
+    return telling(model, batch, count)
 
 
 @torch.no_grad()

@@ -97,3 +97,9 @@ def evaluate_captures(captures: CaptureSet, rows: Sequence[Capture], model: Mode
             batch = load_batch(captures, [row])
             parts.append(batch.errors(Predictor(model, batch).predict(model)))
         return joined(parts)
+
+
+@torch.no_grad()
+def excess_on(model: Model, batches: Sequence[Batch]) -> float:
+    """Excess of a model on batches that are loaded."""
+    return joined([b.errors(Predictor(model, b).predict(model)) for b in batches]).excess

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import torch
 
@@ -22,14 +22,14 @@ SEARCH_SCENES = 3
 LEAST_EXPECTED = (
     0.5  # of the excess that an order must remove: where a straight line expects less, it is not fitted
 )
+# Orders are raised at once where each expects this share of what the one that expects most does: what others expect may
+# be its doing.
+RIVALS = 0.3
 
 
 def settled(model: Model, batches: Sequence[Batch]) -> FitResult:
     """The model with all of its effects fitted together, and their orders raised as far as that helps."""
-    fitted = fit(model, model.names, batches)
-    for name in model.names:
-        fitted = raise_order(fitted, name, batches, least_for_order, model.names)
-    return fitted
+    return raise_orders(fit(model, model.names, batches), model.names, batches, least_for_order)
 
 
 def fit_from(
@@ -39,7 +39,7 @@ def fit_from(
     if start.effect.rugged:
         with torch.no_grad():
             few = [
-                _telling(model, b, max(1, SEARCH_PIXELS // b.signal[0].numel()))
+                telling(model, b, max(1, SEARCH_PIXELS // b.signal[0].numel()))
                 for b in batches[:SEARCH_SCENES]
             ]
             predictors = [Predictor(model.having(start), b) for b in few]
@@ -61,77 +61,108 @@ def next_order(present: EffectInstance) -> int | None:
     return None if not higher or ended or present.nodes is not None else higher[0]
 
 
-def raise_order(
+def raise_orders(
     fitted: FitResult,
-    name: str,
+    names: Sequence[str],
     batches: Sequence[Batch],
     gain_needed: Callable[[float], float],
-    free: Sequence[str] | None = None,
+    hold: float = 0.0,
+    fixed: Collection[tuple[str, str]] = (),
 ) -> FitResult:
-    """Raise the order of an effect's map or curve while the error keeps falling.
+    """Raise the orders of effects' maps or curves, of all that pay at once, while the error keeps falling.
 
     A map that can go on in free form is raised to order POLYNOMIALS only: beyond it splines cost less.
 
     Parameters
     ----------
     fitted : FitResult
-        Of a model with the effect.
+        Of a model with the effects.
+    names : sequence of str
+        The effects; the others keep their values.
     gain_needed : callable
         How much excess a higher order must remove to be kept, from the excess that there is.
-    free : sequence of str, optional
-        Effects that are refitted too; the effect alone by default.
+    hold, fixed
+        As for `fit`; effects with a fixed parameter keep their orders.
     """
+    rising = [n for n in names if n not in {name for name, _ in fixed}]
     while True:
-        present = fitted.model.instance(name)
-        higher = next_order(present)
-        if higher is None:
-            return fitted
-        trial = fitted.model.having(raised(present, fitted.model.bench, higher))
         needed = gain_needed(fitted.errors.excess)
-        if _expected_gain(trial, present, free or [name], batches) < LEAST_EXPECTED * needed:
+        trial = _with_orders_that_pay(fitted.model, names, rising, batches, LEAST_EXPECTED * needed)
+        if trial is None:
             return fitted
-        better = fit(trial, free or [name], batches, iterations=8)
+        better = fit(trial, names, batches, iterations=8, hold=hold, fixed=fixed)
         if fitted.errors.excess - better.errors.excess < needed:
             return fitted
         fitted = better
 
 
 @torch.no_grad()
-def _expected_gain(
-    trial: Model, lower: EffectInstance, free: Sequence[str], batches: Sequence[Batch]
-) -> float:
-    """Excess that a straight-line step of an effect's new terms removes, on the most telling capture of each batch.
+def _with_orders_that_pay(
+    model: Model, names: Sequence[str], rising: Sequence[str], batches: Sequence[Batch], least: float
+) -> Model | None:
+    """The model with the next orders, absent, of those effects that a straight-line step expects so much excess of.
+
+    The step is that of all new terms and everything that is fitted, on the most telling capture of each batch. Of
+    effects whose terms expect the same, the one that expects most is taken, and beside it those that expect about as
+    much of what is left.
 
     Parameters
     ----------
-    trial : Model
-        With the effect at a higher order, its new terms absent.
-    lower : EffectInstance
-        The effect at the order before.
+    names, rising : sequence of str
+        Of the effects that are fitted, and of those whose orders may be raised.
+    least : float
+        Excess that an effect's next order must be expected to remove, beside those that are taken already.
+
+    Returns
+    -------
+    Model or None
+        None where no order pays.
     """
-    few = [_telling(trial, b, 1) for b in batches]
-    predictors = [Predictor(trial, b) for b in few]
-    points = [p.trace(trial) for p in predictors]
-    keys = keys_of(trial, [n for n in free if not has_many(trial.instance(n))])
-    residual, slopes = stacked(trial, keys, predictors, points)
-    known = [not _is_new(key, trial, lower) for key in keys] + [True] * (len(slopes) - len(keys))
-    removed = remaining(residual, slopes[known]) - remaining(residual, slopes)
-    return removed / float(joined([b.errors(torch.zeros_like(b.signal)) for b in few]).variance.sum())
+    higher = {name: next_order(model.instance(name)) for name in rising}
+    trials = {n: raised(model.instance(n), model.bench, o) for n, o in higher.items() if o is not None}
+    if not trials:
+        return None
+    every = model
+    for one in trials.values():
+        every = every.having(one)
+    few = [telling(model, b, 1) for b in batches]
+    predictors = [Predictor(every, b) for b in few]
+    points = [p.trace(every) for p in predictors]
+    keys = keys_of(every, [n for n in names if not has_many(every.instance(n))])
+    residual, slopes = stacked(every, keys, predictors, points)
+    new = [key[0] if _is_new(key, every, model) else "" for key in keys]
+    new += [""] * (len(slopes) - len(keys))
+    scale = float(joined([b.errors(torch.zeros_like(b.signal)) for b in few]).variance.sum())
+
+    def left(taken: Sequence[str]) -> float:
+        return remaining(residual, slopes[[not one or one in taken for one in new]]) / scale
+
+    taken: list[str] = []
+    before = left(taken)
+    while rest := [n for n in trials if n not in taken]:
+        after = {n: left([*taken, n]) for n in rest}
+        best = min(rest, key=lambda n: after[n])
+        if before - after[best] < least:
+            break
+        least = max(least, RIVALS * (before - after[best]))
+        taken.append(best)
+        before = after[best]
+    for name in taken:
+        model = model.having(trials[name])
+    return model if taken else None
 
 
-def _telling(model: Model, batch: Batch, count: int) -> Batch:
+def telling(model: Model, batch: Batch, count: int) -> Batch:
     """The captures of a batch of which a model leaves most unexplained, in counts, in their order."""
     left = (batch.mask * (batch.signal - Predictor(model, batch).predict(model)) ** 2).sum((1, 2))
     return batch.only(sorted(left.argsort(descending=True)[:count].tolist()))
 
 
-def _is_new(key: tuple[str, str, int], trial: Model, lower: EffectInstance) -> bool:
-    """Whether a number is one that the effect did not have at the lower order."""
+def _is_new(key: tuple[str, str, int], trial: Model, lower: Model) -> bool:
+    """Whether a number is one that its effect did not have at the lower order."""
     name, parameter, index = key
-    if name != lower.effect.name:
-        return False
-    p = lower.effect.parameter(parameter)
+    p = trial.instance(name).effect.parameter(parameter)
     rows = (len(trial.bench.channels) if p.per_channel else 1) * p.blocks
-    before = lower.values[parameter].size // rows
+    before = lower.instance(name).values[parameter].size // rows
     now = trial.instance(name).values[parameter].size // rows
-    return index % now >= before
+    return index % now >= before if now else False

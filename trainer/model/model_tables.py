@@ -169,7 +169,11 @@ def _effect(
     errors: dict[str, np.ndarray] = {}
     for p in effect.parameters:
         where = f"{name}.{p.name}"
-        table = table_at(given.get(p.name), where)
+        if p.name not in given:  # the effect had no such parameter when the file was written
+            values[p.name] = np.full(p.shape(order, bench), p.absent_value(bench))
+            errors[p.name] = np.zeros(p.shape(order, bench))
+            continue
+        table = table_at(given[p.name], where)
         only_keys(table, ("value", "error", "unit"), f"{where}.")
         if table.get("unit") != p.unit:
             raise InputError(
@@ -182,7 +186,8 @@ def _effect(
     for key in (MAP, CURVE):
         if key in row:
             nodes = _nodes(row[key], key, effect, bench, arrays)
-    return EffectInstance(effect, order, values, errors or None, nodes)
+    fitted = any("error" in given[name] for name in given)
+    return EffectInstance(effect, order, values, errors if fitted else None, nodes)
 
 
 def _nodes(given: Any, key: str, effect: Effect, bench: Bench, arrays: Arrays) -> np.ndarray:

@@ -59,7 +59,7 @@ def light_path(scene: Scene, stages: Stages) -> LightPath:
         weights=weights,
         gain=stages.drive.gain,
         crosstalk=stages.drive.crosstalk,
-        leak=stages.panel.leak,
+        leak=stages.panel.unmodulated,
         aperture=(stages.panel.aperture[0], stages.panel.aperture[1]),
         irradiance_filter=display_filter(stages),
         far_field=_far_field(scene, stages.pupil) if scene.method == "fraunhofer" else None,

@@ -98,6 +98,8 @@ class Panel:
         The field that no pattern modulates.
     aperture : Tensor [2]
         Sides of a pixel's active area, share of the pitch.
+    reflected : complex Tensor [H, W] or None
+        A further field that no pattern modulates, and that has none of the panel's wavefront.
     copies : tuple of (complex Tensor, Tensor, Tensor)
         Further fields beside the panel's own: amplitude against it, and displacement along rows and columns in panel
         pixels.
@@ -112,6 +114,7 @@ class Panel:
     source: Tensor
     leak: Tensor | None
     aperture: Tensor
+    reflected: Tensor | None = None
     copies: tuple[tuple[Tensor, Tensor, Tensor], ...] = ()
 
     def copied(self, amplitude: Tensor, dy: Tensor, dx: Tensor) -> Panel:
@@ -121,11 +124,23 @@ class Panel:
     def multiplied(self, factor: Tensor) -> Panel:
         """The panel with the modulated and the unmodulated light multiplied by a map [H, W], real or complex."""
         leak = None if self.leak is None else self.leak * factor
-        return replace(self, source=self.source * factor, leak=leak)
+        reflected = None if self.reflected is None else self.reflected * factor.abs()
+        return replace(self, source=self.source * factor, leak=leak, reflected=reflected)
 
     def leaking(self, field: Tensor) -> Panel:
         """The panel with a field [H, W] added that the pattern does not modulate."""
         return replace(self, leak=field if self.leak is None else self.leak + field)
+
+    def reflecting(self, field: Tensor) -> Panel:
+        """The panel with a field [H, W] added that the pattern does not modulate and that no wavefront delays."""
+        return replace(self, reflected=field if self.reflected is None else self.reflected + field)
+
+    @property
+    def unmodulated(self) -> Tensor | None:
+        """All the light that the pattern does not modulate, [H, W]."""
+        if self.leak is None or self.reflected is None:
+            return self.reflected if self.leak is None else self.leak
+        return self.leak + self.reflected
 
 
 @dataclass(frozen=True)
