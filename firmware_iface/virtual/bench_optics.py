@@ -193,21 +193,23 @@ class BenchOptics:
         if drive.smears:
             return _turn(drive.spread(phase) * np.float32(colour))
         turned = _turn(np.float32(drive.sign * colour) * phase)
-        return np.repeat(np.repeat(turned, drive.q, 0), drive.q, 1)
+        return np.repeat(np.repeat(turned, drive.q, 1), drive.q, 0)
 
     def turned(
-        self, gray: NDArray[np.generic], before: NDArray[np.float64] | None
+        self, gray: NDArray[np.generic], before: NDArray[np.float64] | None, times: int = 1
     ) -> NDArray[np.float64] | None:
-        """How far the panel has turned after one more capture, for the next one; None where it is not slow.
+        """How far the panel has turned after some more captures, for the next one; None where it is not slow.
 
         Parameters
         ----------
         gray : array [H, W]
         before : float64 array [H, W], optional
             What this returned for the capture before.
+        times : int
+            How many.
         """
         drive = self.drive(self.bench.channels[0].name)  # a share of one wave is the same in all colours
-        return drive.turned(np.asarray(gray, np.float64), before) if drive.slow else None
+        return drive.turned(np.asarray(gray, np.float64), before, times) if drive.slow else None
 
     def irradiance(
         self,

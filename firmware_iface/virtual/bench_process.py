@@ -16,11 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.errors import DeviceError, InputError
+from firmware_iface.panel.panel import Gray
 from firmware_iface.virtual.bench_description import BenchDescription
 from firmware_iface.virtual.virtual_devices import LitField
 from firmware_iface.virtual.virtual_headset import VirtualHeadset
 
-Expose = Callable[[Sequence[LitField], Mapping[str, float], float], NDArray[np.uint16]]
+Shown = Sequence[tuple[Gray, int]]  # patterns, and for how many periods each was shown
+Expose = Callable[[Sequence[LitField], Mapping[str, float], float, Shown], NDArray[np.uint16]]
 
 
 def bench_process(description: BenchDescription, seed: int) -> Expose:
@@ -35,9 +37,9 @@ def bench_process(description: BenchDescription, seed: int) -> Expose:
     Returns
     -------
     callable
-        From what the panel shows in turn, each laser's power (fraction of full) and an exposure (ms) to the camera's
-        picture, uint16 counts [h, w]. For one thread at a time. It raises InputError as `VirtualCamera` does, and
-        DeviceError where the process has ended.
+        From what the panel shows in turn, each laser's power (fraction of full), an exposure (ms) and what the panel
+        showed before (`VirtualHeadset.has_shown`) to the camera's picture, uint16 counts [h, w]. For one thread at a
+        time. It raises InputError as `VirtualCamera` does, and DeviceError where the process has ended.
     """
     context = multiprocessing.get_context("spawn")  # the caller has threads
     ours, theirs = context.Pipe()
@@ -45,10 +47,10 @@ def bench_process(description: BenchDescription, seed: int) -> Expose:
     theirs.close()
 
     def expose(
-        fields: Sequence[LitField], power: Mapping[str, float], exposure_ms: float
+        fields: Sequence[LitField], power: Mapping[str, float], exposure_ms: float, before: Shown
     ) -> NDArray[np.uint16]:
         try:
-            ours.send((tuple(fields), dict(power), exposure_ms))
+            ours.send((tuple(fields), dict(power), exposure_ms, tuple(before)))
             picture = ours.recv()
         except (EOFError, OSError):
             raise DeviceError(
@@ -68,8 +70,9 @@ def _serve(pipe: Connection, description: BenchDescription, seed: int) -> None:
     headset = VirtualHeadset(description, seed)
     with suppress(EOFError, OSError):
         while True:
-            fields, power, exposure_ms = pipe.recv()
+            fields, power, exposure_ms, before = pipe.recv()
             try:
+                headset.has_shown(before)
                 headset.panel.fields = fields
                 for channel, fraction in power.items():
                     headset.lasers.set_power(channel, fraction)

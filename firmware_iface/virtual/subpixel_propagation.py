@@ -7,6 +7,10 @@ The transfer is the exact angular spectrum (Goodman, Introduction to Fourier Opt
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,14 +31,35 @@ def smooth_size(least: int) -> int:
         n += 2
 
 
-def _fft(a: Complex, n: int | None = None, axis: int = -1) -> Complex:
-    """sum a exp(-2 pi j ...), in single precision."""
-    return np.fft.fft(a, n=n, axis=axis).astype(np.complex64, copy=False)
+def _fft(rows: Complex, n: int | None = None) -> Complex:
+    """sum a exp(-2 pi j ...) along each row, with zeros up to n, in single precision."""
+    return np.fft.fft(rows, n=n).astype(np.complex64, copy=False)
 
 
-def _sum(a: Complex, axis: int = -1) -> Complex:
-    """sum a exp(+2 pi j ...) without a factor, in single precision."""
-    return np.fft.ifft(a, axis=axis, norm="forward").astype(np.complex64, copy=False)
+def _sum(rows: Complex, bins: NDArray[np.integer], n: int) -> Complex:
+    """sum a exp(+2 pi j ...) without a factor along each row, of values at some of n frequencies."""
+    work = np.zeros((len(rows), n), np.complex64)
+    work[:, bins] = rows
+    return np.fft.ifft(work, norm="forward").astype(np.complex64, copy=False)
+
+
+def _in_blocks(transform: Callable[[Complex], Complex], rows: Complex, width: int) -> Complex:
+    """The transform of each row, `width` long: some rows at a time, and of a large array on all cores.
+
+    So what it needs on the way stays small, which spares most of the time that fresh memory takes.
+    """
+    out = np.empty((len(rows), width), np.complex64)
+    step = max(1, 2**19 // rows.shape[1])
+
+    def fill(k: int) -> None:
+        out[k : k + step] = transform(np.ascontiguousarray(rows[k : k + step]))
+
+    if len(rows) <= step:
+        fill(0)
+    else:
+        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+            list(pool.map(fill, range(0, len(rows), step)))
+    return out
 
 
 class Band:
@@ -78,35 +103,32 @@ class Band:
 
     def spectrum(self, field: Complex) -> Complex:
         """Spectrum in the band, [Fy, Fx], of a field on sub-pixels, [qH, qW]."""
-        rows = _fft(field, n=self.q * self.padded[1], axis=1)[:, self._in_x] * self._env_x
-        columns = _fft(np.ascontiguousarray(rows.T), n=self.q * self.padded[0], axis=1)
-        return (columns[:, self._in_y] * self._env_y).T
+        ny, nx = (self.q * n for n in self.padded)
+        rows = _in_blocks(lambda block: _fft(block, nx)[:, self._in_x] * self._env_x, field, len(self.fx))
+        columns = _in_blocks(lambda block: _fft(block, ny)[:, self._in_y] * self._env_y, rows.T, len(self.fy))
+        return columns.T
 
     def spectrum_adjoint(self, spectrum: Complex) -> Complex:
         """Adjoint of `spectrum`: [Fy, Fx] to [qH, qW]."""
         ny, nx = (self.q * n for n in self.padded)
-        work = np.zeros((len(self.fx), ny), np.complex64)
-        work[:, self._in_y] = spectrum.T * self._env_y.conj()
-        columns = _sum(work, axis=1)[:, : self.q * self.shape[0]]
-        work = np.zeros((self.q * self.shape[0], nx), np.complex64)
-        work[:, self._in_x] = columns.T * self._env_x.conj()
-        return _sum(work, axis=1)[:, : self.q * self.shape[1]]
+        height, width = (self.q * n for n in self.shape)
+        env_y, env_x = self._env_y.conj(), self._env_x.conj()
+        columns = _in_blocks(
+            lambda block: _sum(block * env_y, self._in_y, ny)[:, :height], spectrum.T, height
+        )
+        return _in_blocks(lambda block: _sum(block * env_x, self._in_x, nx)[:, :width], columns.T, width)
 
     def field(self, spectrum: Complex) -> Complex:
         """Field samples [sY, sX] of a spectrum in the band; sample s i lies on pixel i's centre."""
         ny, nx = self.samples
-        work = np.zeros((len(self.fx), ny), np.complex64)
-        work[:, self._out_y] = spectrum.T
-        columns = _sum(work, axis=1)
-        work = np.zeros((ny, nx), np.complex64)
-        work[:, self._out_x] = columns.T
         scale = np.float32(1 / (self.padded[0] * self.padded[1]))
-        return _sum(work, axis=1) * scale
+        columns = _in_blocks(lambda block: _sum(block * scale, self._out_y, ny), spectrum.T, ny)
+        return _in_blocks(lambda block: _sum(block, self._out_x, nx), columns.T, nx)
 
     def field_adjoint(self, field: Complex) -> Complex:
         """Adjoint of `field`: [sY, sX] to [Fy, Fx]."""
-        rows = _fft(field, axis=1)[:, self._out_x]
-        columns = _fft(np.ascontiguousarray(rows.T), axis=1)[:, self._out_y]
+        rows = _in_blocks(lambda block: _fft(block)[:, self._out_x], field, len(self.fx))
+        columns = _in_blocks(lambda block: _fft(block)[:, self._out_y], rows.T, len(self.fy))
         scale = np.float32(1 / (self.padded[0] * self.padded[1]))
         return columns.T * scale
 

@@ -52,6 +52,17 @@ def irfft2(x: Array, shape: tuple[int, int]) -> Array:
     return array_namespace(x).fft.irfftn(x, s=shape, axes=(-2, -1))
 
 
+def irfft(x: Array, n: int) -> Array:
+    """Inverse DFT of half a spectrum along the last axis, zero-padded at its end, to `n` real samples, divided by n."""
+    host = _on_host(x)
+    if host is not None:
+        whole = np.zeros((*host.shape[:-1], n // 2 + 1), host.dtype)
+        whole[..., : host.shape[-1]] = host
+        back = _ducc.c2r(whole, lastsize=n, axes=(-1,), forward=False, inorm=2, nthreads=_threads(x))
+        return _as(x, back)
+    return array_namespace(x).fft.irfft(x, n=n, axis=-1)
+
+
 def has_ducc() -> bool:
     """Whether ducc0 is installed; SciPy does its work otherwise."""
     return _ducc is not None

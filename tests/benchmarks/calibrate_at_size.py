@@ -86,7 +86,7 @@ class TimedPictures:
         begun = time.perf_counter()
         self.first_s = self.first_s or begun
         power = {c: self._lasers.power(c) for c in self._lasers.channels}
-        counts = self._expose(self._panel.fields, power, self.camera.exposure_ms)
+        counts = self._expose(self._panel.fields, power, self.camera.exposure_ms, ())
         self.waited_s += time.perf_counter() - begun
         return counts
 

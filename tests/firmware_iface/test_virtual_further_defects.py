@@ -152,6 +152,23 @@ def test_what_a_slow_panel_shows_depends_on_its_history_and_forgets_it():
     np.testing.assert_allclose(pictures[0][8], settled, rtol=5e-3, atol=10)
 
 
+def test_a_slow_panel_can_be_told_what_it_showed_and_for_how_long():
+    told, taken = (quiet(make_defect("slow_response", share=0.3)) for _ in range(2))
+    history = [(random_gray(k), periods) for k, periods in ((1, 30), (2, 1), (3, 2))]
+    for gray, periods in history:
+        taken.panel.show(gray)
+        for _ in range(periods):
+            taken.camera.capture()
+    told.has_shown(history)
+    seen = []
+    for headset in (told, taken):
+        headset.panel.show(random_gray(4))
+        seen.append(headset.camera.capture().astype(float))
+    assert np.abs(seen[0] - seen[1]).mean() < 1e-3 * seen[0].mean()
+    told.has_shown([(random_gray(4), 1)])
+    assert np.abs(told.camera.capture() - seen[0]).mean() > 0.05 * seen[0].mean()
+
+
 def test_ripple_is_the_mean_of_five_gains():
     gray = random_gray(6)
     seen = VirtualHeadset(small(make_defect("phase_ripple"))).true_irradiance(gray, "green")
