@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from runtime.lightpath.light_path import LightPath
+from runtime.solver.block_motion import Part, follow
 from runtime.solver.double_phase import BOARDS, Start
 from runtime.solver.drive_range import DriveRange
 from runtime.solver.initialiser import Initialiser
@@ -36,6 +37,8 @@ class FirstPhases:
         Of the patterns, a colour's after one another.
     initialiser : bytes or None
         A network in ONNX from a target's amplitude to a first phase.
+    edges_count : bool
+        Whether the picture counts to its very edge.
 
     Raises
     ------
@@ -46,6 +49,8 @@ class FirstPhases:
     ----------
     fits : bool
         Whether the last start was made for the picture that the solver has solved last.
+    aligned : bool
+        Whether the pattern stands on the same chequerboard as that start.
     """
 
     def __init__(
@@ -54,21 +59,24 @@ class FirstPhases:
         stacks: Sequence[Sequence[LightPath]],
         drives: Sequence[DriveRange],
         initialiser: bytes | None,
+        edges_count: bool = True,
     ) -> None:
+        self.edges_count = edges_count
         self.backend, self.shape = objective.backend, objective.shape[1:]
         self.frames, self.drives = objective.frames, drives[:: objective.frames]
+        self.initialiser = None if initialiser is None else Initialiser(initialiser, self.shape)
+        begins = self.initialiser is None or self.initialiser.corrects
         self.starts = [
-            Start(objective, stack[0], c, drive.gapless and initialiser is None)
+            Start(objective, stack[0], c, drive.gapless and begins)
             for c, (stack, drive) in enumerate(zip(stacks, self.drives, strict=True))
         ]
         self.noise: np.ndarray | None = None
         if self.frames > 1:
             noise = np.random.default_rng(0).normal(scale=NOISE, size=self.shape)
             self.noise = noise.astype(stacks[0][0].response.dtype)
-        self.initialiser = None if initialiser is None else Initialiser(initialiser, self.shape)
         self.amplitude = np.zeros(self.shape, stacks[0][0].response.dtype)
         self.made = objective.backend.xp.zeros(objective.shape, stacks[0][0].response.dtype)
-        self.fits = False
+        self.fits, self.aligned = False, True
 
     def cold(self, targets: np.ndarray, phases: Array, soon: bool = False) -> None:
         """Fill `phases` (rad), a pattern each, from targets [C, K, H, W] alone, not from the picture before.
@@ -77,9 +85,9 @@ class FirstPhases:
         """
         self._make(targets, phases, soon)
         self.made[...] = phases
-        self.fits = (
-            soon or self.frames == 1
-        )  # several patterns of a video are made `soon`, others are no like of them
+        self.aligned = True
+        # several patterns of a video are made `soon`, and others are not like them
+        self.fits = soon or self.frames == 1
 
     def _make(self, targets: np.ndarray, phases: Array, soon: bool) -> None:
         for c, (drive, start) in enumerate(zip(self.drives, self.starts, strict=True)):
@@ -89,13 +97,16 @@ class FirstPhases:
             )
             np.sqrt(self.amplitude, out=self.amplitude)
             alike: Sequence[Array] = ()
-            if self.initialiser is not None:
-                phase[...] = self.backend.xp.asarray(self.initialiser.phase(self.amplitude))
-            elif drive.gapless:
-                alike = others[: BOARDS - 1] if soon else ()
-                start.double_phase(self.amplitude, phase, alike)
-            else:
-                start.flat_phase(self.amplitude, phase)
+            network = self.initialiser
+            if network is None or network.corrects:
+                if drive.gapless:
+                    alike = others[: BOARDS - 1] if soon and network is None else ()
+                    start.double_phase(self.amplitude, phase, alike)
+                else:
+                    start.flat_phase(self.amplitude, phase)
+            if network is not None:
+                found = network.phase(self.amplitude, self.backend.to_host(phase))
+                phase[...] = self.backend.xp.asarray(found)
             if drive.bounded:
                 for one in (phase, *alike):
                     one[...] = self.backend.xp.asarray(drive.held(self.backend.to_host(one)))
@@ -115,6 +126,7 @@ class FirstPhases:
         self,
         before: Array,
         motion: tuple[int, int],
+        parts: Sequence[Part],
         targets: np.ndarray,
         phases: Array,
         room: Array,
@@ -122,15 +134,22 @@ class FirstPhases:
     ) -> None:
         """Fill `phases` with those of the frame before, moved as its content has moved.
 
-        Where content comes in and along the edges, the pattern stays where it is and changes as its start does from
-        frame to frame: so it keeps what the descent has found there, most of all against the panel's end.
+        A pattern is a start, double phase, and what the descent has found since. Double phase stands on a chequerboard.
+        Moved by an even number of pixels it stays on it: then what was found moves to the new frame's start. Along the
+        edges it stays in its place, as it compensates for the panel's end. Moved by an odd number, or where the edges
+        do not count, the pattern itself moves, with its chequerboard, except along the edges.
+
+        Patterns on different chequerboards do not go together. So parts that move by themselves follow only by even
+        numbers and begin anew otherwise, and where the whole is off the chequerboard, all begins anew.
 
         Parameters
         ----------
         before : float array [C N, H, W], rad
             Phases of the frame before.
         motion : (int, int), pixels
-            Down, right.
+            Of the whole: down, right.
+        parts : sequence of Part
+            What moves otherwise, and what is new.
         targets : array [C, K, H, W]
             Of this frame: where content comes in, the start is cold.
         phases, room : float array [C N, H, W], rad
@@ -138,18 +157,32 @@ class FirstPhases:
         still : bool
             Whether this frame is the same picture as the one before.
         """
-        shifted(before, motion, phases)
-        if not any(motion):
+        if not any(motion) and not parts:
+            phases[...] = before
             self.fits = self.fits and still
             return
+        even = sum(motion) % 2 == 0
         self._make(targets, room, soon=True)
-        for n, (phase, fresh) in enumerate(zip(phases, room, strict=True)):
+        self.made *= -1
+        self.made += before  # what the descent has found since the start
+        for n, (phase, fresh, found) in enumerate(zip(phases, room, self.made, strict=True)):
             drive, edges = self.drives[n // self.frames], self.starts[n // self.frames].edges
+            adds = self.fits and not drive.bounded  # the sum may lie out of a bounded panel's range
+            if parts and not (adds and even and self.aligned):
+                phase[...] = fresh
+                continue
+            if adds and even and (parts or self.edges_count):
+                shifted(found, motion, phase)
+                phase += fresh
+            else:
+                shifted(before[n], motion, phase)
+            for one in parts:
+                follow(phase, found, fresh, one)
             near = all(2 * abs(step) <= edge for step, edge in zip(motion, edges, strict=True))
-            for part in renewed(motion, edges, self.shape):
+            for part in renewed(motion, edges, self.shape) if any(motion) else ():
                 phase[part] = fresh[part]
-                if self.fits and near and not drive.bounded:  # the sum may lie out of a bounded panel's range
-                    phase[part] += before[n][part]
-                    phase[part] -= self.made[n][part]
+                if adds and near:
+                    phase[part] += found[part]
+        self.aligned = bool(parts) or self.aligned == even
         self.made[...] = room
         self.fits = True
