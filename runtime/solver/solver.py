@@ -24,6 +24,7 @@ from firmware_iface.errors import InputError, nearest
 from runtime.lightpath.light_path import LightPath
 from runtime.networks.onnx_approximator import Approximator, predistorted
 from runtime.solver.array_backend import Backend, backend
+from runtime.solver.block_motion import Part, block_motions
 from runtime.solver.deadline import Deadline, Pace, check_deadline
 from runtime.solver.drive_range import DriveRange
 from runtime.solver.first_phases import FirstPhases
@@ -132,7 +133,7 @@ class Solver:
         if stages:
             on, objective = self.on, self.objective
             objective.rounding = SoftLevels(self.drives, objective.shape, objective.strip, on, stages)
-        self.first = FirstPhases(self.objective, self.stacks, self.drives, initialiser)
+        self.first = FirstPhases(self.objective, self.stacks, self.drives, initialiser, self.region is None)
         made = METHODS[method]
         self.method: Method | None = made(self.objective, self.drives, **options) if made else None
         if method == "gerchberg_saxton" and (penalty != "amplitude" or in_the_loop):
@@ -212,18 +213,23 @@ class Solver:
         target, iterations, deadline_ms
             As in `solve`.
         motion : (int, int) or None, pixels
-            How far content has moved since: down, right. None: found from the frames.
+            How far content has moved since as a whole: down, right. None: found from the frames. What moves by itself
+            is found.
         """
         targets, begun = self._begun(target, iterations, deadline_ms)
         picture = targets[0, 0]
-        if self.follows and motion is None:
-            motion = motion_between(self.before, picture)
+        parts: list[Part] = []
+        if self.follows:
+            whole = motion_between(self.before, picture) if motion is None else motion
+            motion, parts = block_motions(self.before, picture, whole)
         optics_targets = self._aim(targets)
         if self.follows and motion is not None and not is_cut(self.before, picture, motion):
             first = next(k for k, phase in enumerate(self.phases) if phase is not self.best)
             self.phases[0], self.phases[first] = self.phases[first], self.phases[0]
             room = next(phase for phase in self.phases[1:] if phase is not self.best)
-            self.first.warm(self.best, motion, optics_targets, self.phases[0], room, self._is_still(targets))
+            self.first.warm(
+                self.best, motion, parts, optics_targets, self.phases[0], room, self._is_still(targets)
+            )
         else:
             self.first.cold(optics_targets, self.phases[0], soon=True)
         return self._improve(targets, begun, iterations, deadline_ms, None)
@@ -281,9 +287,8 @@ class Solver:
         expected = max(history)
         if rounding is not None:
             loss, expected = self._rounded(self.best)
-            if (
-                loss > at_first[0]
-            ):  # a descent that is cut short, or goes on for long, can end below its start
+            # a descent that is cut short, or goes on for long, can end below its start
+            if loss > at_first[0]:
                 self.best[...], expected = self.begun_from, at_first[1]
         self.grays.reverse()
         for drive, phase, gray in zip(self.drives, self.best, self.grays[0], strict=True):

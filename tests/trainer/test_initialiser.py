@@ -38,7 +38,33 @@ def test_the_command_writes_a_bundle_whose_solver_begins_with_the_network(
     assert new.provenance == read_bundle(old).provenance
     path, target = load_light_path(new), scene(SHAPE)
     begun = Solver(path, initialiser=new.networks[INITIALISER]).solve(target, 0).phase
-    assert np.abs(np.exp(1j * begun) - np.exp(1j * Solver(path).solve(target, 0).phase)).mean() > 0.05
+    assert np.abs(np.exp(1j * begun) - np.exp(1j * Solver(path).solve(target, 0).phase)).mean() > 0.001
+
+
+def test_an_untaught_network_begins_as_double_phase_does() -> None:
+    path, target = ideal_path(SHAPE, 6e-3, 0.5, np.float32), scene(SHAPE)
+    untaught = initialiser_onnx(InitialiserNetwork(), SHAPE)
+    begun = Solver(path, initialiser=untaught).solve(target, 0).phase
+    plain = Solver(path).solve(target, 0).phase
+    np.testing.assert_allclose(np.exp(1j * begun), np.exp(1j * plain), atol=1e-4)
+
+
+def test_it_corrects_double_phase_behind_an_iris_that_is_half_open() -> None:
+    """Taught on some scenes, it is ahead of double phase on another, at the start and after an iteration."""
+    torch.manual_seed(2)
+    path = ideal_path(SHAPE, 6e-3, 0.5, np.float32)
+    solver, solved = Solver(path), []
+    for seed in range(12):
+        target = scene(SHAPE, seed)
+        amplitude = torch.tensor(np.sqrt(target / target.mean()), dtype=torch.float32)
+        phases = [torch.tensor(solver.solve(target, k).phase.copy()) for k in (0, 20)]
+        solved.append((amplitude, *phases))
+    network = InitialiserNetwork()
+    _fit(network, solved, 150, lambda done: None)
+    target = scene(SHAPE, 20)
+    taught = Solver(path, initialiser=initialiser_onnx(network, SHAPE)).solve(target, 1).psnr_db
+    plain = Solver(path).solve(target, 1).psnr_db
+    assert taught[0] > plain[0] + 0.3 and taught[1] > plain[1] + 0.1
 
 
 def test_onnx_says_what_torch_says() -> None:
@@ -47,30 +73,11 @@ def test_onnx_says_what_torch_says() -> None:
     network = InitialiserNetwork()
     for weight in network.parameters():
         torch.nn.init.normal_(weight, 0, 0.05)
-    amplitude = torch.rand(1, 1, *SHAPE) * 2
+    amplitude, start = torch.rand(2, 1, 1, *SHAPE) * 2
     session = onnxruntime.InferenceSession(initialiser_onnx(network, SHAPE))
-    (phase,) = session.run(["phase"], {"target": amplitude.numpy()})
+    (phase,) = session.run(["phase"], {"target": amplitude.numpy(), "start": start.numpy()})
     with torch.no_grad():
-        np.testing.assert_allclose(phase, network(amplitude).numpy(), atol=1e-4)
-
-
-def test_it_learns_a_phase_that_the_amplitude_determines() -> None:
-    """A made-up solver whose phase is the amplitude itself: after some steps the network knows it."""
-    torch.manual_seed(1)
-    network = InitialiserNetwork()
-    amplitude = torch.tensor(np.sqrt(scene(SHAPE) / scene(SHAPE).mean()), dtype=torch.float32)
-    with torch.no_grad():
-        cosine, sine = network(amplitude[None, None])[0]
-    wanted = torch.atan2(sine, cosine) + 0.7
-
-    def error() -> float:
-        with torch.no_grad():
-            c, s = network(amplitude[None, None])[0]
-            return float(1 - (c * torch.cos(wanted) + s * torch.sin(wanted)).mean())
-
-    before = error()
-    _fit(network, [(amplitude, wanted)], 40, lambda done: None)
-    assert error() < 0.2 * before
+        np.testing.assert_allclose(phase, network(amplitude, start).numpy(), atol=1e-4)
 
 
 @pytest.mark.parametrize(
