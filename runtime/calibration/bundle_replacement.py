@@ -24,7 +24,8 @@ def replace_bundle(folder: Path, bundle: Bundle, found: Calibration) -> Path:
     """Write a bundle whose light paths have the calibration's drift applied, at every colour and plane.
 
     The folder holds the old bundle or the new one at every moment. The old one is kept next to it, in place of one kept
-    before. The camera's view goes into the description, and the calibration's numbers are added to the provenance.
+    before. The camera's view goes into the description, and the calibration's numbers are added to the provenance. The
+    network D goes along as the calibration has decided.
 
     Parameters
     ----------
@@ -56,7 +57,7 @@ def replace_bundle(folder: Path, bundle: Bundle, found: Calibration) -> Path:
         arrays,
         {**bundle.description, "paths": records, "camera": camera},
         provenance,
-        networks=bundle.networks,
+        networks=found.network.networks(bundle.networks) if found.network else bundle.networks,
         replace=True,
         keep=kept,
     )

@@ -102,7 +102,11 @@ def _heldout_table(values: dict[str, Any]) -> str:
     """Errors on held-out patterns, before and after."""
     rows = "".join(
         f"<tr><td>{name}</td><td>{v['nrmse']:.4f}</td><td>{v['noise_nrmse']:.4f}</td><td>{v['excess']:.2g}</td></tr>"
-        for name, v in (("as it was", values["heldout"]["before"]), ("refitted", values["heldout"]["after"]))
+        for plane, heldout in (
+            ("", values["heldout"]),
+            *((f", at {p['plane_mm']:g} mm", p["heldout"]) for p in values["planes"]),
+        )
+        for name, v in ((f"as it was{plane}", heldout["before"]), (f"refitted{plane}", heldout["after"]))
     )
     return (
         "<table><tr><th>on held-out patterns</th><th>error (nrmse)</th><th>camera noise alone</th><th>excess</th></tr>"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,23 +27,47 @@ class ColourLightPath:
 
 @dataclass(frozen=True)
 class Shot:
-    """One capture.
+    """One capture, kept in half of the memory of its signal and weight: a calibration has a hundred of them.
 
     Attributes
     ----------
     channel : str
     gray : uint8 array [H, W]
         The pattern that was shown.
-    signal : float32 array [h, w], counts
-        Above black.
-    weight : float32 array [h, w], 1 / counts^2
-        Inverse variance of the signal's noise; 0 where saturated.
+    counts : uint16 or float32 array [h, w]
+        As the camera gave them.
+    black : float, counts
+        Black level.
+    weight_halves : uint16 array [h, w]
+        The upper halves of `weight`, which hold it to 0.4 %.
     """
 
     channel: str
     gray: np.ndarray
-    signal: np.ndarray
-    weight: np.ndarray
+    counts: np.ndarray
+    black: float
+    weight_halves: np.ndarray
+
+    @property
+    def signal(self) -> np.ndarray:
+        """Counts above black, float32 [h, w]."""
+        return self.counts - np.float32(self.black)
+
+    @property
+    def weight(self) -> np.ndarray:
+        """Inverse variance of the signal's noise, 1 / counts^2; 0 where saturated: float32 [h, w]."""
+        return (self.weight_halves.astype(np.uint32) << 16).view(np.float32)
+
+    def rows(self, which: slice) -> Shot:
+        """The capture with some of its rows alone."""
+        counts, halves = (a[which].copy() for a in (self.counts, self.weight_halves))
+        return replace(self, counts=counts, weight_halves=halves)
+
+
+def shot_of(channel: str, gray: np.ndarray, counts: np.ndarray, black: float, weight: np.ndarray) -> Shot:
+    """A capture with weights [h, w], 1 / counts^2, each rounded to the 8 bits that are kept of it."""
+    bits = np.ascontiguousarray(weight, np.float32).view(np.uint32)
+    return Shot(channel, gray, counts, black, ((bits + np.uint32(0x8000)) >> 16).astype(np.uint16))
 
 
 @dataclass(frozen=True)
@@ -96,6 +120,5 @@ def with_stray(view: View, even: np.ndarray, light: np.ndarray) -> np.ndarray:
 
 def gain_of(shot: Shot, light: np.ndarray) -> float:
     """The factor on a prediction that brings it nearest to a capture."""
-    return float(np.vdot(shot.weight * light, shot.signal)) / max(
-        float(np.vdot(shot.weight * light, light)), 1e-30
-    )
+    weighted = shot.weight * light
+    return float(np.vdot(weighted, shot.signal)) / max(float(np.vdot(weighted, light)), 1e-30)

@@ -100,7 +100,7 @@ def fit_freeform(
 
 def iterations_over(shots: Sequence[Shot]) -> int:
     """Most iterations of a fit to some shots."""
-    return min(ITERATIONS, max(FEWEST, WORK // sum(shot.signal.size for shot in shots)))
+    return min(ITERATIONS, max(FEWEST, WORK // sum(shot.counts.size for shot in shots)))
 
 
 def spacings(shape: tuple[int, int], turns: int) -> list[float]:

@@ -47,10 +47,11 @@ def held_out_errors(
     for number, shot in enumerate(shots):
         light = predictor.light(shot)
         prediction = gain_of(shot, light) * light
-        mask = shot.weight > 0
-        noise = np.divide(1, shot.weight, out=np.zeros(shot.weight.shape, np.float64), where=mask)
-        arrays = (a.astype(np.float64)[None] for a in (shot.signal, prediction, noise, mask))
+        signal, weight = shot.signal, shot.weight  # each is made anew when it is asked for
+        mask = weight > 0
+        noise = np.divide(1, weight, out=np.zeros(weight.shape, np.float64), where=mask)
+        arrays = (a.astype(np.float64)[None] for a in (signal, prediction, noise, mask))
         parts.append(prediction_errors([f"{number:03d}"], *arrays))
-        error = np.where(mask, shot.signal - prediction, 0)
-        residuals.append((error * np.sqrt(shot.weight)).astype(np.float32))
+        error = np.where(mask, signal - prediction, 0)
+        residuals.append((error * np.sqrt(weight)).astype(np.float32))
     return HeldOutErrors(joined(parts), tuple(residuals))

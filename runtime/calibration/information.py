@@ -67,7 +67,7 @@ def measured_information(
     by_colour = {channel: np.zeros((count, count)) for channel in bases}
     # Where one pattern is enough, one colour is too: the others' matrices follow from its own.
     first = next(iter(bases))
-    enough = len(bases) > 1 and shots[0].signal.size >= SAMPLE
+    enough = len(bases) > 1 and shots[0].counts.size >= SAMPLE
     chosen = _sample([shot for shot in shots if shot.channel == first] if enough else shots)
     columns = Columns({c: bases[c] for c in dict.fromkeys(s.channel for s, *_ in chosen)}, estimate, layout)
     for number, (shot, pixels, share) in enumerate(chosen):
@@ -128,7 +128,7 @@ def _sample(shots: Sequence[Shot]) -> list[tuple[Shot, np.ndarray | slice, float
     rng = np.random.default_rng(0)
     for channel in dict.fromkeys(shot.channel for shot in shots):
         own = [shot for shot in shots if shot.channel == channel]
-        size = own[0].signal.size
+        size = own[0].counts.size
         some = own[: max(1, math.ceil(SAMPLE / size))]
         each = min(size, math.ceil(SAMPLE / len(some)))
         for shot in some:

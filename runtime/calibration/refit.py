@@ -197,7 +197,7 @@ def few(shots: Sequence[Shot], pixels: int, turn: int = 0) -> list[Shot]:
     channels = list(dict.fromkeys(shot.channel for shot in shots))
     for channel in channels:
         own = [shot for shot in shots if shot.channel == channel]
-        count = max(2, math.ceil(pixels / own[0].signal.size))
+        count = max(2, math.ceil(pixels / own[0].counts.size))
         count = min(math.ceil(count / len(channels)), len(own))
         chosen += [own[(turn * count + k) % len(own)] for k in range(count)]
     return chosen

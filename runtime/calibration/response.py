@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, predicted
+from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, predicted, shot_of
 from runtime.calibration.prediction import Predictor
 from runtime.calibration.shown_patterns import grating
 from runtime.camera.view import Sampler
@@ -79,7 +79,7 @@ def best_period(base: ColourLightPath, channel: str, estimate: Estimate, sample:
 def _blank(channel: str, base: ColourLightPath, period: int, gray: int) -> Shot:
     """A grating without a picture."""
     nothing = np.zeros((1, 1), np.float32)
-    return Shot(channel, grating(base.path.grid.shape, period, gray), nothing, nothing)
+    return shot_of(channel, grating(base.path.grid.shape, period, gray), nothing, 0.0, nothing)
 
 
 def measured_sweep(predictor: Predictor, shots: Sequence[Shot]) -> Sweep:
@@ -130,8 +130,8 @@ def rows_apart(camera: tuple[int, int]) -> int:
 
 def thinned(shot: Shot) -> Shot:
     """A capture of a grating with the rows that are used: sixteen whole ones would be half of all captures."""
-    every = rows_apart(shot.signal.shape)
-    return replace(shot, signal=shot.signal[::every].copy(), weight=shot.weight[::every].copy())
+    every = rows_apart(shot.counts.shape)
+    return shot.rows(slice(None, None, every))
 
 
 def _parts_of(predictor: Predictor, shot: Shot, believed: np.ndarray, start: float) -> tuple[np.ndarray, ...]:

@@ -2,7 +2,8 @@
 
 The sequence for each colour is dots (where the camera looks), a sweep of gratings (the phase response), ten patterns
 of random grains (wavefront, beam and distance), three held-out ones, and a picture solved through the light path as
-it was; after the fit, the picture solved through the new one. Lasers are on only while pictures are taken.
+it was; then the held-out ones in the bundle's other planes, where the camera can be focused on them; after the fit, the
+picture solved through the new one. Lasers are on only while pictures are taken.
 """
 
 from __future__ import annotations
@@ -16,7 +17,13 @@ import numpy as np
 
 from firmware_iface.errors import InputError
 from runtime.bundle.bundle_folder import Bundle
-from runtime.bundle.light_path_arrays import bundle_channels, bundle_paths, load_light_path, plane_of
+from runtime.bundle.light_path_arrays import (
+    bundle_channels,
+    bundle_paths,
+    load_light_path,
+    plane_of,
+    slow_response_share,
+)
 from runtime.calibration.colour_captures import (
     ColourCaptures,
     colour_captures,
@@ -24,20 +31,33 @@ from runtime.calibration.colour_captures import (
     proof_pattern,
     proof_pictures,
 )
-from runtime.calibration.drift import Drift
-from runtime.calibration.drift_fit import fit, layout_of
+from runtime.calibration.drift import Drift, drifted
 from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, gain_of
 from runtime.calibration.held_out_errors import HeldOutErrors, held_out_errors
-from runtime.calibration.information import measured_information
+from runtime.calibration.network_refit import (
+    NetworkCheck,
+    checked_network,
+    colour_pictures,
+    learned_pictures,
+)
+from runtime.calibration.other_planes import (
+    PlaneCheck,
+    checked_plane,
+    fitted_views,
+    other_planes,
+    plane_shots,
+)
 from runtime.calibration.prediction import Predictor
-from runtime.calibration.refit import PIXELS, Progress, few, part_of, refit, start_view
+from runtime.calibration.refit import Progress, part_of, refit, start_view
 from runtime.calibration.replacement_rule import LEAST_EXCESS, Verdict, is_certain, replacement_verdict
 from runtime.calibration.response import Sweep, swept
 from runtime.calibration.shown_patterns import GRAINS, HELD_OUT
 from runtime.calibration.taking import Taker
-from runtime.camera.view import View, view_of
+from runtime.camera.view import view_of
 from runtime.excess import is_complete, removed_excess
 from runtime.headset.open_devices import Devices
+from runtime.lightpath.overdrive import settling_periods
+from runtime.networks.onnx_approximator import approximator_of
 from runtime.program.progress import no_progress
 
 
@@ -50,7 +70,7 @@ class Calibration:
     verdict : str
         As from `replacement_verdict`.
     complete : bool
-        Whether what the refit leaves is too little to matter.
+        Whether what the refit leaves is too little to matter, in every plane that was checked.
     estimate : Estimate
         What was fitted.
     errors : Drift
@@ -70,8 +90,14 @@ class Calibration:
         The light path of each colour as it was.
     plane_mm : float, mm
         The image plane that the camera sees.
+    planes : tuple of PlaneCheck
+        The bundle's other planes, checked on held-out patterns.
+    planes_unchecked : tuple of float, mm
+        The bundle's other planes that this camera cannot be focused on.
+    network : NetworkCheck or None
+        What becomes of the bundle's network D; None where it has none, or nothing is replaced.
     pictures_taken : int
-        By the camera, in all.
+        By the camera, in all, without those for which a slow panel was waited for.
     seconds : mapping of str to float, s
         "capturing" and "fitting".
     known_counts_per_ms : mapping of str to float
@@ -93,6 +119,9 @@ class Calibration:
     counts_per_ms: Mapping[str, tuple[float, float]]
     bases: Mapping[str, ColourLightPath]
     plane_mm: float
+    planes: tuple[PlaneCheck, ...]
+    planes_unchecked: tuple[float, ...]
+    network: NetworkCheck | None
     pictures_taken: int
     seconds: Mapping[str, float]
     known_counts_per_ms: Mapping[str, float]
@@ -137,6 +166,8 @@ def calibrate(
     }
     shape = next(iter(bases.values())).path.grid.shape
     plane = plane_of(bundle, channels[0], plane_mm)
+    approximator = approximator_of(bundle, (len(channels), *shape))
+    settling = settling_periods(slow_response_share(bundle))
     say(0.0, "solving what is to be shown")
     patterns = {c: colour_patterns(c, bases[c], seed) for c in channels}
     started = time.perf_counter()
@@ -150,30 +181,52 @@ def calibrate(
         _check(devices, channels, shape)
         devices.move_to_plane(plane)
         camera = tuple(devices.camera.shape)
-        taker = Taker(devices, showing)
+        taker = Taker(devices, showing, settling=settling)
         black, floor = taker.darkness()
         captures = {c: colour_captures(taker, c, patterns[c], black, floor) for c in channels}
+        others = other_planes(bundle, plane) if devices.focus else []
+        elsewhere = {mm: plane_shots(taker, mm, patterns, captures) for mm in others}
     captured = time.perf_counter()
     view, new = start_view(captures[channels[0]], view_of(bundle), shape, camera)
     found, sweeps = refit(bases, captures, view, new, part_of(say, 0.25, 0.85, "fitting"))
     say(0.86, "checking against held-out patterns")
     heldout = [shot for one in captures.values() for shot in one.heldout]
-    rigid, scaled = _as_it_was(bases, heldout, found.estimate.view)
+    rigid, scaled = fitted_views(bases, heldout, found.estimate.view)
     before = held_out_errors(bases, heldout, scaled)
     after = held_out_errors(bases, heldout, found.estimate)
+    wavelengths = {c: base.wavelength_nm for c, base in bases.items()}
+    planes = [
+        checked_plane(bundle, wavelengths, mm, shots, found.estimate) for mm, shots in elsewhere.items()
+    ]
     say(0.92, "solving the picture again")
     better = {c: proof_pattern(bases[c], c, found.estimate.drift) for c in channels}
     with open_devices() as devices, _dark_after(devices):
         devices.move_to_plane(plane)
-        taker = Taker(devices, lambda what: say(0.96, f"showing: {what}"), taker.taken)
+        taker = Taker(devices, lambda what: say(0.96, f"showing: {what}"), taker.taken, settling)
         pictures = {
             c: proof_pictures(taker, c, better[c], captures[c], found.estimate.view) for c in channels
         }
-    done = time.perf_counter()
     verdict = replacement_verdict(before.errors, after.errors, _excess_before(bundle))
+    if verdict == "recalibrated" and any(p.worse for p in planes):
+        verdict = "not_explained"
+    network = None
+    if approximator is not None and verdict == "recalibrated":
+        drift, view = found.estimate.drift, found.estimate.view
+        paths = {c: drifted(base.path, c, base.wavelength_nm, drift) for c, base in bases.items()}
+        shown = {"before": {c: captures[c].heldout[-1].gray for c in channels}, "after": better}
+        deciding = [
+            colour_pictures(paths, grays, {c: pictures[c][name][0] for c in channels})
+            for name, grays in shown.items()
+        ]
+        learned = learned_pictures(paths, captures, view)
+        network = checked_network(
+            approximator, learned, deciding, part_of(say, 0.97, 1.0, "refitting the network")
+        )
+    done = time.perf_counter()
+    everywhere = [(before.errors, after.errors), *((p.before, p.after) for p in planes)]
     return Calibration(
         verdict,
-        is_complete(after.errors.excess, before.errors.excess),
+        all(is_complete(now.excess, then.excess) for then, now in everywhere),
         found.estimate,
         found.errors,
         sweeps,
@@ -184,27 +237,14 @@ def calibrate(
         {c: _power(bases[c], captures[c], found.estimate) for c in channels},
         bases,
         plane,
+        tuple(planes),
+        tuple(mm for mm in other_planes(bundle, plane) if mm not in elsewhere),
+        network,
         taker.taken,
         {"capturing": captured - started, "fitting": done - captured},
         (bundle.description.get("camera") or {}).get("counts_per_ms") or {},
         _camera_scale(bases, heldout, rigid, scaled, before) if verdict == "unchanged" else None,
     )
-
-
-def _as_it_was(
-    bases: Mapping[str, ColourLightPath], heldout: Sequence[Shot], view: View
-) -> tuple[Estimate, Estimate]:
-    """The light path as it was, before a camera that has moved, and before one whose scale is off as well.
-
-    At one plane, defocus and distance together do what a camera of another scale does: no pattern tells them apart
-    (the rays' matrices are the same). So the old light path is checked with the scale of the camera that suits it best,
-    and a refit must be better than that before it replaces anything.
-    """
-    some, start, layout = few(heldout, PIXELS[0]), Estimate(Drift(), view), layout_of(bases, (0, 0), True)
-    known = measured_information(bases, some, layout.widened(start), layout, no_progress)
-    rigid = fit(bases, some, start, (0, 0), 5, information=known).estimate
-    scaled = fit(bases, some, rigid, (0, 0), 5, new_view=True, information=known).estimate
-    return rigid, scaled
 
 
 def _camera_scale(

@@ -35,9 +35,12 @@ def grains(shape: tuple[int, int], size: int, seed: int) -> np.ndarray:
 
 
 def grating(shape: tuple[int, int], period: int, gray: int) -> np.ndarray:
-    """A binary grating of gray 0 and `gray`, its lines `period` pixels apart along a row: uint8 [H, W]."""
+    """A binary grating of gray 0 and `gray`, its lines `period` pixels apart along a row: uint8 [H, W].
+
+    It is read only, and takes the memory of one row.
+    """
     stripes = np.arange(shape[1]) % period >= period // 2
-    return np.broadcast_to(np.where(stripes, gray, 0).astype(np.uint8), shape).copy()
+    return np.broadcast_to(np.where(stripes, gray, 0).astype(np.uint8), shape)
 
 
 def proof_picture(shape: tuple[int, int]) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 from runtime.calibration.drift import LOWEST_AMPLITUDE, LOWEST_WAVEFRONT
 from runtime.calibration.self_calibration import Calibration
 from runtime.calibration.shown_patterns import GRAINS, HELD_OUT
-from runtime.excess import removed_excess
+from runtime.excess import PredictionErrors, removed_excess
 from runtime.lightpath.legendre import edge_to_edge, legendre_curve, legendre_order, legendre_products
 
 
@@ -22,13 +22,13 @@ def numbers(found: Calibration) -> dict[str, Any]:
     -------
     dict
         Keys `verdict`, `complete`, `heldout`, `wavefront`, `distance_mm`, `registration`, `camera_scale`, `channels`,
-        `plane_mm`, `patterns`, `captures` and `seconds` of `calibrate --json`. `captures` counts all pictures taken.
+        `plane_mm`, `planes`, `planes_unchecked`, `network`, `patterns`, `captures` and `seconds` of `calibrate --json`.
+        `captures` counts all pictures taken.
     """
     drift, view = found.estimate.drift, found.estimate.view
     shape = next(iter(found.bases.values())).path.grid.shape
     wavefront = drift.wavefront(shape)
     shortest = min(b.wavelength_nm for b in found.bases.values())
-    removed = removed_excess(found.before.errors, found.after.errors)
     colours = {}
     for channel, base in found.bases.items():
         sweep, was, now = found.sweeps[channel], base.path.response, drift.response[channel]
@@ -55,12 +55,7 @@ def numbers(found: Calibration) -> dict[str, Any]:
     return {
         "verdict": found.verdict,
         "complete": found.complete,
-        "heldout": {
-            "before": found.before.errors.as_json(),
-            "after": found.after.errors.as_json(),
-            "excess_removed": removed.value,
-            "ci95": list(removed.interval()),
-        },
+        "heldout": _heldout(found.before.errors, found.after.errors),
         "wavefront": {
             "rms_nm": float(wavefront.std()),
             "peak_to_valley_nm": float(np.ptp(wavefront)),
@@ -77,6 +72,12 @@ def numbers(found: Calibration) -> dict[str, Any]:
         "camera_scale": found.camera_scale,
         "channels": colours,
         "plane_mm": found.plane_mm,
+        "planes": [
+            {"plane_mm": p.plane_mm, "heldout": _heldout(p.before, p.after), "worse": p.worse}
+            for p in found.planes
+        ],
+        "planes_unchecked": list(found.planes_unchecked),
+        "network": found.network and {"outcome": found.network.outcome, "errors": dict(found.network.errors)},
         "patterns": {
             "fitted": len(GRAINS),
             "gratings": max(len(sweep.gray) for sweep in found.sweeps.values()),
@@ -109,18 +110,45 @@ def sentence_of(found: dict[str, Any], replaced: bool) -> str:
         return (
             f"Nothing has drifted that the camera can see: the excess on held-out patterns is {before:.2g}."
         )
+    if worse := [plane for plane in found["planes"] if plane["worse"]]:
+        plane, errors = worse[0]["plane_mm"], worse[0]["heldout"]
+        return (
+            f"What was found in the plane at {found['plane_mm']:g} mm (excess from {before:.2g} to {after:.2g}) is "
+            f"wrong in the one at {plane:g} mm (from {errors['before']['excess']:.2g} to "
+            f"{errors['after']['excess']:.2g}): planes or the camera's focus are not where they should be; take "
+            "captures of both planes and run hololoop-trainer diagnose; nothing was replaced."
+        )
     if found["verdict"] == "not_explained":
         return (
             f"The light path does not fit (excess {before:.2g} on held-out patterns) and refitting what drifts does "
             f"not correct it ({after:.2g}): take captures and run hololoop-trainer diagnose; nothing was replaced."
         )
+    if found["planes_unchecked"]:
+        seen = ", ".join(f"{mm:g} mm" for mm in found["planes_unchecked"])
+        after_planes = f" Not checked, as the camera's focus is fixed: {seen}."
+    else:
+        after_planes = ""
     done = "it was replaced" if replaced else "nothing was replaced, as asked"
     more = (
         ""
         if found["complete"]
         else ("; more is wrong than drifts here: take captures and run hololoop-trainer diagnose")
     )
-    return f"The light path has drifted: the refit takes the excess from {before:.2g} to {after:.2g}; {done}{more}."
+    return (
+        f"The light path has drifted: the refit takes the excess from {before:.2g} to {after:.2g}; {done}{more}."
+        f"{after_planes}"
+    )
+
+
+def _heldout(before: PredictionErrors, after: PredictionErrors) -> dict[str, Any]:
+    """Errors on held-out patterns of one plane, before and after, and what the refit removes."""
+    removed = removed_excess(before, after)
+    return {
+        "before": before.as_json(),
+        "after": after.as_json(),
+        "excess_removed": removed.value,
+        "ci95": list(removed.interval()),
+    }
 
 
 def _rms_error(errors: np.ndarray, shape: tuple[int, int], lowest: int) -> float:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware_iface.errors import InputError
-from runtime.calibration.estimate import Shot
+from runtime.calibration.estimate import Shot, shot_of
 from runtime.headset.open_devices import Devices
 
 AIM, BRIGHTEST = 0.7, 0.999  # this share of full scale for this quantile of a picture
@@ -57,15 +57,20 @@ class Taker:
         Called before each picture with what it is.
     taken : int
         Pictures taken before.
+    settling : int
+        Pictures of each pattern that are not used, because a slow panel still shows the pattern before.
 
     Attributes
     ----------
     taken : int
-        Pictures taken so far.
+        Pictures taken so far, without those.
     """
 
-    def __init__(self, devices: Devices, announce: Callable[[str], None], taken: int = 0) -> None:
+    def __init__(
+        self, devices: Devices, announce: Callable[[str], None], taken: int = 0, settling: int = 0
+    ) -> None:
         self.devices, self.announce, self.taken = devices, announce, taken
+        self._settling = settling
         self.top = float(2**devices.camera.bit_depth - 1)
 
     def darkness(self) -> tuple[float, float]:
@@ -112,7 +117,7 @@ class Taker:
         camera = self.devices.camera
         self.announce("exposure")
         for _ in range(8):
-            self.devices.panel.show(gray)
+            self._show(gray)
             bright = float(np.quantile(self._picture(), BRIGHTEST)) - black
             room = self.top - black
             if bright < 0.9 * room:
@@ -146,7 +151,7 @@ class Taker:
         floor : float, counts^2
             Variance of a picture without light.
         """
-        self.devices.panel.show(gray)
+        self._show(gray)
         self.announce("noise")
         first, second = (self._picture() - black for _ in range(2))
         second = second * (first.sum() / second.sum())
@@ -157,13 +162,13 @@ class Taker:
 
     def shot(self, channel: str, gray: np.ndarray, noise: Noise, what: str) -> Shot:
         """One capture of a pattern."""
-        self.devices.panel.show(gray)
+        self._show(gray)
         self.announce(what)
-        counts = self._picture()
+        counts = self._counts()
         signal = counts - np.float32(noise.black)
         # weights from a picture smoothed a little, or dark noise would be trusted more than bright
         weight = np.where(counts >= noise.top, 0, 1 / noise.variance(_softened(signal)))
-        return Shot(channel, gray, signal, weight.astype(np.float32))
+        return shot_of(channel, gray, counts, noise.black, weight)
 
     def shots(
         self,
@@ -179,9 +184,17 @@ class Taker:
             for number, gray in enumerate(grays, 1)
         ]
 
+    def _show(self, gray: np.ndarray) -> None:
+        self.devices.panel.show(gray)
+        for _ in range(self._settling):
+            self.devices.camera.capture()
+
     def _picture(self) -> np.ndarray:
+        return self._counts().astype(np.float32)
+
+    def _counts(self) -> np.ndarray:
         self.taken += 1
-        return np.asarray(self.devices.camera.capture()).astype(np.float32)
+        return np.array(self.devices.camera.capture())
 
 
 def _softened(signal: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from scipy import ndimage
 from scipy.sparse import csr_matrix
 
 from runtime.camera.registration import panel_points
-from runtime.lightpath.fft import irfft2
+from runtime.lightpath.fft import ifft, irfft, irfft2
 from runtime.lightpath.grid import FINE, Grid
 
 Array = Any
@@ -106,8 +106,8 @@ def finer_picture(spectrum: Array, shape: tuple[int, int], finer: int) -> Array:
     -------
     real array [..., finer n, finer m]
     """
-    height, width = (finer * n for n in shape)
-    return finer**2 * irfft2(_widened(spectrum, shape, finer), (height, width))
+    rows = _taller(finer**2 * _below_highest(shape, spectrum) * spectrum, shape[0], finer)
+    return irfft(ifft(rows, axis=-2), finer * shape[1])  # the columns that a finer grid adds are zero
 
 
 def finer_picture_adjoint(spectrum: Array, shape: tuple[int, int]) -> Array:
@@ -130,22 +130,12 @@ def finer_picture_adjoint(spectrum: Array, shape: tuple[int, int]) -> Array:
     return kept * _below_highest(shape, kept)
 
 
-def _widened(spectrum: Array, shape: tuple[int, int], finer: int) -> Array:
-    """A half spectrum with zeros for the frequencies that only a finer grid has."""
+def _taller(spectrum: Array, rows: int, finer: int) -> Array:
+    """A half spectrum with zero rows for the frequencies that only a finer grid has."""
     xp = array_namespace(spectrum)
-    spectrum = spectrum * _below_highest(shape, spectrum)
-    half, leading = (shape[0] + 1) // 2, tuple(spectrum.shape[:-2])
-    device = spectrum.device
-
-    def zeros(rows: int, columns: int) -> Array:
-        return xp.zeros((*leading, rows, columns), dtype=spectrum.dtype, device=device)
-
-    more = (finer - 1) * shape[0]
-    tall = xp.concat(
-        [spectrum[..., :half, :], zeros(more, spectrum.shape[-1]), spectrum[..., half:, :]], axis=-2
-    )
-    wide = finer * shape[1] // 2 + 1 - spectrum.shape[-1]
-    return xp.concat([tall, zeros(finer * shape[0], wide)], axis=-1)
+    half, shape = (rows + 1) // 2, (*spectrum.shape[:-2], (finer - 1) * rows, spectrum.shape[-1])
+    between = xp.zeros(shape, dtype=spectrum.dtype, device=spectrum.device)
+    return xp.concat([spectrum[..., :half, :], between, spectrum[..., half:, :]], axis=-2)
 
 
 def _below_highest(shape: tuple[int, int], like: Array) -> Array:

@@ -16,12 +16,16 @@ DESCRIPTION = """Find out with the headset's own camera what has drifted, and pu
 
 Some thirty patterns a colour are shown and captured: dots (where the camera looks), a sweep of gratings (the panel's
 phase response), ten patterns of random grains (wavefront, beam and distance, refit together) and three that the fit
-does not see. The light path is replaced only if it predicts those three better, surely and by enough to matter. The
-folder holds the old bundle or the new one at every moment; the old one is kept as BUNDLE.previous. Where the headset's
-configuration has fields in turn, each colour is lit in its own field alone.
+does not see. The light path is replaced only if it predicts those three better, surely and by enough to matter, and
+predicts them no worse in the bundle's other planes, as far as the camera can be focused on them. The folder holds the
+old bundle or the new one at every moment; the old one is kept as BUNDLE.previous. Where the headset's configuration has
+fields in turn, each colour is lit in its own field alone.
 
 verdict: recalibrated (replaced), unchanged (it was as good as the camera can tell), not_explained (it is wrong, and
 refitting what drifts does not correct it: capture and diagnose on the workstation)."""
+
+
+WAYS = {"left_out": "left out", "kept": "as it was", "refitted": "refitted"}
 
 
 def options(parser: ArgumentParser) -> None:
@@ -103,6 +107,15 @@ def show(result: Result, args: Namespace, screen: Screen) -> None:
             f"{100 * c['illumination_rms']:.1f} % rms; power {_power(c)}; picture "
             f"{c['picture_psnr_db']['before']:.1f} -> {c['picture_psnr_db']['after']:.1f} dB"
         )
+    for plane in result["planes"]:
+        before, after = (plane["heldout"][k]["excess"] for k in ("before", "after"))
+        screen.say(
+            f"at {plane['plane_mm']:g} mm   excess {before:.2g} -> {after:.2g}, where nothing was fitted"
+        )
+    if result["network"]:
+        outcome, errors = result["network"]["outcome"], result["network"]["errors"]
+        tried = ", ".join(f"{WAYS[name]} {error:.3g}" for name, error in errors.items())
+        screen.say(f"network     {WAYS[outcome]}; error of amplitude squared on the test pictures: {tried}")
     if result["replaced"]:
         screen.say(
             f"\nThe old light path is {result['previous']}; to put it back: calibrate {result['bundle']} --restore"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.interpolate import BSpline
 
 
 def node_weights(pixels: int, nodes: int) -> np.ndarray:
@@ -16,6 +15,8 @@ def weights_at(places: np.ndarray, first: float, last: float, nodes: int) -> np.
 
     Places beyond the ends have the end's weights.
     """
+    from scipy.interpolate import BSpline  # takes a second to load, and few light paths have maps
+
     knots = np.concatenate([np.full(3, first), np.linspace(first, last, nodes - 2), np.full(3, last)])
     return np.asarray(BSpline.design_matrix(np.clip(places, first, last), knots, 3).toarray())
 

@@ -2,8 +2,8 @@
 
 Chakravarthula et al. 2020, eq. 13. It comes in a bundle as two networks in ONNX: `approximator.onnx`, irradiance to
 corrected, and `approximator_gradient.onnx`, irradiance and target to a loss and its gradient over irradiance, with
-the weights that may be refined on the headset as further inputs. All are [1, C, H, W], float32, irradiance with a
-mean of about 1.
+the weights that may be refined on the headset as further inputs (in the first file, inputs with a default). All are
+[1, C, H, W], float32, irradiance with a mean of about 1.
 """
 
 from __future__ import annotations
@@ -66,11 +66,15 @@ class Approximator:
         self._loss = np.zeros((), np.float32)
         self._forward = OnnxSession(model, "approximator.onnx")
         _check(self._forward, {"irradiance"}, {"corrected"}, whole)
-        self._forward.bind(irradiance=self._irradiance, corrected=self._corrected)
+        given = {n: np.array(a, np.float32) for n, a in (adapters or {}).items()}
+        self._forward.bind(
+            irradiance=self._irradiance,
+            corrected=self._corrected,
+            **{n: a for n, a in given.items() if n in self._forward.defaults},
+        )
         self._backward: OnnxSession | None = None
         if gradient is not None:
             self._backward = OnnxSession(gradient, "approximator_gradient.onnx")
-            given = dict(adapters or {})
             _check(self._backward, {"irradiance", "target", *given}, {"loss", "gradient"}, whole)
             room: dict[str, np.ndarray] = {
                 name: np.zeros(given[name.removeprefix("gradient.")].shape, np.float32)
@@ -78,7 +82,7 @@ class Approximator:
                 if name.startswith("gradient.")
             }
             self._adapter_gradients = {name.removeprefix("gradient."): a for name, a in room.items()}
-            self._adapters = {n: np.array(a, np.float32) for n, a in given.items()}
+            self._adapters = given
             if "corrected" in self._backward.outputs:  # with the adapters as they are now
                 room["corrected"] = self._corrected
             self._backward.bind(
@@ -93,13 +97,21 @@ class Approximator:
 
     @property
     def adapters(self) -> dict[str, np.ndarray]:
-        """The weights that may be refined, by name, to be written in place; `look` takes them, `correct` does not."""
+        """The weights that may be refined, by name, to be written in place; `look` takes them.
+
+        `correct` does too, where `correct_follows`.
+        """
         return self._adapters if self._backward is not None else {}
 
     @property
     def refinable(self) -> bool:
         """Whether `look` takes adapters, gives their gradients and fills `corrected` with what they make."""
         return bool(self.adapters) and "corrected" in getattr(self._backward, "outputs", ())
+
+    @property
+    def correct_follows(self) -> bool:
+        """Whether `correct` takes the adapters, too; exports of versions before 0.2 have theirs built in."""
+        return set(self.adapters) <= set(self._forward.defaults)
 
     def correct(self) -> None:
         """Fill `corrected` from `irradiance`."""

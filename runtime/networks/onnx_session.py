@@ -33,6 +33,8 @@ class OnnxSession:
     ----------
     inputs : dict of str to list
         Shapes by name.
+    defaults : dict of str to list
+        Shapes by name of inputs that have a value where none is given.
     outputs : list of str
     provider : str
         The one that ONNX Runtime chose.
@@ -61,6 +63,7 @@ class OnnxSession:
             ) from None
         self.name = name
         self.inputs = {i.name: i.shape for i in self._session.get_inputs()}
+        self.defaults = {i.name: i.shape for i in self._session.get_overridable_initializers()}
         self.outputs = [o.name for o in self._session.get_outputs()]
         self.provider: str = self._session.get_providers()[0]
         self._binding = self._session.io_binding()
@@ -69,7 +72,8 @@ class OnnxSession:
     def bind(self, **arrays: np.ndarray) -> None:
         """Set once where inputs are read and outputs written: contiguous float32 arrays."""
         for name, array in arrays.items():
-            to = self._binding.bind_input if name in self.inputs else self._binding.bind_output
+            given = name in self.inputs or name in self.defaults
+            to = self._binding.bind_input if given else self._binding.bind_output
             to(name, "cpu", 0, np.float32, array.shape, array.ctypes.data)
             self._kept[name] = array
 

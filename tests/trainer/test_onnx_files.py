@@ -100,6 +100,20 @@ def test_adapters_are_inputs_whose_change_is_followed() -> None:
     assert float(before["loss"]) - float(after["loss"]) == pytest.approx(step * slope, rel=0.05)
 
 
+def test_both_files_follow_adapters_and_the_first_has_them_by_default() -> None:
+    files = exported("compact", (67, 121), 4)
+    adapters = safetensors.numpy.load(files[ADAPTERS])
+    light = np.random.default_rng(6).random((1, 3, 67, 121)).astype(np.float32)
+    plain = run(files[APPROXIMATOR], {"irradiance": light})["corrected"]
+    moved = {name: 1.3 * value for name, value in adapters.items()}
+    first = run(files[APPROXIMATOR], {"irradiance": light, **moved})["corrected"]
+    second = run(files[GRADIENT], {"irradiance": light, "target": light, **moved})["corrected"]
+    assert far(first, torch.as_tensor(second).double()) < ROUNDING
+    assert far(plain, torch.as_tensor(first).double()) > 1e-3
+    same = run(files[APPROXIMATOR], {"irradiance": light, **adapters})["corrected"]
+    np.testing.assert_array_equal(same, plain)
+
+
 def test_baselines_are_not_exported() -> None:
     with pytest.raises(InputError, match="published or compact"):
         onnx_files(disturbed("unet", (32, 48)))

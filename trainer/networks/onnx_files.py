@@ -1,6 +1,6 @@
 """An approximator as two ONNX files, which onnxruntime alone evaluates on the headset.
 
-    approximator.onnx           irradiance -> corrected
+    approximator.onnx           irradiance (adapters, by default those exported) -> corrected
     approximator_gradient.onnx  irradiance, target, adapters -> loss, corrected, gradient, gradient.ADAPTER for each
 
 The second file is the forward and the backward pass as one graph of plain operations. The network and torch's own
@@ -14,7 +14,7 @@ from __future__ import annotations
 import io
 import logging
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -77,17 +77,48 @@ def onnx_files(network: Approximator) -> dict[str, bytes]:
     joint = _joint_gradient(network, tuple(adapters))
     arguments = (irradiance, target, *adapters.values())
     with _quiet():
-        forward = onnx_bytes(network, (irradiance,), ["irradiance"], ["corrected"])
+        plain = _traced(_forward(network, tuple(adapters)), (irradiance, *adapters.values()))
+        forward = onnx_bytes(
+            plain, (irradiance, *adapters.values()), ["irradiance", *adapters], ["corrected"]
+        )
         graph = _traced(joint, arguments)
         names = ["loss", "corrected", "gradient", *(f"gradient.{name}" for name in adapters)]
         gradient = onnx_bytes(graph, arguments, ["irradiance", "target", *adapters], names)
-    return {APPROXIMATOR: forward, GRADIENT: gradient, ADAPTERS: safetensors.torch.save(adapters)}
+    return {
+        APPROXIMATOR: _with_defaults(forward, adapters),
+        GRADIENT: gradient,
+        ADAPTERS: safetensors.torch.save(adapters),
+    }
 
 
 def _frozen(network: Approximator) -> Approximator:
     copy = Approximator(network.architecture)
     copy.load_state_dict(network.state_dict())
     return copy.requires_grad_(False).eval()
+
+
+def _forward(network: Approximator, names: Sequence[str]) -> Callable[..., Tensor]:
+    """(irradiance, adapters) to corrected."""
+
+    def forward(irradiance: Tensor, *weights: Tensor) -> Tensor:
+        corrected: Tensor = torch.func.functional_call(
+            network, dict(zip(names, weights, strict=True)), (irradiance,)
+        )
+        return corrected
+
+    return forward
+
+
+def _with_defaults(model: bytes, values: Mapping[str, Tensor]) -> bytes:
+    """A model whose inputs of these names have these values where none is given (ONNX IR: overridable initializers)."""
+    import onnx
+
+    made = onnx.load_from_string(model)
+    made.graph.initializer.extend(
+        onnx.numpy_helper.from_array(value.numpy(), name) for name, value in values.items()
+    )
+    whole: bytes = made.SerializeToString()
+    return whole
 
 
 def _joint_gradient(network: Approximator, names: Sequence[str]) -> Callable[..., tuple[Tensor, ...]]:
@@ -125,7 +156,7 @@ def onnx_bytes(module: Any, arguments: tuple[Tensor, ...], inputs: list[str], ou
         verbose=False,
     )
     if program is None:  # only where the exporter writes a file itself, which is not asked for here
-        raise RuntimeError("torch.onnx.export rerotated no program")
+        raise RuntimeError("torch.onnx.export returned no program")
     buffer = io.BytesIO()
     import onnx
 

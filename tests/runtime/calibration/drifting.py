@@ -12,7 +12,7 @@ from firmware_iface.virtual import BenchDescription, VirtualHeadset
 from firmware_iface.virtual.defects import make_defect
 from runtime.bundle.bundle_folder import INITIALISER, write_bundle
 from runtime.bundle.light_path_arrays import pack_light_paths
-from runtime.calibration.estimate import ColourLightPath
+from runtime.calibration.estimate import ColourLightPath, Shot, shot_of
 from runtime.headset.open_devices import Devices
 from runtime.lightpath.legendre import edge_to_edge
 from tests.runtime.benches import ideal_path
@@ -44,12 +44,18 @@ def base(shape: tuple[int, int] = SHAPE) -> ColourLightPath:
     return ColourLightPath(ideal_path(shape, DISTANCE_MM * 1e-3, dtype=np.float32), WAVELENGTH_NM)
 
 
-def ideal_bundle(folder: Path, shape: tuple[int, int] = SHAPE) -> Path:
+def blank(gray: np.ndarray, channel: str = "green") -> Shot:
+    """A pattern without a picture, to be predicted."""
+    nothing = np.zeros((1, 1), np.float32)
+    return shot_of(channel, gray, nothing, 0.0, nothing)
+
+
+def ideal_bundle(folder: Path, shape: tuple[int, int] = SHAPE, slow_share: float = 0.0) -> Path:
     records, arrays = pack_light_paths([("green", DISTANCE_MM, WAVELENGTH_NM, base(shape).path)])
     networks = {INITIALISER: b"a network that calibration does not read"}
-    write_bundle(
-        folder, arrays, {"paths": records, "distance_mm": DISTANCE_MM}, {"bench": "ideal"}, networks=networks
-    )
+    panel = {"panel": {"slow_response_share": slow_share}} if slow_share else {}
+    described = {"paths": records, "distance_mm": DISTANCE_MM, **panel}
+    write_bundle(folder, arrays, described, {"bench": "ideal"}, networks=networks)
     return folder
 
 

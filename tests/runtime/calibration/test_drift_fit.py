@@ -10,7 +10,7 @@ import pytest
 from runtime.calibration import information
 from runtime.calibration.drift import Drift
 from runtime.calibration.drift_fit import chi_squared, fit, layout_of
-from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, predicted
+from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, predicted, shot_of
 from runtime.calibration.free_form_fit import spacings
 from runtime.calibration.information import measured_information
 from runtime.calibration.misfit import Misfit
@@ -24,7 +24,7 @@ from runtime.lightpath.legendre import legendre_map_by_map, legendre_maps, legen
 from runtime.lightpath.light_path import LightPath, irradiance, panel_phase
 from runtime.program.progress import no_progress
 from tests.runtime.benches import ideal_path, random_path
-from tests.runtime.calibration.drifting import WAVELENGTH_NM, without_tilt
+from tests.runtime.calibration.drifting import WAVELENGTH_NM, blank, without_tilt
 
 SMALL = (40, 52)
 
@@ -41,10 +41,10 @@ def shots_of(path: LightPath, truth: Estimate, count: int, noise: float = 0.01) 
     sample, rng, shots = sampler(truth.view, path.grid), np.random.default_rng(3), []
     for seed in range(count):
         gray = grains(shape, 2 + seed % 4, seed)
-        seen = predicted(base, Shot("green", gray, *np.zeros((2, 1, 1))), truth, sample)
+        seen = predicted(base, blank(gray), truth, sample)
         deviation = noise * float(seen.mean())
         signal = (seen + deviation * rng.normal(size=seen.shape)).astype(np.float32)
-        shots.append(Shot("green", gray, signal, np.full(seen.shape, 1 / deviation**2, np.float32)))
+        shots.append(shot_of("green", gray, signal, 0.0, np.full(seen.shape, 1 / deviation**2)))
     return shots
 
 
@@ -53,7 +53,7 @@ def test_a_prediction_in_place_is_the_prediction(make: object) -> None:
     path = ideal_path(SMALL, 8e-3) if make is ideal_path else random_path(SMALL)
     base = ColourLightPath(path, WAVELENGTH_NM)
     estimate = moved_at_random(layout_of({"green": base}, (3, 2), True), SMALL)
-    shot = Shot("green", grains(SMALL, 3, 0), *np.zeros((2, 1, 1)))
+    shot = blank(grains(SMALL, 3, 0))
     predictor = Predictor({"green": base})
     predictor.take(estimate)
     wanted = predicted(base, shot, estimate, sampler(estimate.view, path.grid))
@@ -166,7 +166,10 @@ def test_maps_of_terms_one_by_one_are_the_stack_and_their_moments_its_products()
 
 def test_large_panels_are_fitted_to_fewer_patterns_which_take_turns_and_small_ones_to_all() -> None:
     small, large = (
-        [Shot("green", np.zeros((1, 1), np.uint8), *np.full((2, *shape), k, np.float32)) for k in range(10)]
+        [
+            shot_of("green", np.zeros((1, 1), np.uint8), np.full(shape, k, np.float32), 0.0, np.ones(shape))
+            for k in range(10)
+        ]
         for shape in ((96, 128), (1000, 1000))
     )
     assert len(few(small, 1_000_000)) == 10
@@ -192,7 +195,7 @@ def test_phases_of_gratings_are_the_same_from_one_propagation_as_from_one_each()
         seen = sample(
             irradiance(replace(path, response=true), panel_phase(replace(path, response=true), pattern))
         )
-        shots.append(Shot("green", pattern, seen.astype(np.float32), np.ones(SMALL, np.float32)))
+        shots.append(shot_of("green", pattern, seen.astype(np.float32), 0.0, np.ones(SMALL)))
     sweeps = []
     for one in (path, replace(path, gain=np.ones(SMALL, np.float32))):
         predictor = Predictor({"green": ColourLightPath(one, WAVELENGTH_NM)})

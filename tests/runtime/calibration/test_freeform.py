@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from runtime.calibration.drift import Drift, drifted
 from runtime.calibration.drift_fit import chi_squared
-from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, predicted
+from runtime.calibration.estimate import ColourLightPath, Estimate, predicted, shot_of
 from runtime.calibration.free_form_fit import fit_freeform
 from runtime.calibration.shown_patterns import grains
 from runtime.camera.view import View, sampler, sampler_and_adjoint
@@ -61,7 +61,7 @@ def test_fine_structure_is_found_in_wavefront_and_beam(make: object) -> None:
         gray = grains(SHAPE, size, seed)
         seen = sample(irradiance(truth, panel_phase(truth, gray.astype(np.int64))))
         noise = (0.005 * seen.mean()) ** 2
-        shots.append(Shot("green", gray, seen, np.full(SHAPE, 1 / noise)))
+        shots.append(shot_of("green", gray, seen, 0.0, np.full(SHAPE, 1 / noise)))
     found = fit_freeform({"green": base}, shots, start)
     assert found.drift.wavefront_nodes_nm.shape == nodes_over(SHAPE, 4)
     error = without_tilt(found.drift.wavefront(SHAPE) - hidden_nm)[4:-4, 4:-4]

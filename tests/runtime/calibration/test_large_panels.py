@@ -18,7 +18,7 @@ from runtime.calibration.colour_captures import colour_captures, colour_patterns
 from runtime.calibration.columns import Columns
 from runtime.calibration.drift import Drift
 from runtime.calibration.drift_fit import DriftFit, layout_of
-from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, predicted
+from runtime.calibration.estimate import ColourLightPath, Estimate, predicted, shot_of
 from runtime.calibration.information import measured_information
 from runtime.calibration.misfit import Misfit
 from runtime.calibration.refit import refit, start_view
@@ -29,7 +29,14 @@ from runtime.excess import COMPLETE_EXCESS
 from runtime.lightpath.ideal_path import ideal_path, single
 from runtime.lightpath.light_path import irradiance, panel_phase
 from runtime.program.progress import no_progress
-from tests.runtime.calibration.drifting import WAVELENGTH_NM, base, devices, drifted_bench, without_tilt
+from tests.runtime.calibration.drifting import (
+    WAVELENGTH_NM,
+    base,
+    blank,
+    devices,
+    drifted_bench,
+    without_tilt,
+)
 
 SHAPE = (80, 96)
 
@@ -79,14 +86,15 @@ def test_an_excess_that_is_too_little_to_matter_is_a_small_error(pixels: int, mo
     assert excess(1 / most / 2) < COMPLETE_EXCESS < excess(1 / most)
 
 
+def uniform(rng: np.random.Generator) -> np.ndarray:
+    return rng.uniform(0.5, 1.5, SHAPE).astype(np.float32)
+
+
 def test_light_that_stays_is_not_propagated_again_and_gives_the_cameras_slopes() -> None:
     bases, start = {"green": base(SHAPE)}, Estimate(Drift(), View(SHAPE))
     moved = Estimate(Drift(), View(SHAPE, shift_x_px=0.2, blur_y_px2=0.1, stray=0.01))
     rng = np.random.default_rng(2)
-    shots = [
-        Shot("green", grains(SHAPE, 3, k), *rng.uniform(0.5, 1.5, (2, *SHAPE)).astype(np.float32))
-        for k in (0, 1)
-    ]
+    shots = [shot_of("green", grains(SHAPE, 3, k), uniform(rng), 0.0, uniform(rng)) for k in (0, 1)]
     whole, still = Misfit(bases, shots), Misfit(bases, shots, light=False)
     still.at(start)
     image = still.predictor.image
@@ -109,7 +117,7 @@ def test_colours_share_the_memory_of_their_fields_and_say_what_each_says_alone()
     }
     rng = np.random.default_rng(3)
     shots = [
-        Shot(c, grains(SHAPE, 3, k), *rng.uniform(0.5, 1.5, (2, *SHAPE)).astype(np.float32))
+        shot_of(c, grains(SHAPE, 3, k), uniform(rng), 0.0, uniform(rng))
         for k, c in enumerate([*colours, *colours])
     ]
     start = Estimate(Drift(distance_mm=0.05), View(SHAPE))
@@ -132,11 +140,10 @@ def test_one_colours_captures_tell_how_much_the_others_say(monkeypatch: pytest.M
         bases[channel] = ColourLightPath(path, nm)
         for seed in range(2):
             gray = grains(SHAPE, 2 + seed, seed)
-            empty = Shot(channel, gray, *np.zeros((2, 1, 1), np.float32))
             still = Estimate(Drift(), View(SHAPE))
-            seen = predicted(bases[channel], empty, still, sampler(still.view, path.grid))
+            seen = predicted(bases[channel], blank(gray, channel), still, sampler(still.view, path.grid))
             weight = np.full(SHAPE, 1e4 / float(seen.mean()) ** 2, np.float32)
-            shots.append(Shot(channel, gray, seen, weight))
+            shots.append(shot_of(channel, gray, seen, 0.0, weight))
     layout = layout_of(bases, (4, 2), False)
     still = layout.nothing(still)
     whole = measured_information(bases, shots, still, layout, no_progress).matrix

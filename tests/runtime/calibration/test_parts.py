@@ -10,10 +10,12 @@ import pytest
 
 from firmware_iface.errors import InputError
 from firmware_iface.panel.phase_light_modulator import gray_levels
+from firmware_iface.virtual.defects import make_defect
 from firmware_iface.virtual.simulated_drive import Drive
+from runtime.bundle.bundle_folder import read_bundle
 from runtime.calibration.columns import Columns
 from runtime.calibration.drift import LOWEST_WAVEFRONT, Drift, drifted
-from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, predicted
+from runtime.calibration.estimate import ColourLightPath, Estimate, predicted, shot_of
 from runtime.calibration.parameter_layout import ParameterLayout
 from runtime.calibration.prediction import Predictor
 from runtime.calibration.replacement_rule import replacement_verdict
@@ -24,6 +26,7 @@ from runtime.calibration.response import (
     measured_sweep,
     swept,
 )
+from runtime.calibration.self_calibration import calibrate
 from runtime.calibration.shown_patterns import grains, grating
 from runtime.calibration.taking import Taker
 from runtime.camera.view import View, sampler
@@ -31,8 +34,17 @@ from runtime.excess import PredictionErrors, is_complete
 from runtime.lightpath.gray_levels import shown_as
 from runtime.lightpath.legendre import edge_to_edge, legendre_maps
 from runtime.lightpath.light_path import irradiance, panel_phase, pixel_irradiance
+from runtime.lightpath.overdrive import settling_periods
 from tests.runtime.benches import PITCH, ideal_path, random_path
-from tests.runtime.calibration.drifting import WAVELENGTH_NM, base, devices, drifted_bench, headset
+from tests.runtime.calibration.drifting import (
+    WAVELENGTH_NM,
+    base,
+    devices,
+    drifted_bench,
+    headset,
+    ideal_bundle,
+    opened,
+)
 from trainer.captures.grating_powers import phase_of_power
 
 SMALL = (40, 52)
@@ -109,7 +121,7 @@ def test_derivatives_are_what_differences_say() -> None:
     one = ColourLightPath(full, WAVELENGTH_NM)
     rng = np.random.default_rng(2)
     gray = rng.integers(0, 256, SMALL, dtype=np.uint8)
-    shot = Shot("green", gray, np.zeros(SMALL, np.float32), np.ones(SMALL, np.float32))
+    shot = shot_of("green", gray, np.zeros(SMALL, np.float32), 0.0, np.ones(SMALL, np.float32))
     layout = ParameterLayout(("green",), 3, 2)
     start = layout.moved(
         layout.nothing(Estimate(Drift(), View(SMALL))), 0.02 * rng.normal(size=int(layout.edges[-1]))
@@ -274,3 +286,38 @@ def test_grains_use_every_gray_level_and_differ_with_the_seed() -> None:
     assert (one != grains((120, 160), 2, 1)).mean() > 0.9
     path = ideal_path((120, 160), 8e-3)
     assert path.grid.pitch == PITCH and panel_phase(path, one.astype(np.int64)).shape == (120, 160)
+
+
+def test_a_capture_keeps_its_weights_in_half_of_the_memory() -> None:
+    rng = np.random.default_rng(7)
+    counts = rng.integers(60, 4000, SMALL).astype(np.uint16)
+    weight = np.where(counts > 3900, 0, 1 / (4 + 0.2 * counts)).astype(np.float32)
+    shot = shot_of("green", np.zeros(SMALL, np.uint8), counts, 64.0, weight)
+    assert shot.signal.dtype == shot.weight.dtype == np.float32
+    np.testing.assert_array_equal(shot.signal, counts.astype(np.float32) - 64)
+    np.testing.assert_allclose(shot.weight, weight, rtol=2**-8)
+    np.testing.assert_array_equal(shot.weight == 0, weight == 0)
+    assert shot.counts.nbytes + shot.weight_halves.nbytes == weight.nbytes
+
+
+@pytest.mark.parametrize(
+    ("share", "pictures"), [(0.0, 0), (0.001, 0), (0.04, 1), (0.1, 2), (0.3, 5), (0.9, 59)]
+)
+def test_a_slow_panel_is_waited_for_until_little_is_left(share: float, pictures: int) -> None:
+    assert settling_periods(share) == pictures
+    assert share ** (pictures + 1) <= 1 / 512 and (pictures == 0 or share**pictures > 1 / 512)
+
+
+def test_a_calibration_on_a_slow_panel_finds_the_drift_alone(tmp_path: Path) -> None:
+    shape, share = (48, 64), 0.1
+    bench = drifted_bench("panel_wavefront", shape=shape)
+    bench = replace(bench, defects=(*bench.defects, make_defect("slow_response", share=share)))
+    found = {
+        said: calibrate(opened(headset(bench)), read_bundle(ideal_bundle(tmp_path / str(said), shape, said)))
+        for said in (0.0, share)
+    }
+    assert found[0.0].verdict != "recalibrated", "without waiting, each picture has a tenth of the one before"
+    assert found[share].verdict == "recalibrated" and found[share].complete
+    assert found[share].after.errors.excess < 0.01 * found[0.0].after.errors.excess
+    before, after = (found[share].pictures["green"][when][1] for when in ("before", "after"))
+    assert after > before + 6
