@@ -155,6 +155,12 @@ def panel_fields(table: Table) -> int:
     return _panel_table(table).fields
 
 
+def frame_s(table: Table) -> float:
+    """Time of a frame with all of its fields on the panel of a configuration's [panel], s."""
+    settings = _panel_table(table)
+    return settings.fields * round(1e6 / settings.refresh_hz) * 1e-6
+
+
 def gated_light(table: Table, pulses: int) -> GatedLight | None:
     """How the panel of a configuration's [panel] gates the lasers, at most; None where it does not.
 

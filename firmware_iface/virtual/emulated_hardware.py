@@ -1,8 +1,9 @@
 """A headset's hardware, emulated at the level of its buses' bytes, with a simulated bench between its parts.
 
-The frame on the panel board and the light of the laser board give the camera's picture. The panel's light outputs gate
-the lasers, in version 2 of its protocol each one to its own fields. `served` runs it in a process of its own, so that
-it continues when the process that drives it dies, as hardware does.
+The frame on the panel board and the light of the laser board give the camera's picture. A slow panel takes one step in
+each period of the board; a picture shows it as it is in the period in which its exposure begins. The panel's light
+outputs gate the lasers, in version 2 of its protocol each one to its own fields. `served` runs it in a process of its
+own, so that it continues when the process that drives it dies, as hardware does.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
 from firmware_iface.virtual.bench_loading import load_bench
 from firmware_iface.virtual.bench_process import bench_process
 from firmware_iface.virtual.fault_injection import Faults
+from firmware_iface.virtual.further_defects import SlowResponse
 from firmware_iface.virtual.i2c import LaserBoard
 from firmware_iface.virtual.oak import OakModel, expose_bench
 from firmware_iface.virtual.usb.panel_board import BoardModel, LitPattern
@@ -60,6 +62,7 @@ class EmulatedHardware:
     def __init__(self, bench: str, seed: int = 0) -> None:
         self.bench = load_bench(bench)
         self._expose = bench_process(self.bench, seed)
+        self._slow = self.bench.defect(SlowResponse) is not None
         self._channels = tuple(c.name for c in self.bench.channels)
         self.board = BoardModel((self.bench.panel.height, self.bench.panel.width))
         self.light: deque[tuple[float, float]] = deque([(time.monotonic(), 0.0)], REMEMBERED)
@@ -126,7 +129,8 @@ class EmulatedHardware:
         with self._lock:
             emitted = self.lasers.emitted_uw
             power = {c: min(1.0, emitted.get(c, 0.0) / self._full_uw.get(c, 1.0)) for c in self._channels}
-            return self._expose(self._lit_fields(exposure_ms * 1e-3), power, exposure_ms)
+            before = self.board.shown_before() if self._slow else ()
+            return self._expose(self._lit_fields(exposure_ms * 1e-3), power, exposure_ms, before)
 
     def _lit_fields(self, exposure_s: float) -> tuple[LitField, ...]:
         """The patterns on the panel, with the share of an exposure that begins now in which each is lit."""

@@ -102,7 +102,7 @@ class Drive:
         """Whether the amplitude depends on the gray level."""
         return self._absorption is not None
 
-    def turned(self, gray: NDArray[np.floating], before: Array | None = None) -> Array:
+    def turned(self, gray: NDArray[np.floating], before: Array | None = None, times: int = 1) -> Array:
         """How far the pixels' cells have turned, as a share of one wave before gain and thickness, [H, W].
 
         Parameters
@@ -111,11 +111,14 @@ class Drive:
             Fractions allowed.
         before : float64 array [H, W], optional
             What this returned for the capture before; None: the gray levels have been shown for long.
+        times : int
+            For how many captures they are shown.
         """
         settled = self._shape(self._has(gray))
         if before is None or not self.slow:
             return settled
-        return (1 - self._left) * settled + self._left * before
+        left = self._left**times
+        return (1 - left) * settled + left * before
 
     def magnitude(self, gray: NDArray[np.floating], before: Array | None = None) -> Single:
         """Phase of each pixel before its sign, rad; arguments as of `turned`."""
@@ -206,7 +209,7 @@ class Drive:
         """Phase on sub-pixels, [qH, qW], of phase a pixel, [H, W]; with the panel's sign."""
         phase = np.float32(self.sign) * phase
         if self._smear_y is None or self._smear_x is None:
-            return np.repeat(np.repeat(phase, self.q, 0), self.q, 1)
+            return np.repeat(np.repeat(phase, self.q, 1), self.q, 0)
         return _smear(_smear(phase, self._smear_y).T, self._smear_x).T
 
     def spread_adjoint(self, phase: Single) -> Single:

@@ -54,23 +54,38 @@ class Surface:
         measured, turn = measured_field(bench.defect(MeasuredField), wavelength_nm, h * q, w * q)
         beam = beam_amplitude(bench.defect(Illumination), h * q, w * q) * measured
         fill = leak.fill_factor if leak else bench.panel.fill_factor
-        active = active_area(fill, q)
-        covered = np.tile(active, (h, w))
-        amplitude = beam * _stripes(bench.defect(Stripes), h, w, q)
+        covered = np.tile(active_area(fill, q), (1, w))  # of one row of pixels
+        stripes = _stripes(bench.defect(Stripes), h, w, q)
         path = panel_path_nm(bench.defect(PanelWavefront), h * q, w * q, w / h)
-        surface = amplitude * turn * np.exp(2j * np.pi * path / wavelength_nm)
-        surface = surface * _dust(bench.defect(Specks), h, w, q)
-        self.lit: Complex = (surface * covered).astype(np.complex64)
+        dust = _dust(bench.defect(Specks), h, w, q)
         self.dark = leak is None
-        self.unlit: Complex = np.zeros((1, 1), np.complex64)
+        self.lit: Complex = np.empty((h * q, w * q), np.complex64)
+        self.unlit: Complex = np.zeros((1, 1) if leak is None else (h * q, w * q), np.complex64)
         if leak:
             dead = leak.dead_amplitude * np.exp(1j * np.deg2rad(leak.dead_phase_deg))
             cycles = bench.panel.pitch_um / wavelength_nm  # 1 mrad, in cycles a pixel
-            tilt = tilt_factor(
+            tilt_y, tilt_x = tilt_turns(
                 (h, w), q, (leak.surface_tilt_y_mrad * cycles, leak.surface_tilt_x_mrad * cycles)
             )
             first = leak.surface_amplitude * np.exp(1j * np.deg2rad(leak.surface_phase_deg))
-            self.unlit = (surface * (1 - covered) * dead + beam * first * tilt).astype(np.complex64)
+        for block in _blocks(h * q, w * q, q):
+            beam_here, stripes_here, turn_here, path_here, dust_here = (
+                a if len(a) == 1 else a[block] for a in (beam, stripes, turn, path, dust)
+            )
+            covered_here = np.tile(covered, ((block.stop - block.start) // q, 1))
+            surface = beam_here * stripes_here * turn_here * np.exp(2j * np.pi / wavelength_nm * path_here)
+            surface = surface * dust_here
+            self.lit[block] = surface * covered_here
+            if leak:
+                reflected = beam_here * first * (tilt_y[block] * tilt_x)
+                self.unlit[block] = surface * (1 - covered_here) * dead + reflected
+
+
+def _blocks(height: int, width: int, multiple: int = 1) -> Iterator[slice]:
+    """Rows of a large array, some at a time and a multiple of that many: what is needed on the way stays small."""
+    step = multiple * max(1, 2**19 // (width * multiple))
+    for k in range(0, height, step):
+        yield slice(k, min(k + step, height))
 
 
 def active_area(fill_factor: float, q: int) -> Array:
@@ -83,10 +98,18 @@ def active_area(fill_factor: float, q: int) -> Array:
 
 def tilt_factor(shape: tuple[int, int], q: int, cycles_a_pixel: tuple[float, float]) -> Complex128:
     """exp(2 pi j f . x) on sub-pixels, about the panel's centre; f is (fy, fx) in cycles a pixel."""
+    turn_y, turn_x = tilt_turns(shape, q, cycles_a_pixel)
+    return turn_y * turn_x
+
+
+def tilt_turns(
+    shape: tuple[int, int], q: int, cycles_a_pixel: tuple[float, float]
+) -> tuple[Complex128, Complex128]:
+    """The two factors of `tilt_factor`, [qH, 1] and [1, qW]."""
     y, x = share_grid(shape[0] * q, shape[1] * q)
     turn_y = np.exp(2j * np.pi * cycles_a_pixel[0] * y * shape[0] / 2)
     turn_x = np.exp(2j * np.pi * cycles_a_pixel[1] * x * shape[1] / 2)
-    return turn_y * turn_x
+    return turn_y, turn_x
 
 
 def beam_amplitude(d: Illumination | None, height: int, width: int) -> Array:
@@ -94,12 +117,16 @@ def beam_amplitude(d: Illumination | None, height: int, width: int) -> Array:
     if d is None:
         return np.ones((1, 1))
     y, x = share_grid(height, width)
-    r2 = ((x - d.centre_x_share) / d.waist_x_share) ** 2 + ((y - d.centre_y_share) / d.waist_y_share) ** 2
-    amplitude = np.exp(-r2) * (1 + d.ring * np.cos(9 * r2 + 1))
+    y, x = ((y - d.centre_y_share) / d.waist_y_share) ** 2, ((x - d.centre_x_share) / d.waist_x_share) ** 2
+    amplitude = np.empty((height, width))
+    for block in _blocks(height, width):
+        r2 = y[block] + x
+        amplitude[block] = np.exp(-r2) * (1 + d.ring * np.cos(9 * r2 + 1))
     if d.rough_rms:
         nodes = (d.rough_nodes_y, d.rough_nodes_x)
-        amplitude = amplitude * np.exp(d.rough_rms * rough_surface(nodes, d.rough_seed, height, width))
-    return amplitude / np.sqrt(np.mean(amplitude**2))
+        amplitude *= np.exp(d.rough_rms * rough_surface(nodes, d.rough_seed, height, width))
+    amplitude /= np.sqrt(np.mean(amplitude**2))
+    return amplitude
 
 
 def panel_path_nm(d: PanelWavefront | None, height: int, width: int, aspect: float) -> Array:
@@ -109,13 +136,17 @@ def panel_path_nm(d: PanelWavefront | None, height: int, width: int, aspect: flo
     y, x = share_grid(height, width)
     y = y / aspect
     turn = np.deg2rad(d.orientation_deg)
-    a, b = x * np.cos(turn) + y * np.sin(turn), y * np.cos(turn) - x * np.sin(turn)
-    dent = np.exp(-((x + 0.4) ** 2 + (y - 0.2) ** 2) / 0.08)
-    path = (a**2 - 0.8 * b**2) + 0.25 * (a**3 - 3 * a * b**2) + 0.15 * np.cos(3 * a + b) - 0.12 * dent
-    path = d.peak_to_valley_nm * path / np.ptp(path)
+    path = np.empty((height, width))
+    for block in _blocks(height, width):
+        a = x * np.cos(turn) + y[block] * np.sin(turn)
+        b = y[block] * np.cos(turn) - x * np.sin(turn)
+        a2, b2 = a * a, b * b
+        dent = np.exp(-((y[block] - 0.2) ** 2) / 0.08) * np.exp(-((x + 0.4) ** 2) / 0.08)
+        path[block] = (a2 - 0.8 * b2) + 0.25 * a * (a2 - 3 * b2) + 0.15 * np.cos(3 * a + b) - 0.12 * dent
+    path *= d.peak_to_valley_nm / np.ptp(path)
     if d.rough_rms_rad:
         rough = rough_surface((d.rough_nodes_y, d.rough_nodes_x), d.rough_seed, height, width)
-        path = path + d.rough_rms_rad * REFERENCE_NM / (2 * np.pi) * rough
+        path += d.rough_rms_rad * REFERENCE_NM / (2 * np.pi) * rough
     return path
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,6 +102,17 @@ class VirtualHeadset:
             Unless within 2 m.
         """
         self.plane_mm = checked_plane(plane_mm)
+
+    def has_shown(self, patterns: Sequence[tuple[Gray, int]]) -> None:
+        """Say what the panel showed before what it shows now, where captures do not tell.
+
+        Parameters
+        ----------
+        patterns : sequence of (uint8 array [H, W], int)
+            And for how many periods each was shown, the last one last; the first has been there for long.
+        """
+        for k, (gray, periods) in enumerate(patterns):
+            self._turned = self._optics.turned(gray, self._turned if k else None, periods)
 
     def _capture(self) -> NDArray[np.uint16]:
         dose = self.camera.exposure_ms / 10 * self._drift.gain(self.captures)

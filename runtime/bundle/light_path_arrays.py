@@ -9,7 +9,9 @@
 Fields that are None in a LightPath are not listed; `crosstalk` is two arrays, crosstalk_rows and
 crosstalk_columns, and `modulation` three: modulation_ends, modulation_factors and modulation_shares.
 Arrays that several planes or colours share are stored once. Where the panel has few gray levels, the description's
-`panel` lists them as `gray_levels`: a light path's response is then of these alone, so that solvers see them.
+`panel` lists them as `gray_levels`: a light path's response is then of these alone, so that solvers see them. Where
+it is slow, `panel` has `slow_response_share` (unit 1): of the phase before, what is left when a pattern was shown for
+one period of the panel. Light paths are for patterns that stay.
 """
 
 from __future__ import annotations
@@ -197,6 +199,24 @@ def _gray_levels(bundle: Bundle) -> tuple[tuple[int, ...], float]:
     if not _is_number(levels) or levels < 1:
         raise InputError(f"{MANIFEST}: 'levels' of its panel is {levels!r}: export the bundle again")
     return checked_gray_levels(panel.get("gray_levels"), f"'gray_levels' in {MANIFEST}"), levels
+
+
+def slow_response_share(bundle: Bundle) -> float:
+    """Share of the phase before that a bundle's panel keeps until a pattern's time is over; 0 where it is not slow.
+
+    Raises
+    ------
+    InputError
+        Unless it is from 0 to less than 1.
+    """
+    panel = bundle.description.get("panel")
+    share: Any = panel.get("slow_response_share", 0.0) if isinstance(panel, Mapping) else 0.0
+    if not _is_number(share) or not 0 <= share < 1:
+        raise InputError(
+            f"{MANIFEST}: 'slow_response_share' of its panel is {share!r}, and a share is from 0 to less than 1: "
+            "export the bundle again"
+        )
+    return float(share)
 
 
 def plane_of(bundle: Bundle, channel: str | None = None, plane_mm: float | None = None) -> float:

@@ -42,11 +42,12 @@ def run(args: Namespace, screen: Screen) -> Result:
     import numpy as np
 
     from runtime.bundle.bundle_folder import read_bundle
-    from runtime.bundle.light_path_arrays import bundle_channels, load_light_path
+    from runtime.bundle.light_path_arrays import bundle_channels, load_light_path, slow_response_share
     from runtime.calibration.taking import Taker
     from runtime.camera.view import View, view_of
     from runtime.headset.colour_fields import open_colours
     from runtime.headset.open_devices import is_simulated
+    from runtime.lightpath.overdrive import settling_periods
     from runtime.networks.onnx_approximator import approximator_of
     from runtime.refinement.panel_and_camera import PanelAndCamera
     from runtime.refinement.picture_refinement import Refinement, refine
@@ -78,7 +79,8 @@ def run(args: Namespace, screen: Screen) -> Result:
                 f"{args.bundle} does not know where this camera looks: run hololoop-runtime calibrate first"
             )
         state = Refinement(paths, approximator, target, first, log)
-        taker = Taker(devices, lambda what: None)
+        settling = settling_periods(slow_response_share(bundle))
+        taker = Taker(devices, lambda what: None, settling=settling)
         black, _ = taker.darkness()
         exposures: dict[str, float] = {}
 
@@ -91,9 +93,8 @@ def run(args: Namespace, screen: Screen) -> Result:
                 taker.light(channel)
                 exposures[channel] = taker.expose(gray, black)
             turns = [partial(turn, c) for c in channels] if len(channels) > 1 else None
-            steps = refine(
-                state, PanelAndCamera(devices.panel, devices.camera, view, black, turns), args.captures
-            )
+            seen = PanelAndCamera(devices.panel, devices.camera, view, black, turns, settling)
+            steps = refine(state, seen, args.captures)
         finally:
             devices.lasers.off()
     for out, gray in zip(outs, state.gray if outs else [], strict=True):

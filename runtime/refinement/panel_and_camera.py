@@ -27,12 +27,21 @@ class PanelAndCamera:
     turns : sequence of callable, or None
         For each of several colours, a function that makes it the only one that is lit, at its power and exposure. None:
         the only colour is lit already, and its light is not changed.
+    settling : int
+        Pictures of each pattern that are not used, because a slow panel still shows the pattern before.
     """
 
     def __init__(
-        self, panel: Any, camera: Any, view: View, black: float, turns: Sequence[Turn] | None = None
+        self,
+        panel: Any,
+        camera: Any,
+        view: View,
+        black: float,
+        turns: Sequence[Turn] | None = None,
+        settling: int = 0,
     ) -> None:
         self.panel, self.camera, self.view, self.black, self.turns = panel, camera, view, black, turns
+        self.settling = settling
 
     def __call__(self, gray: np.ndarray) -> np.ndarray:
         """Show the colours of a pattern one after the other and capture each.
@@ -54,6 +63,8 @@ class PanelAndCamera:
                 self.panel.show_colours(gray)
             else:
                 self.panel.show(field)
+            for _ in range(self.settling):
+                self.camera.capture()
             counts = np.asarray(self.camera.capture(), np.float32) - np.float32(self.black)
             captured.append(on_panel(counts, self.view, field.shape))
         return np.stack(captured)

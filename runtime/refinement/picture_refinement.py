@@ -201,13 +201,13 @@ class Refinement:
     def _scaled(self, simulated: np.ndarray, captured: np.ndarray) -> np.ndarray:
         """A captured picture, each colour scaled to D of the simulated picture."""
         self._learning.evaluate(simulated, captured)
-        return np.stack([_matched(y, d) for y, d in zip(captured, self.approximator.corrected, strict=True)])
+        return np.stack([matched(y, d) for y, d in zip(captured, self.approximator.corrected, strict=True)])
 
     def _moved(self, simulated: np.ndarray, scaled: np.ndarray, pullbacks: list[Pullback]) -> np.ndarray:
         """The next pattern: one step down the gradient, with the captured picture instead of the simulated one."""
         self._learning.evaluate(simulated, scaled)
         made = _amplitude(self.approximator.corrected)
-        wanted = np.stack([_matched(t, y) for t, y in zip(self.target, scaled, strict=True)])
+        wanted = np.stack([matched(t, y) for t, y in zip(self.target, scaled, strict=True)])
         # The network subtracts a target from its own output: with this target, the camera's residual remains.
         instead = np.maximum(made - _amplitude(scaled) + _amplitude(wanted), 0) ** 2 - EPSILON
         self._learning.evaluate(simulated, np.maximum(instead, 0))
@@ -250,7 +250,7 @@ def _amplitude(light: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(light, 0) + EPSILON)
 
 
-def _matched(light: np.ndarray, reference: np.ndarray) -> np.ndarray:
+def matched(light: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """Light [H, W] scaled so that its amplitude is nearest to that of a reference."""
     root, reference_root = np.sqrt(light), np.sqrt(np.maximum(reference, 0))
     scale = float(np.vdot(root, reference_root)) / max(float(np.vdot(root, root)), 1e-30)

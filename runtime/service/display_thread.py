@@ -2,7 +2,7 @@
 
 Only this thread writes to the panel, so no two frames mix. Patterns are shown in order, one at each display time. A
 pattern that the panel did not accept is tried again at the next display time, until it is stale. A panel that was
-disconnected is opened again as soon as it answers.
+disconnected is opened again as soon as it answers. A slow panel is overdriven (`slow_panel`), by what it really showed.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 
 from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
 from firmware_iface.panel.fields import colours_in_turn
+from runtime.service.slow_panel import SlowPanel
 
 AGAIN_S = 0.02  # between attempts to open the panel
 ASK_S = 0.03  # between requests for the status of an idle panel
@@ -31,6 +32,10 @@ class DisplayClock:
     def __init__(self, period_ns: int) -> None:
         self.period_ns = period_ns
         self.origin_ns = time.monotonic_ns()
+
+    def number(self, tick: int) -> int:
+        """How many display times there were up to this one."""
+        return (tick - self.origin_ns) // self.period_ns
 
     def after(self, now_ns: int) -> int:
         """The first display time at or after `now_ns`."""
@@ -115,6 +120,8 @@ class DisplayThread(threading.Thread):
         Until when the pattern on the panel may be lit.
     lasers : sequence of int
         The laser of each colour, where a frame has several fields; set when the panel is opened.
+    slow : SlowPanel or None
+        Overdrives the patterns; None where the panel is not slow.
     lit_colours : frozenset of int or None
         Colours that have light in the frame on the panel; None: it has one field, which is not gated.
     """
@@ -135,6 +142,8 @@ class DisplayThread(threading.Thread):
         self.turned_ns = time.monotonic_ns()
         self.lit_until_ns = 0
         self.lasers: Sequence[int] = ()
+        self.slow: SlowPanel | None = None
+        self._on_panel: DisplayPattern | None = None  # shown last; its gray levels are those that are wanted
         self.lit_colours: frozenset[int] | None = None
 
     @property
@@ -173,19 +182,29 @@ class DisplayThread(threading.Thread):
 
     def _turn(self, tick: int) -> None:
         """Do the work of one display time."""
-        pattern = self._due(tick)
+        pattern, slow, number = self._due(tick), self.slow, self._clock.number(tick)
         try:
             if pattern is not None:
                 self.taken_ns = tick
                 began = time.monotonic_ns()
-                self._show(pattern)
+                gray = slow.driven(pattern.gray, number, pattern.refined) if slow else pattern.gray
+                self._show(pattern, gray)
+                self._on_panel = pattern
                 self._shown(pattern, tick, began)
+            elif slow and self._on_panel and (again := slow.again(number)) is not None:
+                self._show(self._on_panel, again)
+                self.answered_ns = time.monotonic_ns()
+                self._out = False
             elif time.monotonic_ns() - self.answered_ns > ASK_S * 1e9:
                 self._panel.status()
                 self.answered_ns = time.monotonic_ns()
                 self._out = False
         except DEVICE_ERRORS as error:
             self._events.panel_fault(error, self._out)
+            if slow:
+                # an overdriven pattern that stays shows what nobody has predicted
+                self.lit_until_ns = self.lit_until_ns if slow.settled else 0
+                slow.forget()
             if isinstance(error, DeviceGoneError | OSError):
                 with suppress(*DEVICE_ERRORS):
                     self._panel.close()
@@ -193,12 +212,12 @@ class DisplayThread(threading.Thread):
             if pattern is not None:
                 self._keep(pattern)
 
-    def _show(self, pattern: DisplayPattern) -> None:
-        """Show the pattern of one field, or the frame of several, swapped in as a whole."""
-        if len(pattern.gray) == 1:
-            self._panel.show(pattern.gray[0])
+    def _show(self, pattern: DisplayPattern, gray: np.ndarray) -> None:
+        """Show the pattern of one field, or the frame of several, swapped in as a whole, by these gray levels."""
+        if len(gray) == 1:
+            self._panel.show(gray[0])
             return
-        frame = colours_in_turn(pattern.gray, self.lasers, pattern.brightness, self._panel.field_us)
+        frame = colours_in_turn(gray, self.lasers, pattern.brightness, self._panel.field_us)
         lit = frozenset(k % len(self.lasers) for k, field in enumerate(frame) if field.lasers)
         if self.lit_colours is not None:
             self.lit_colours &= lit  # what the frame before had and this has: until it is displayed

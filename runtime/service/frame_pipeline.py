@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from firmware_iface.configured_devices import gated_light, laser_numbers, open_panel, panel_fields
+from firmware_iface.configured_devices import frame_s, gated_light, laser_numbers, open_panel, panel_fields
 from firmware_iface.errors import InputError
 from firmware_iface.lasers.eye_safety import GatedLight
 from runtime.service import process_messages, protocol
@@ -28,6 +28,7 @@ from runtime.service.program_session import FrameJob, RequestError, Session
 from runtime.service.protocol import Code
 from runtime.service.refinement_captures import RefinementCaptures
 from runtime.service.shared_memory import crc32
+from runtime.service.slow_panel import slow_panel
 from runtime.service.solver_client import SolverClient, SolverSend
 
 HAND_OVER_NS = 1_000_000  # from the solver's deadline until the display has its pattern
@@ -162,6 +163,9 @@ class FramePipeline:
 
     def solver_ready(self) -> None:
         """The solver can take jobs."""
+        table = self._configuration.devices["panel"]
+        passes = max(1, round(self.clock.period_ns * 1e-9 / frame_s(table)))
+        self.display.slow = slow_panel(self.solver.overdrive, panel_fields(table), passes)
         self._send_targets()
 
     def solver_lost(self, why: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,8 +19,9 @@ from firmware_iface.configured_devices import (
 from firmware_iface.errors import InputError
 from firmware_iface.lasers.eye_safety import SIZES_MRAD, spot_shares
 from runtime.bundle.bundle_folder import INITIALISER, Bundle, read_bundle
-from runtime.bundle.light_path_arrays import bundle_channels, load_light_path
+from runtime.bundle.light_path_arrays import bundle_channels, load_light_path, slow_response_share
 from runtime.lightpath.light_path import LightPath
+from runtime.lightpath.overdrive import overdrive_tables
 from runtime.networks.onnx_approximator import approximator_of
 from runtime.service.configuration import Configuration
 from runtime.solver import Solution, Solver, shown
@@ -44,7 +45,8 @@ class Pattern:
         The picture is black, which no pattern can show.
     shares : tuple of float
         Shares of the light in its brightest spots (eye_safety.spot_shares), colour after colour, each the largest of
-        the colour's patterns; empty where they were not asked for.
+        the colour's patterns, and raised by 1 / (1 - s) on a panel that keeps the share s of the phase before; empty
+        where they were not asked for.
     brightness : tuple of float
         Light of each colour, as a share of what a white picture has; empty for a picture of one field, which has all.
     """
@@ -68,11 +70,15 @@ class PatternSolver:
         Angle of a pixel at the eye, for predicting the brightest spots of each pattern; 0: they are not predicted.
     frames : int
         N, the patterns for each colour of a picture.
+    slow_share : float
+        Of the phase before that the panel keeps until a pattern's time is over.
     **options
         Of `Solver`.
 
     Attributes
     ----------
+    overdrive : uint8 array [C, 3, 256, 256] or None
+        `overdrive_tables` of each colour, where the panel is slow.
     colours : tuple of str
     shape : tuple of int
         Of a picture: (C, H, W).
@@ -81,12 +87,20 @@ class PatternSolver:
     """
 
     def __init__(
-        self, paths: dict[str, LightPath], mrad_per_pixel: float = 0.0, frames: int = 1, **options: Any
+        self,
+        paths: dict[str, LightPath],
+        mrad_per_pixel: float = 0.0,
+        frames: int = 1,
+        slow_share: float = 0.0,
+        **options: Any,
     ) -> None:
         self.colours = tuple(paths)
         self._paths, self._mrad, self._frames = list(paths.values()), mrad_per_pixel, frames
+        self._slow_share = slow_share
         self.shape = (len(paths), *self._paths[0].grid.shape)
         self.fields = len(paths) * frames
+        tables = [overdrive_tables(path.response, slow_share, path.gray_levels) for path in self._paths]
+        self.overdrive = np.stack(tables) if slow_share else None
         self._solvers = [Solver(path, frames=frames, **options) for path in self._paths]
 
     def patterns(self, target: np.ndarray, deadline_ns: int) -> Iterator[Pattern]:
@@ -142,7 +156,8 @@ class PatternSolver:
         shares: tuple[float, ...] = ()
         if self._mrad:
             for k, path in enumerate(self._paths):
-                shares += brightest_spots(path, gray[:, k], self._mrad) if k in solved else NO_LIGHT
+                spots = brightest_spots(path, gray[:, k], self._mrad) if k in solved else NO_LIGHT
+                shares += raised(spots, self._slow_share)
         # a pattern puts all of its light into the picture, however bright that is: the light's time makes it right
         brightness = tuple(float(c.mean()) for c in target) if self.fields > 1 else ()
         lowest_db = min(solution.expected_psnr_db for solution in solved.values())
@@ -158,6 +173,11 @@ def brightest_spots(path: LightPath, grays: np.ndarray, mrad_per_pixel: float) -
     """
     each = [spot_shares(shown(path, gray), mrad_per_pixel) for gray in grays]
     return tuple(map(max, zip(*each, strict=True)))
+
+
+def raised(spots: Sequence[float], slow_share: float) -> tuple[float, ...]:
+    """Predicted shares of light in bright spots, with room for a slow panel, which is on its way to the pattern."""
+    return tuple(min(1.0, spot / (1 - slow_share)) for spot in spots)
 
 
 def shown_colours(configuration: Configuration, bundle: Bundle) -> list[str]:
@@ -213,6 +233,7 @@ def open_solver(configuration: Configuration) -> PatternSolver:
         paths,
         mrad_per_pixel(configuration.devices["lasers"]),
         panel_fields(configuration.devices["panel"]) // len(colours),
+        slow_response_share(bundle),
         grid="panel",  # before a deadline, more iterations gain more than the finer grid
         approximator=approximator,
         initialiser=bundle.networks.get(INITIALISER),

@@ -1,7 +1,7 @@
 """Messages between the supervisor and its two child processes.
 
 From the supervisor to the solver   TargetRing, SolveJob, FreeSlot, RefinePicture, RefinementCapture, Ping
-From the solver to the supervisor   PatternRing, SolvedPattern, FailedJob, RefinementEnd, Pong
+From the solver to the supervisor   OverdriveTables, PatternRing, SolvedPattern, FailedJob, RefinementEnd, Pong
 From the supervisor to the camera   TakePicture
 From the camera to the supervisor   CameraPicture (the answer to TakePicture has the picture), CameraMissing
 """
@@ -30,6 +30,12 @@ class PatternRing(NamedTuple):
     height: U32
     width: U32
     colours: Text  # their names, in this order, with commas
+
+
+class OverdriveTables(NamedTuple):
+    """What to send to a slow panel; comes before PatternRing, with a memfd: uint8 [channels, 3, 256, 256]."""
+
+    channels: U32
 
 
 class TargetRing(NamedTuple):
@@ -138,6 +144,7 @@ SOLVER = Vocabulary(
         9: RefinePicture,
         10: RefinementCapture,
         11: RefinementEnd,
+        12: OverdriveTables,
     }
 )
 CAMERA = Vocabulary({1: CameraPicture, 2: CameraMissing, 3: TakePicture})

@@ -120,7 +120,7 @@ class Shown(NamedTuple):
     slot: U32
     psnr_db: F32  # of amplitude, as the calibrated model predicts it
     flags: U32
-    pattern_crc: U32
+    pattern_crc: U32  # of the gray levels that are wanted; a slow panel is sent others
     reserved: U32 = 0
 
 

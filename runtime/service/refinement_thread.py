@@ -19,12 +19,12 @@ from firmware_iface.configured_devices import mrad_per_pixel, panel_fields
 from firmware_iface.errors import InputError
 from firmware_iface.lasers.eye_safety import spot_shares
 from runtime.bundle.bundle_folder import read_bundle
-from runtime.bundle.light_path_arrays import load_light_path
+from runtime.bundle.light_path_arrays import load_light_path, slow_response_share
 from runtime.camera.view import View, on_panel, view_of
 from runtime.networks.onnx_approximator import approximator_of
 from runtime.refinement.picture_refinement import Refinement
 from runtime.service.configuration import Configuration
-from runtime.service.frame_solver import Pattern
+from runtime.service.frame_solver import Pattern, raised
 from runtime.service.process_messages import RefinementEnd, RefinePicture
 from runtime.service.shared_memory import crc32
 from runtime.solver import quality, shown, solve
@@ -117,7 +117,7 @@ class RefinementThread(threading.Thread):
         gray, path = prepared.state.gray, prepared.state.paths[0]
         light = shown(path, gray[0])
         mrad = mrad_per_pixel(self._configuration.devices["lasers"])
-        shares = spot_shares(light, mrad) if mrad else ()
+        shares = raised(spot_shares(light, mrad), prepared.slow_share) if mrad else ()
         psnr_db = quality(light, self._target[0]).psnr_db
         self._awaited = crc32(gray)
         self.pattern = Pattern(gray, psnr_db, final=True, shares=shares)
@@ -125,10 +125,11 @@ class RefinementThread(threading.Thread):
 
 @dataclass(frozen=True)
 class _PreparedRefinement:
-    """A refinement that is ready to begin, and where the camera sees the image plane."""
+    """A refinement that is ready to begin, where the camera sees the image plane, and how slow the panel is."""
 
     state: Refinement
     view: View
+    slow_share: float
 
 
 def _prepared(configuration: Configuration, target: np.ndarray) -> _PreparedRefinement:
@@ -153,4 +154,5 @@ def _prepared(configuration: Configuration, target: np.ndarray) -> _PreparedRefi
         raise InputError("the picture is black: there is nothing to see")
     first = solve(path, target[0]).phase[None]
     view = view_of(bundle) or View(path.grid.shape)
-    return _PreparedRefinement(Refinement([path], approximator, target, first, sys.stderr), view)
+    state = Refinement([path], approximator, target, first, sys.stderr)
+    return _PreparedRefinement(state, view, slow_response_share(bundle))

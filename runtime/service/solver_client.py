@@ -11,6 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from firmware_iface.errors import InputError
+from runtime.lightpath.overdrive import TABLES
 from runtime.service import process_messages
 from runtime.service.child_processes import ChildProcess
 from runtime.service.configuration import Configuration
@@ -18,7 +19,7 @@ from runtime.service.event_loop import EventLoop
 from runtime.service.fault_log import FaultLog
 from runtime.service.message_format import ProtocolError
 from runtime.service.metrics import Metrics
-from runtime.service.shared_memory import Ring, open_ring
+from runtime.service.shared_memory import Ring, open_ring, read_sealed
 
 PING_NS = 30_000_000
 HUNG_NS = 1_000_000_000  # a solver that is silent so long after it counts as stale, and so dark, is ended
@@ -63,6 +64,8 @@ class SolverClient:
         (C, H, W) of a picture; None until the solver was ready for the first time.
     colours : tuple of str
         Names of its colours. They stay: the lasers are budgeted for them.
+    overdrive : uint8 array [C, 3, 256, 256] or None
+        `overdrive_tables` of each colour, where the bundle says that the panel is slow.
     fresh_until_ns : int, ns
         Until when the solver counts as fresh (CLOCK_MONOTONIC); 0: it was lost.
     busy_until_ns : int, ns
@@ -83,6 +86,7 @@ class SolverClient:
         )
         self.shape: tuple[int, int, int] | None = None
         self.colours: tuple[str, ...] = ()
+        self.overdrive: np.ndarray | None = None
         self.fresh_until_ns = self.busy_until_ns = 0
         self._loop, self._faults, self._metrics = loop, faults, metrics
         self._stale_ns, self._events = stale_ns, events
@@ -140,6 +144,8 @@ class SolverClient:
             self._lost(f"its process died ({error})")
             return
         match message:
+            case process_messages.OverdriveTables(channels) if fd is not None:
+                self.overdrive = read_sealed(fd, (channels, *TABLES), np.uint8)
             case process_messages.PatternRing(slots, fields, channels, height, width, colours) if (
                 fd is not None
             ):
@@ -187,6 +193,7 @@ class SolverClient:
         self.process.stop()
         self._metrics.restarts.labels("solver").inc()
         self._fault(f"{why} and is started again")
+        self.overdrive = None
         if self._patterns is not None:
             self._patterns.close()
             self._patterns = None

@@ -27,6 +27,7 @@ from runtime.service.process_messages import (
     SOLVER,
     FailedJob,
     FreeSlot,
+    OverdriveTables,
     PatternRing,
     Ping,
     Pong,
@@ -38,7 +39,7 @@ from runtime.service.process_messages import (
 )
 from runtime.service.protocol import Code
 from runtime.service.refinement_thread import RefinementThread
-from runtime.service.shared_memory import Ring, crc32, make_ring, open_ring, read_sealed
+from runtime.service.shared_memory import Ring, crc32, make_ring, open_ring, read_sealed, sealed_copy
 from runtime.service.socket_link import MessageLink
 
 SLOTS = 4
@@ -190,6 +191,10 @@ def main(fd: str, configuration: str) -> None:
         return
     for _ in solver.patterns(np.ones(solver.shape, np.float32), time.monotonic_ns()):
         pass  # everything that the first use sets up is ready before the first frame
+    if solver.overdrive is not None:
+        tables = sealed_copy(solver.overdrive)
+        link.send(OverdriveTables(len(solver.overdrive)), fds=[tables])
+        os.close(tables)
     Worker(link, solver.shape, solver.fields, solver.colours, settings).run(solver.patterns)
 
 

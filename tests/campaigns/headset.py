@@ -76,6 +76,7 @@ def write_configuration(
     metrics_port: int = 0,
     patterns: int = 1,
     half_width: float = 1.0,
+    slow_share: float = 0.0,
 ) -> Path:
     """A bundle, a bench and a configuration in `folder`; returns the configuration's path.
 
@@ -100,13 +101,16 @@ def write_configuration(
         Of each colour of a picture.
     half_width : float
         Of the iris, as a share of the panel's band.
+    slow_share : float
+        Of the phase before that the panel keeps for a period, as the bundle says; the bench's panel is not slow.
     """
     small = shape == SHAPE
     distance_mm = DISTANCE_MM * shape[0] / SHAPE[0]
     path = converted(ideal_path(shape, distance_mm * 1e-3, half_width), np.float32)
     shown = COLOURS if colours else {"green": 520.0}
     records, arrays = pack_light_paths([(name, distance_mm, nm, path) for name, nm in shown.items()])
-    write_bundle(folder / "bundle", arrays, {"paths": records, "distance_mm": distance_mm}, {})
+    panel_keys = {"panel": {"slow_response_share": slow_share}} if slow_share else {}
+    write_bundle(folder / "bundle", arrays, {"paths": records, "distance_mm": distance_mm, **panel_keys}, {})
     channels = [f'[[channel]]\nname = "{name}"\nwavelength_nm = {nm}\n' for name, nm in shown.items()]
     coarse = "[simulation]\nsubpixels = 2\n" if colours else ""  # three colours take a third of the time each
     bench = BENCH.format(height=shape[0], width=shape[1], distance_mm=distance_mm)

@@ -196,6 +196,24 @@ def test_the_swap_waits_for_the_period_and_the_next_frame_for_the_swap() -> None
     frames.send(pattern(1))
 
 
+def test_the_model_knows_what_it_showed_before_and_for_how_many_periods() -> None:
+    now = [0.0]
+    model = BoardModel(SHAPE, clock=lambda: now[0])
+    frames = opened(model, timeout_s=0.02).frames
+    shown = []
+    for k, periods in ((0, 3), (1, 1), (2, 0)):
+        frames.send(pattern(k))
+        now[0] += 0.002  # it is shown from now on
+        shown = [(int(gray.sum()), count) for gray, count in model.shown_before()]
+        now[0] += 0.002 * max(0, periods - 1)
+    assert shown == [(0, 1), (int(pattern(0).sum()), 3), (int(pattern(1).sum()), 1)]
+    now[0] += 0.0081
+    assert [(int(gray.sum()), count) for gray, count in model.shown_before()] == [
+        *shown,
+        (int(pattern(2).sum()), 4),
+    ]
+
+
 def test_timing_is_set_read_back_and_refused_where_it_cannot_be() -> None:
     model = BoardModel(SHAPE)
     control = opened(model).control

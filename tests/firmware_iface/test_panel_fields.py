@@ -139,6 +139,25 @@ def test_a_frame_is_swapped_in_after_the_last_field_of_the_one_before() -> None:
     assert [sequence for sequence, _ in model.shown] == [1, 1, 1, 2, 2, 2]
 
 
+def test_the_model_knows_what_was_shown_before_the_frame_on_display() -> None:
+    """For how many periods each pattern: what a slow panel still shows of it follows."""
+    now = [0.0]
+    model = BoardModel(SHAPE, clock=lambda: now[0])
+    panel = opened(model)
+    first, second = picture(0), picture(1)
+    panel._fields.send_fields(first)
+    now[0] += 0.002
+    assert model.shown_before() == []
+    now[0] += 0.008  # it was shown once, and is shown in its second field again
+    assert [(crc(gray), periods) for gray, periods in model.shown_before()] == [
+        (crc(f.gray), 1) for f in first
+    ]
+    panel._fields.send_fields(second)
+    now[0] += 0.004
+    once = [(crc(f.gray), 1) for f in first]
+    assert [(crc(gray), periods) for gray, periods in model.shown_before()] == 2 * once
+
+
 def test_one_pattern_alone_is_lit_by_every_laser_and_for_no_more_of_the_time() -> None:
     model = BoardModel(SHAPE)
     panel = opened(model)

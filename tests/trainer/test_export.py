@@ -14,7 +14,7 @@ import torch
 
 from firmware_iface.errors import InputError
 from runtime.bundle.bundle_folder import ADAPTERS, APPROXIMATOR, GRADIENT, Bundle, read_bundle, write_bundle
-from runtime.bundle.light_path_arrays import bundle_channels, load_light_path, plane_of
+from runtime.bundle.light_path_arrays import bundle_channels, load_light_path, plane_of, slow_response_share
 from runtime.lightpath.light_path import irradiance, panel_phase
 from tests.trainer.made_sets import write_captures
 from tests.trainer.test_effects import HEIGHT, PLANE, WIDTH, bench, gray, present
@@ -171,7 +171,7 @@ def test_a_folder_that_is_taken_is_refused_unless_asked(folder: Path, tmp_path: 
 def test_the_description_says_what_the_panel_is(folder: Path) -> None:
     description = json.loads((folder / "bundle.json").read_text())["description"]
     assert description["panel"] == {
-        "height": HEIGHT, "width": WIDTH, "pitch_um": 8.0, "levels": 256, "phase_sign": 1,
+        "height": HEIGHT, "width": WIDTH, "pitch_um": 8.0, "levels": 256, "phase_sign": 1, "slow_response_share": 0.02,
     }  # fmt: skip
     assert [c["name"] for c in description["channels"]] == ["red", "green"]
     assert {a.dtype for a in read_bundle(folder).arrays.values()} <= {np.dtype("f4"), np.dtype("c8")}
@@ -286,3 +286,14 @@ def test_a_network_of_another_bench_is_refused(
     with pytest.raises(InputError, match="trained"):
         export_bundle(Model(bench()), None, tmp_path / "b", network=tmp_path / "n.safetensors")
     assert not (tmp_path / "b").exists()
+
+
+def test_what_a_slow_panel_keeps_goes_into_the_bundle(tmp_path: Path) -> None:
+    export_bundle(Model(bench(), (present("slow_response", share=0.12),)), None, tmp_path / "slow")
+    export_bundle(Model(bench()), None, tmp_path / "plain")
+    slow, plain = (read_bundle(tmp_path / name) for name in ("slow", "plain"))
+    assert slow_response_share(slow) == pytest.approx(0.12, abs=1e-12) and slow_response_share(plain) == 0
+    assert "slow_response_share" not in plain.description["panel"]
+    assert slow.arrays.keys() == plain.arrays.keys()
+    for name, array in plain.arrays.items():  # the light path is for patterns that stay
+        np.testing.assert_array_equal(array, slow.arrays[name])

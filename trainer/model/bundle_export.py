@@ -85,7 +85,7 @@ def export_bundle(
         for channel, plane in scene_list
     ]
     records, arrays = pack_light_paths(baked)
-    panel = model.bench.panel
+    panel, share = model.bench.panel, _slow_share(exported, *scene_list[0], last)
     description: dict[str, Any] = {
         "panel": {
             "height": panel.height,
@@ -94,6 +94,7 @@ def export_bundle(
             "levels": panel.levels,
             "phase_sign": panel.phase_sign,
             **({"gray_levels": list(panel.gray_levels)} if panel.gray_levels else {}),
+            **({"slow_response_share": share} if share else {}),
         },
         "channels": [
             {"name": c.name, "wavelength_nm": c.wavelength_nm}
@@ -188,6 +189,14 @@ def baked_path(model: Model, channel: str, plane_mm: float, moment: Moment | Non
         scene = scene_for(model, channel, plane_mm, torch.float64)
         path = light_path(scene, stages_of(scene, model, moment=moment))
     return LightPath(**{f.name: _single(getattr(path, f.name)) for f in fields(path)})
+
+
+def _slow_share(model: Model, channel: str, plane_mm: float, moment: Moment | None) -> float:
+    """Share of the phase before that is left when a pattern's time is over; cells turn alike in all colours."""
+    with torch.no_grad():
+        scene = scene_for(model, channel, plane_mm, torch.float64)
+        left = stages_of(scene, model, moment=moment).drive.persistence
+    return 0.0 if left is None else float(left)
 
 
 def _single(value: Any) -> Any:

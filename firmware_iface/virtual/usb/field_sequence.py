@@ -14,6 +14,7 @@ from firmware_iface.virtual.usb.field_frame import ReceivedField
 
 LONGEST = 20000  # periods that are carried out one by one after a pause
 REMEMBERED = 20000
+MOST_PERIODS = 64  # that a slow panel may still show
 WRONG_PATTERN, WRONG_RECORD = 1, 2
 
 
@@ -43,6 +44,8 @@ class FieldSequence:
         Numbers of fields.
     reason : int
         Why a field was kept dark last; 0: none was.
+    history : deque of bytes
+        Pixels that the panel showed, a period each, the last one last.
     opened : deque of (int, int)
         CRC-32 of what was on the panel, and the mask of the outputs that were opened on it, for each field.
     """
@@ -55,6 +58,7 @@ class FieldSequence:
         self.on_panel = bytes(size)
         self.displayed = self.kept_dark = self.reason = 0
         self.opened: deque[tuple[int, int]] = deque(maxlen=REMEMBERED)
+        self.history: deque[bytes] = deque(maxlen=MOST_PERIODS)
         self._passed: dict[int, tuple[bytes, int]] = {}  # as each field of the front frame was shown last
         self._slot = self.began = self._outputs = 0
 
@@ -75,6 +79,12 @@ class FieldSequence:
     def shown(self) -> list[tuple[ReceivedField, bytes, int]]:
         """Each field of the front frame, with what the panel shows in it and the outputs that are opened."""
         return [(f, *self._passed.get(k, (f.pixels, f.outputs))) for k, f in enumerate(self.front)]
+
+    @property
+    def before(self) -> list[bytes]:
+        """Pixels shown before the frame on display began, or began again, a period each."""
+        since = (self._slot - self.began) % len(self.front) + 1 if self.front else 0
+        return list(self.history)[: len(self.history) - since]
 
     @property
     def outputs(self) -> int:
@@ -100,6 +110,7 @@ class FieldSequence:
         refused = self.proven(record, number, crc)
         outputs = record.outputs if self.lit and not refused and record.width_us else 0
         self.number, self.on_panel = number, taken
+        self.history.append(taken)
         self.displayed += 1
         if refused:
             self.kept_dark, self.reason = self.kept_dark + 1, refused

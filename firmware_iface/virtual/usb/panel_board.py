@@ -11,6 +11,7 @@ import zlib
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import groupby
 from typing import NoReturn
 
 import numpy as np
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from firmware_iface.virtual.fault_injection import Faults
 from firmware_iface.virtual.usb.field_frame import FieldFrame, RefusedFrame
-from firmware_iface.virtual.usb.field_sequence import FieldSequence
+from firmware_iface.virtual.usb.field_sequence import MOST_PERIODS, FieldSequence
 from firmware_iface.virtual.usb.usb_model import (
     BULK,
     Nak,
@@ -160,6 +161,18 @@ class BoardModel(UsbModel):
             since_s = self._clock() - self._epoch - self.sequence.began * period_s
             return frame_s, since_s % frame_s, patterns
 
+    def shown_before(self) -> list[tuple[NDArray[np.uint8], int]]:
+        """Patterns on the panel before those of `lit`, and for how many periods each; the last one last."""
+        with self._lock:
+            self._run()
+            shown = self._before(self._periods()) if self._version == 1 else self.sequence.before
+            return [(self._picture(pixels), len(list(same))) for pixels, same in groupby(shown)]
+
+    def _before(self, period: int) -> list[bytes]:
+        """Pixels that version 1 showed before a period, a period each."""
+        periods = min(period - self._since, MOST_PERIODS)
+        return [*self._history, *periods * [self._front]][-MOST_PERIODS:]
+
     def _picture(self, pixels: bytes) -> NDArray[np.uint8]:
         return np.frombuffer(pixels, np.uint8).reshape(self.shape).copy()
 
@@ -173,6 +186,8 @@ class BoardModel(UsbModel):
         self._back = bytearray()
         self._state, self._refusal = EMPTY, 0
         self._header: tuple[int, int, int] | None = None  # sequence, bytes, CRC of the pixels
+        self._history: list[bytes] = []  # what version 1 showed before `_front`, a period each
+        self._since = 0  # the period from which on it shows `_front`
         self._received = self._committed = self._displayed = 0
         self._count = self._rejected = 0
         self._restart_fields()
@@ -208,7 +223,7 @@ class BoardModel(UsbModel):
                 if self._version == 2:
                     self._state, self._header = EMPTY, None
                     self._restart_fields()
-                self._epoch = self._clock()
+                self._epoch, self._since = self._clock(), 0
                 self._due = 1 if self._state == PENDING else 0
             case 0xC0, 4, int():
                 return self._status()
@@ -288,6 +303,7 @@ class BoardModel(UsbModel):
             return
         if self._state == PENDING and self._periods() >= self._due:
             assert self._header is not None
+            self._history, self._since = self._before(self._due), self._due
             self._front = bytes(self._back)
             self._displayed = self._committed
             self._count += 1

@@ -70,6 +70,21 @@ def panel_and_camera_of(headset: VirtualHeadset) -> PanelAndCamera:
     return PanelAndCamera(headset.panel, headset.camera, View(SHAPE), 64.0)
 
 
+def test_a_refinement_waits_for_a_slow_panel() -> None:
+    headset, plain = lit_headset("slow_response"), lit_headset()
+    rng = np.random.default_rng(0)
+    first, second = rng.integers(0, 256, (2, 1, *SHAPE), dtype=np.uint8)
+    seen = []
+    for one, settling in ((headset, 2), (plain, 0)):
+        take = PanelAndCamera(one.panel, one.camera, View(SHAPE), 64.0, settling=settling)
+        take(first)
+        seen.append(take(second))
+    soon = panel_and_camera_of(headset)
+    soon(first)
+    noise = np.abs(seen[0] - seen[1]).mean()
+    assert np.abs(soon(second) - seen[1]).mean() > 1.5 * noise
+
+
 @pytest.mark.parametrize(
     ("defect", "better_db"), [("phase_response", 6.0), ("zero_order", 4.0), ("ghost", 2.0)]
 )
@@ -171,7 +186,7 @@ def test_where_camera_and_model_agree_the_gradient_is_the_models(
     """The captured picture takes the place of the simulated one: given the simulated one, it is plain descent."""
     from runtime.lightpath.light_path import irradiance, pixel_irradiance
     from runtime.lightpath.light_path_adjoint import irradiance_and_pullback
-    from runtime.refinement.picture_refinement import STEP, _amplitude, _matched
+    from runtime.refinement.picture_refinement import STEP, _amplitude, matched
 
     target = scene(SHAPE)[None]
     start = start + np.random.default_rng(0).normal(0, 0.5, start.shape).astype(np.float32)
@@ -182,7 +197,7 @@ def test_where_camera_and_model_agree_the_gradient_is_the_models(
     simulated = pixel_irradiance(path, image)
     simulated /= simulated.mean()
     made = _amplitude(simulated)
-    slope = (made - _amplitude(_matched(target[0], simulated))) / made  # D is the identity
+    slope = (made - _amplitude(matched(target[0], simulated))) / made  # D is the identity
     wanted = start[0] - STEP * _to_step(path, pullback)(slope.astype(np.float32))
     moved = np.angle(np.exp(1j * (state.phase[0] - wanted)))
     # 255 steps of a 256th of a turn leave a gap: phases in it are held at its nearer edge

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from firmware_iface.errors import DeviceError, DeviceGoneError
+from runtime.lightpath.overdrive import NEAREST, REACHED, overdrive_tables
 from runtime.service.display_thread import DisplayClock, DisplayPattern, DisplayThread
+from runtime.service.slow_panel import SlowPanel
 
 PERIOD_NS = 5_000_000
 STALE_NS = 100_000_000
@@ -154,3 +156,85 @@ def test_the_clock_gives_the_first_display_time_that_is_not_before(offset: int) 
     tick = clock.after(clock.origin_ns + offset)
     assert (tick - clock.origin_ns) % PERIOD_NS == 0
     assert 0 <= tick - (clock.origin_ns + offset) < PERIOD_NS
+
+
+TABLES = overdrive_tables(2 * np.pi * np.arange(256) / 256, 0.3)
+
+
+@pytest.fixture
+def slow(running) -> tuple[Panel, DisplayThread, Events]:
+    running[1].slow = SlowPanel(TABLES[None])
+    return running
+
+
+def test_a_slow_panel_is_overdriven_and_then_shown_the_plain_pattern_without_being_asked(slow) -> None:
+    panel, display, events = slow
+    display.put(ready(1, 3 * PERIOD_NS, value=100))
+    until(lambda: events.shown_jobs == [1])
+    time.sleep(20 * PERIOD_NS * 1e-9)
+    assert panel.shown == [100], "of what was before nothing is known, and what stays is not sent again"
+    display.put(ready(2, 3 * PERIOD_NS, value=170))
+    until(lambda: panel.shown[-1] == 170)
+    time.sleep(10 * PERIOD_NS * 1e-9)
+    assert panel.shown[1] == TABLES[NEAREST, 100, 170] == 200 and panel.shown[-1] == 170
+    assert events.shown_jobs == [1, 2], "the program is told once"
+
+
+def test_a_panel_that_is_not_slow_gets_every_pattern_once_and_as_it_is(running) -> None:
+    panel, display, events = running
+    for job, value in ((1, 100), (2, 170)):
+        display.put(ready(job, 3 * PERIOD_NS, value))
+        until(lambda job=job: events.shown_jobs[-1:] == [job])
+    time.sleep(10 * PERIOD_NS * 1e-9)
+    assert panel.shown == [100, 170]
+
+
+def test_after_a_fault_a_slow_panel_is_dark_until_it_has_a_pattern_as_it_is(slow) -> None:
+    panel, display, events = slow
+    note = events.shown
+
+    def shown(pattern: DisplayPattern, at_ns: int, transfer_s: float) -> None:
+        if pattern.job == 2:
+            panel.failures = [
+                DeviceError("garbage")
+            ]  # at the display time after, when the plain pattern is to follow
+        note(pattern, at_ns, transfer_s)
+
+    events.shown = shown  # type: ignore[method-assign]
+    for job, value in ((1, 10), (2, 100)):
+        display.put(ready(job, 0, value))
+        until(lambda job=job: events.shown_jobs[-1:] == [job])
+    assert panel.shown[:2] == [10, TABLES[NEAREST, 10, 100]]
+    until(lambda: events.faults)
+    assert display.lit_until_ns == 0 and len(panel.shown) == 2
+    display.put(ready(3, 0, 200))
+    until(lambda: events.shown_jobs == [1, 2, 3])
+    assert panel.shown[2] == 200 and display.lit_until_ns > 0
+    display.put(ready(4, 0, 100))
+    until(lambda: events.shown_jobs[-1] == 4)
+    assert panel.shown[3] == TABLES[NEAREST, 200, 100] == 57
+
+
+def test_a_slow_panel_that_comes_back_gets_its_first_pattern_as_it_is(slow) -> None:
+    panel, display, events = slow
+    for job, value in ((1, 10), (2, 100)):
+        display.put(ready(job, 0, value))
+        until(lambda job=job: events.shown_jobs[-1:] == [job])
+    panel.connected = False
+    until(lambda: not display.open)
+    shown, panel.connected = len(panel.shown), True
+    until(lambda: display.open)
+    display.put(ready(3, PERIOD_NS, 200))
+    until(lambda: events.shown_jobs[-1] == 3)
+    assert panel.shown[shown] == 200
+
+
+def test_a_dropped_pattern_was_never_before_another(slow) -> None:
+    panel, display, events = slow
+    display.put(ready(1, 0, 50))
+    until(lambda: events.shown_jobs == [1])
+    display.put(ready(2, -2 * STALE_NS, 250))
+    until(lambda: events.dropped_jobs == [2])
+    display.put(ready(3, 3 * PERIOD_NS, 80))
+    until(lambda: events.shown_jobs == [1, 3])
+    assert panel.shown[1] == TABLES[NEAREST, 50, 80] and TABLES[REACHED, 50, panel.shown[1]] == 80

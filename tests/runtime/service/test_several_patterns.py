@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import socket
 import time
 from collections.abc import Sequence
@@ -52,7 +53,9 @@ def mean_light(grays: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def test_two_patterns_of_one_colour_are_nearer_to_the_picture_than_one(tmp_path: Path) -> None:
-    path = ideal_path(SHAPE, 6e-3, 0.7, np.float32)
+    # one pattern of four levels is far from any picture, however long it is solved: the test does not hang on time
+    levels = tuple(range(0, 256, 64))
+    path = dataclasses.replace(ideal_path(SHAPE, 6e-3, 0.7, np.float32), gray_levels=levels)
     found: dict[int, Quality] = {}
     for patterns in (1, 2, 4):
         solver = PatternSolver({"green": path}, frames=patterns, grid="panel")
@@ -65,8 +68,8 @@ def test_two_patterns_of_one_colour_are_nearer_to_the_picture_than_one(tmp_path:
         light = [shown(path, gray) for gray in last.gray]
         found[patterns] = quality(np.mean(light, axis=0), linear())
         alone = [quality(one, linear()).psnr_db for one in light]
-        assert found[patterns].psnr_db > max(alone) + (2 if patterns > 1 else -0.01)
-    assert min(found[2].psnr_db, found[4].psnr_db) > found[1].psnr_db + 0.5
+        assert found[patterns].psnr_db > max(alone) + (1 if patterns > 1 else -0.01)
+    assert min(found[2].psnr_db, found[4].psnr_db) > found[1].psnr_db + 3
 
 
 def test_patterns_of_three_colours_are_in_the_order_of_their_fields(tmp_path: Path) -> None:
