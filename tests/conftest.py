@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import signal
 import sys
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -47,3 +50,11 @@ def shared() -> Path:
     if not folder.is_dir():
         pytest.skip("there is no folder `shared` beside the repository")
     return folder
+
+
+@pytest.fixture(scope="module")
+def only_service() -> Iterator[None]:
+    """No other test runs a service meanwhile: two of them, at real-time priority, leave two cores no time for more."""
+    with (Path(tempfile.gettempdir()) / "hololoop-tests-service.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield

@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from contextlib import suppress
 
@@ -46,13 +47,15 @@ class ChildProcess:
         self._yields = yields
         self.link: MessageLink | None = None
         self._process: subprocess.Popen[bytes] | None = None
+        self._end: threading.Thread | None = None  # of the process before
         self._pause_s = PAUSE_S
         self._started_s = 0.0
         self._next_start_s = 0.0
 
     def due(self, now_s: float) -> bool:
-        """Whether it is not running and it is time to start it."""
-        return self.link is None and now_s >= self._next_start_s
+        """Whether it is not running, the one before has ended, and it is time to start it."""
+        ended = self._end is None or not self._end.is_alive()
+        return self.link is None and ended and now_s >= self._next_start_s
 
     def start(self) -> MessageLink:
         """Start the process; returns the link to it."""
@@ -72,20 +75,32 @@ class ChildProcess:
         return self.link
 
     def stop(self) -> None:
-        """End the process at once and plan its next start."""
+        """Kill the process and plan its next start. This does not wait until it has ended: a driver may hold it."""
         if self.link is not None:
             self.link.close()
             self.link = None
         if self._process is not None:
             with suppress(ProcessLookupError):
                 self._process.kill()
-            self._process.wait()
+            self._end = threading.Thread(target=_wait_for, args=(self._process,), daemon=True)
+            self._end.start()
             self._process = None
         now = time.monotonic()
         if now - self._started_s > SETTLED_S:
             self._pause_s = PAUSE_S
         self._next_start_s = now + self._pause_s
         self._pause_s = min(2 * self._pause_s, LONGEST_PAUSE_S)
+
+
+def _wait_for(process: subprocess.Popen[bytes]) -> None:
+    """Wait until a process has ended, in a thread without real-time priority.
+
+    The kernel takes an ended process apart in the thread that waits for it, and spins there while another program looks
+    at the process in /proc. With real-time priority it can keep that program from the core, and so spin for minutes.
+    """
+    with suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    process.wait()
 
 
 def _schedule_below(pid: int) -> None:

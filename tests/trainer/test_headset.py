@@ -20,6 +20,8 @@ from trainer.captures.capture_set import read_captures
 from trainer.captures.open_bench import RealHeadset, nominal_bench, open_bench
 from trainer.cli import main
 
+pytestmark = pytest.mark.usefixtures("only_service")
+
 
 def test_real_lasers_stay_within_the_power_that_is_set(tmp_path: Path) -> None:
     """Asked for full power, they get what the configuration allows; a capture set is taken all the same."""

@@ -12,6 +12,8 @@ from tests.campaigns.headset import hardware, write_configuration
 from tests.runtime.calibration.drifting import DISTANCE_MM, ideal_bundle
 from tests.trainer.hidden import bench_file
 
+pytestmark = pytest.mark.usefixtures("only_service")
+
 SHAPE = (64, 80)
 
 

@@ -14,6 +14,8 @@ from tests.campaigns.faults import campaign, plans, summary
 from tests.campaigns.lane import Lane
 from tests.campaigns.soak import soak
 
+pytestmark = pytest.mark.usefixtures("only_service")
+
 
 def test_every_kind_of_fault_is_survived() -> None:
     """Dark where that is required, nothing torn, every frame answered, and every headset recovers."""

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
+import signal
+import subprocess
+import threading
+import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -12,6 +17,8 @@ from runtime.service.child_processes import ChildProcess
 from runtime.service.process_messages import SOLVER
 from tests.campaigns.headset import urgent
 from tests.campaigns.lane import Lane
+
+pytestmark = pytest.mark.usefixtures("only_service")
 
 
 @pytest.mark.parametrize(("yields", "lower"), [(True, 1), (False, 0)])
@@ -28,6 +35,44 @@ def test_a_child_that_computes_is_scheduled_below_its_supervisor(yields: bool, l
         policy,
         priority - lower if priority else 0,
     )  # without the right to a priority nothing changes
+
+
+def test_a_killed_child_is_waited_for_without_priority_before_the_next_one_starts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    policies = []
+    wait = subprocess.Popen.wait
+
+    def noted(process: subprocess.Popen[bytes], *arguments: float) -> int:
+        policies.append(os.sched_getscheduler(0))  # of the calling thread
+        return wait(process, *arguments)
+
+    monkeypatch.setattr(subprocess.Popen, "wait", noted)
+    child = ChildProcess("http.server", "0", SOLVER)
+    with urgent():
+        child.start()
+        first = child._process
+        child.stop()
+        while not child.due(math.inf):
+            time.sleep(0.001)
+    assert first is not None and first.returncode == -signal.SIGKILL
+    assert policies == [os.SCHED_OTHER]
+
+
+def test_a_child_that_a_driver_holds_does_not_hold_its_supervisor(monkeypatch: pytest.MonkeyPatch) -> None:
+    held = threading.Event()
+    monkeypatch.setattr("runtime.service.child_processes._wait_for", lambda process: held.wait())
+    child = ChildProcess("http.server", "0", SOLVER)
+    child.start()
+    process = child._process
+    assert process is not None
+    child.stop()
+    assert not child.due(math.inf)  # two processes would fight over the device
+    held.set()
+    assert process.wait(10) == -signal.SIGKILL
+    assert child._end is not None
+    child._end.join()
+    assert child.due(math.inf)
 
 
 def test_the_services_solver_is_below_and_its_camera_is_not(tmp_path: Path) -> None:

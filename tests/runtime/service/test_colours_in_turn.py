@@ -22,6 +22,8 @@ from runtime.service.shared_memory import crc32
 from tests.campaigns.headset import connected, hardware, picture, served, write_configuration
 from tests.campaigns.lane import Lane
 
+pytestmark = pytest.mark.usefixtures("only_service")
+
 
 class Headset(NamedTuple):
     file: Path

@@ -24,6 +24,8 @@ from runtime.service.protocol import LaserState
 from tests.campaigns.headset import connected, picture, served
 from tests.runtime.benches import converted, ideal_path
 
+pytestmark = pytest.mark.usefixtures("only_service")
+
 GUIDE = Path(serve.__file__).parents[1] / "service" / "README.md"
 BENCH = "virtual:demo"
 GREEN_ALONE = """channel = [

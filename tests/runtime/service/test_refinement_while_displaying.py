@@ -19,6 +19,8 @@ from runtime.service.client import Client, RefusedError
 from runtime.service.protocol import Code, LaserState, PartState, Shown
 from tests.campaigns.headset import SHAPE, connected, hardware, picture, served, write_configuration
 
+pytestmark = pytest.mark.usefixtures("only_service")
+
 DEFECT = """
 [[defect]]
 kind = "phase_response"

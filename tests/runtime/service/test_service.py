@@ -29,6 +29,8 @@ from runtime.service.socket_link import MessageLink, PeerCredentials
 from runtime.service.supervisor import Supervisor
 from tests.campaigns.headset import ENVIRONMENT, connected, hardware, picture, served, write_configuration
 
+pytestmark = pytest.mark.usefixtures("only_service")
+
 
 class Headset(NamedTuple):
     file: Path

@@ -7,12 +7,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pytest
 
 from runtime.service.protocol import LaserState, Shown
 from runtime.solver import quality
 from tests.campaigns.headset import SHAPE, write_configuration
 from tests.campaigns.lane import PICTURES, Lane
 from tests.runtime.benches import scene
+
+pytestmark = pytest.mark.usefixtures("only_service")
 
 BLACK, LEAST = 64, 5  # counts of the simulated camera without light, and above them where there is some
 SHARE, REFRESH_HZ = 0.25, 25.0
