@@ -217,7 +217,7 @@ class Solver:
             is found.
         """
         targets, begun = self._begun(target, iterations, deadline_ms)
-        picture = targets[0, 0]
+        picture = _grayscale(targets)
         parts: list[Part] = []
         if self.follows:
             whole = motion_between(self.before, picture) if motion is None else motion
@@ -266,7 +266,7 @@ class Solver:
         progress: IterationReport | None,
     ) -> Solution:
         """Steps from phases[0] until the iterations or the time are used up; the solution from the best phase met."""
-        self.before[...] = targets[0, 0]
+        self.before[...] = _grayscale(targets)
         self.follows = True
         if iterations is None:
             iterations = ITERATIONS if deadline_ms is None else _ENDLESS
@@ -357,7 +357,7 @@ class Solver:
     def _is_still(self, targets: np.ndarray) -> bool:
         """Whether targets [C, K, H, W] are of the picture solved before, judged by some of its pixels."""
         some = (slice(None, None, COMPARED), slice(None, None, COMPARED))
-        return bool(np.array_equal(targets[0, 0][some], self.before[some]))
+        return bool(np.array_equal(_grayscale(targets[..., *some]), self.before[some]))
 
     def _judged(self, patterns: np.ndarray, targets: np.ndarray, number: int) -> tuple[Quality, ...]:
         if self.solved > number + 1:
@@ -369,6 +369,11 @@ class Solver:
 
     def _checked(self, target: np.ndarray) -> np.ndarray:
         return checked_target(target, len(self.stacks), len(self.stacks[0]), self.shape)
+
+
+def _grayscale(targets: np.ndarray) -> np.ndarray:
+    """The picture [H, W] whose motion is looked for: the mean of its colours, one of which may be dark."""
+    return targets[0, 0] if len(targets) == 1 else targets[:, 0].mean(0)
 
 
 def solve(

@@ -291,6 +291,17 @@ def test_motion_is_found_and_a_cut_begins_cold(half: LightPath) -> None:
     np.testing.assert_allclose(solver.frame(other, 2).psnr_db, solve(half, other, 2).psnr_db, atol=1e-3)
 
 
+def test_motion_is_found_whichever_colour_is_dark(half: LightPath) -> None:
+    whole, dark = scene((160, 200), 3), np.full(SHAPE, 1e-3)
+    before, after = whole[20:116, 30:158], whole[16:112, 32:160]
+    found = []
+    for place in (0, 1):
+        solver = Solver([half, half])
+        solver.frame(np.insert(before[None], place, dark, 0), 10)
+        found.append(solver.frame(np.insert(after[None], place, dark, 0), 1).psnr_db)
+    np.testing.assert_allclose(*found, atol=1e-3)
+
+
 def test_a_rehearsal_in_the_middle_of_a_video_changes_nothing(half: LightPath) -> None:
     one, other = Solver(half), Solver(half)
     for solver in (one, other):
