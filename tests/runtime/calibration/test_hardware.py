@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -26,9 +27,18 @@ def test_a_headset_behind_its_drivers_is_calibrated_and_left_dark(
     )
     bench.rename(tmp_path / "bench.toml")
     bundle = ideal_bundle(tmp_path / "measured", SHAPE)
-    with hardware(tmp_path) as remote:
-        assert main(["calibrate", str(bundle), "--headset", str(configuration), "--json"]) == 0
-        result = json.loads(capsys.readouterr().out)
+    with ExitStack() as stack:
+        for _ in range(5):  # a busy machine may stop the heartbeat: then the lasers are dark, and it ends
+            remote = stack.enter_context(hardware(tmp_path))
+            code = main(["calibrate", str(bundle), "--headset", str(configuration), "--json"])
+            said = capsys.readouterr()
+            if not (
+                code == 2 and ("heartbeat" in said.err + said.out or "was silent" in said.err + said.out)
+            ):
+                break
+            stack.pop_all().close()  # a person would look, and switch the board off and on
+        assert code == 0, said
+        result = json.loads(said.out)
         light = [power for _, power in remote.light()]
         assert light[-1] == 0 and max(light) == pytest.approx(
             50, rel=0.02
@@ -37,6 +47,6 @@ def test_a_headset_behind_its_drivers_is_calibrated_and_left_dark(
 
         remote.set_to("interlock", False)
         assert main(["calibrate", str(bundle), "--headset", str(configuration)]) == 2
-        said = capsys.readouterr().err
-        assert "interlock" in said and said.count("\n") == 1
+        refusal = capsys.readouterr().err
+        assert "interlock" in refusal and refusal.count("\n") == 1
         assert remote.light()[-1][1] == 0
