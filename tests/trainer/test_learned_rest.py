@@ -27,7 +27,7 @@ FRINGES = 'kind = "fringes"\ncontrast = 0.22\nperiod_px = 17\nangle_deg = 33\nch
 
 def learned(folder: Path, defect: str, *names: str) -> tuple[CaptureSet, Diagnosis, LearnedRest]:
     """A bench's captures, diagnosed with these effects alone, and what is learned of the rest."""
-    acquire_from(str(bench_file(folder, defect)), folder / "captures", patterns=14)
+    acquire_from(str(bench_file(folder, defect)), folder / "captures", patterns=8)
     captures = read_captures(folder / "captures")
     known = {name: catalogue()[name] for name in names}
     with open_pool(1) as pool:
