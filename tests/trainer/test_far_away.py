@@ -24,10 +24,10 @@ from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import Catalogue, catalogue
 from trainer.fitting.gains import with_gains
 from trainer.fitting.gauss_newton import HOLD, fit
-from trainer.fitting.joint_start import joint_start
+from trainer.fitting.joint_start import joint_start, without_effect
 from trainer.fitting.pool import open_pool
-from trainer.fitting.predictor import Predictor, evaluate_captures
-from trainer.model.model import Model, absent
+from trainer.fitting.predictor import Predictor, evaluate_captures, excess_on
+from trainer.model.model import Model, absent, instance_with
 
 NARROW_BEAM = 'kind = "illumination"\nwaist_x_share = 0.8\nwaist_y_share = 0.9'
 OFF_PLANE = 'kind = "distance"\noffset_mm = 0.6'
@@ -125,6 +125,36 @@ def test_one_strong_effect_alone_is_not_far_away(tmp_path: Path) -> None:
         screened = screen_candidates(roles, ideal, known("distance", "illumination"), pool, no_progress)
         found = explain_together(roles, ideal, errors, catalogue(), screened, Thresholds(), pool)
     assert found is None
+
+
+def test_what_was_taken_for_a_moved_camera_is_given_back_to_the_wavefront(tmp_path: Path) -> None:
+    acquire_from(str(bench_file(tmp_path, 'kind = "panel_wavefront"')), tmp_path / "captures")
+    captures = read_captures(tmp_path / "captures")
+    batches = batches_of(captures)
+    bent = with_gains(captures, Model(captures.bench), capture_roles(captures).fitted)
+    bent = bent.having(absent(catalogue()["panel_wavefront"], captures.bench, 6))
+    right = fit(bent, bent.names, batches)
+    moved = bent.having(instance_with(catalogue()["misregistration"], captures.bench, {"shift_y": -4.0}))
+    for sigma in (4.0, 2.0, 1.0):  # the wavefront alone: a tilt brings the picture back
+        moved = fit(moved, ["panel_wavefront"], [b.smoothed(sigma) for b in batches]).model
+    wrong = moved.without("misregistration")
+    assert fit(wrong, wrong.names, batches).errors.excess > 10 * right.errors.excess
+    found = without_effect(moved, "misregistration", batches)
+    assert excess_on(found, batches) < 1.2 * right.errors.excess
+
+
+@pytest.mark.slow
+def test_a_camera_in_its_place_is_not_moved(tmp_path: Path) -> None:
+    bent = 'kind = "panel_wavefront"\npeak_to_valley_nm = 900'
+    hidden = (NARROW_BEAM, OFF_PLANE, STRONG_PHASE, bent, 'kind = "zero_order"', 'kind = "laser_drift"')
+    bench = bench_file(tmp_path, *hidden, width=160, height=128, distance_mm=15)
+    acquire_from(str(bench), tmp_path / "captures")
+    captures = read_captures(tmp_path / "captures")
+    with open_pool(1) as pool:
+        found = explain(captures, Model(captures.bench), catalogue(), pool)
+    expected = {"illumination", "distance", "phase_response", "panel_wavefront", "zero_order", "laser_drift"}
+    assert set(found.model.names) == expected
+    assert found.diagnosis.verdict == "complete"
 
 
 @pytest.mark.slow

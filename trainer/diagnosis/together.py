@@ -16,13 +16,14 @@ from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import Catalogue
 from trainer.fitting.gains import with_gains
 from trainer.fitting.gauss_newton import fit
-from trainer.fitting.joint_start import joint_start
+from trainer.fitting.joint_start import joint_start, without_effect
 from trainer.fitting.pool import Pool
 from trainer.fitting.predictor import evaluate_captures
 from trainer.model.model import Model
 
 FAR = 0.3  # held-out excess from which several strong effects may hide one another
 HELPS = 0.5  # share of the excess that one effect leaves at most if it gets anywhere alone
+MOVED = "misregistration"  # to smoothed pictures it does what tilt, curvature and distance do
 
 
 @dataclass(frozen=True)
@@ -82,8 +83,15 @@ def explain_together(
     after = evaluate_captures(roles.captures, roles.held_out, joint)
     if after.excess > HELPS * errors.excess:
         return None
-    report(0.7, "looking whether maps go on")
+    report(0.6, "looking whether maps go on")
+    found, before_maps = joint, after
     joint, after = _with_maps(roles, joint, after, thresholds)
+    if MOVED in found.names and not thresholds.complete(after.excess, errors.excess):
+        report(0.7, "looking whether the camera looks where bench.toml says")
+        still = without_effect(found, MOVED, batches)
+        left = evaluate_captures(roles.captures, roles.held_out, still)
+        if left.excess < before_maps.excess:
+            joint, after = _with_maps(roles, still, left, thresholds)
     report(0.8, "leaving out effects that are not needed")
     names = joint.names
     while smaller := without_one(roles, joint, after, names, thresholds, errors.excess, pool, thorough=False):

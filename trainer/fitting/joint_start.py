@@ -57,23 +57,50 @@ def joint_start(
     late = [n for n in AT_LAST if n in known and n not in model.names]
     for name in names:
         model = model.having(absent(known[name], model.bench, ORDERS.get(name)))
+    coarse = _smoothed(model, batches, SMOOTHING_PX[0])
+    for name in names:
+        model = _best_start(model, name, coarse)
     for k, sigma in enumerate(SMOOTHING_PX):
         report(
             k / (len(SMOOTHING_PX) + 1),
             f"fitting {len(names)} effects together, smoothed by {sigma:g} pixels",
         )
-        coarse = [_some(model, b, sigma).smoothed(sigma) for b in batches]
-        if k == 0:
-            for name in names:
-                model = _best_start(model, name, coarse)
-        model = fit(model, model.names, coarse, ITERATIONS, TOLERANCE, None, HOLD, FIXED).model
+        model = _fitted_to_smoothed(model, batches, sigma)
     report(len(SMOOTHING_PX) / (len(SMOOTHING_PX) + 1), f"fitting {len(names)} effects together")
-    few = [_some(model, b, 0.0) for b in batches]
-    fitted = fit(model, model.names, few, ITERATIONS, TOLERANCE, None, HOLD, FIXED)
-    model = raise_orders(fitted, model.names, few, least_for_order, HOLD, FIXED).model
+    model = _with_orders_raised(model, batches)
     for name in late:
         model = with_measured_values(model.having(absent(known[name], model.bench)), [name], batches)
     return model
+
+
+def without_effect(model: Model, name: str, batches: Sequence[Batch]) -> Model:
+    """The model without an effect, the others fitted together once more from smoothed pictures.
+
+    What it did may be another one's: a camera that is moved does to smoothed pictures what a tilt of the wavefront
+    does, and a joint start may end with some of both. Fitted to pictures as they are, the others do not find back.
+    """
+    model = model.without(name)
+    for sigma in SMOOTHING_PX[1:]:
+        model = _fitted_to_smoothed(model, batches, sigma)
+    model = _with_orders_raised(model, batches)
+    return fit(model, model.names, batches).model
+
+
+def _fitted_to_smoothed(model: Model, batches: Sequence[Batch], sigma_px: float) -> Model:
+    """The model with all of its effects fitted to smoothed pictures."""
+    coarse = _smoothed(model, batches, sigma_px)
+    return fit(model, model.names, coarse, ITERATIONS, TOLERANCE, None, HOLD, FIXED).model
+
+
+def _with_orders_raised(model: Model, batches: Sequence[Batch]) -> Model:
+    """The model with all of its effects fitted to a few pictures as they are, their orders raised."""
+    few = [_some(model, b, 0.0) for b in batches]
+    fitted = fit(model, model.names, few, ITERATIONS, TOLERANCE, None, HOLD, FIXED)
+    return raise_orders(fitted, model.names, few, least_for_order, HOLD, FIXED).model
+
+
+def _smoothed(model: Model, batches: Sequence[Batch], sigma_px: float) -> list[Batch]:
+    return [_some(model, b, sigma_px).smoothed(sigma_px) for b in batches]
 
 
 def _some(model: Model, batch: Batch, sigma_px: float) -> Batch:
