@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from runtime.program.command import Command, Result
 from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
-from trainer.commands.device import device_option
+from trainer.commands.device_option import ALONE, device_option
 from trainer.commands.inputs import (
     captures_argument,
     inputs_of,
@@ -42,7 +42,7 @@ def options(parser: ArgumentParser) -> None:
     model_options(parser)
     report_option(parser)
     worker_options(parser)
-    device_option(parser, "(default: cpu); on a GPU, by this process alone: without --workers and --cluster")
+    device_option(parser, ALONE)
     threshold_options(parser)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from runtime.program.command import Command, Result
 from runtime.program.options import comma_list, seed_option, whole
 from runtime.program.screen import Screen
-from trainer.commands.device import device_option
+from trainer.commands.device_option import LIGHT_PATH, device_option
 from trainer.commands.inputs import effects_option
 from trainer.commands.network_options import judge_options, size_options
 from trainer.commands.number_text import LIKENESS
@@ -38,7 +38,7 @@ def options(parser: ArgumentParser) -> None:
     judge_options(parser)
     workers_option(parser, "processes for explain (default: one a core)")
     device_option(
-        parser, "(default: cpu), by this process alone; networks train on a GPU where torch finds one"
+        parser, f"{LIGHT_PATH}, by this process alone; networks train on a GPU where torch finds one"
     )
     seed_option(parser)
 

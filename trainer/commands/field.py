@@ -7,7 +7,7 @@ from argparse import ArgumentParser, Namespace
 from runtime.program.command import Command, Result
 from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
-from trainer.commands.device import device_option
+from trainer.commands.device_option import device_option
 from trainer.commands.inputs import (
     captures_argument,
     inputs_of,

@@ -15,7 +15,7 @@ from runtime.program.outputs import Output, emptied
 from runtime.program.progress import part_of
 from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
-from trainer.commands.device import device_option
+from trainer.commands.device_option import device_option
 from trainer.commands.inputs import captures_argument, inputs_of, model_options
 from trainer.commands.network_options import judge_options, size_options
 from trainer.commands.number_text import LIKENESS
@@ -65,7 +65,8 @@ def options(parser: ArgumentParser) -> None:
     )
     device_option(
         parser,
-        "(default: cpu); the network trains there, too (default: on a GPU where torch finds one)",
+        "what computes the light path and trains: cpu, or cuda, a GPU (default: cpu, and training on a GPU where torch "
+        "finds one)",
         default=None,
     )
     seed_option(parser)
