@@ -50,13 +50,22 @@ def computing_on(device: str) -> Iterator[None]:
         raise InputError(
             "torch finds no CUDA device on this machine: leave out --device, or install a build of torch with CUDA"
         )
-    rounded = torch.backends.cudnn.allow_tf32
-    torch.backends.cudnn.allow_tf32 = False  # convolutions would round to 10 bits of 23
+    with torch.device(device, int(os.environ.get("LOCAL_RANK", "0"))), _whole_single_precision():
+        yield
+
+
+@contextmanager
+def _whole_single_precision() -> Iterator[None]:
+    """Products and convolutions on a GPU keep all 23 bits, where TF32 would leave 10."""
+    kinds: tuple[Any, ...] = (torch.backends.cuda.matmul, torch.backends.cudnn)
+    before = [kind.allow_tf32 for kind in kinds]
+    for kind in kinds:
+        kind.allow_tf32 = False
     try:
-        with torch.device(device, int(os.environ.get("LOCAL_RANK", "0"))):
-            yield
+        yield
     finally:
-        torch.backends.cudnn.allow_tf32 = rounded
+        for kind, was in zip(kinds, before, strict=True):
+            kind.allow_tf32 = was
 
 
 def array_of(tensor: Tensor) -> np.ndarray:

@@ -119,6 +119,18 @@ def test_what_is_kept_is_kept_for_its_device() -> None:
     assert ones(2) is here and made == [2, 2]
 
 
+def test_a_gpu_is_the_default_device_in_whole_single_precision(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setenv("LOCAL_RANK", "1")  # of two processes that torchrun started
+    rounded = torch.backends.cudnn.allow_tf32
+    with computing_on("cuda"):
+        assert torch.get_default_device() == torch.device("cuda", 1)
+        assert not torch.backends.cudnn.allow_tf32 and not torch.backends.cuda.matmul.allow_tf32
+        with computing_on("cpu"):
+            assert torch.ones(3).device.type == "cpu"
+    assert torch.get_default_device().type == "cpu" and torch.backends.cudnn.allow_tf32 == rounded
+
+
 @pytest.mark.parametrize("name", sorted(catalogue()))
 def test_every_effect_acts_on_another_device(name: str) -> None:
     effect = catalogue()[name]
