@@ -17,7 +17,7 @@ def mix_neighbours(phase: Array, taps: Array, axis: int) -> Array:
     count = phase.shape[axis]
     total = 0
     for k in range(taps.shape[0]):
-        index = xp.asarray(np.clip(np.arange(count) + k - reach, 0, count - 1))
+        index = xp.asarray(np.clip(np.arange(count) + k - reach, 0, count - 1), device=phase.device)
         total = total + taps[k] * xp.take(phase, index, axis=axis)
     return total
 

@@ -132,7 +132,7 @@ def _on_host(x: Array) -> np.ndarray | None:
 
 def _as(x: Array, result: np.ndarray) -> Array:
     """A result as an array of x's kind, on the same memory."""
-    return result if isinstance(x, np.ndarray) else array_namespace(x).asarray(result)
+    return result if isinstance(x, np.ndarray) else array_namespace(x).asarray(result, device=x.device)
 
 
 def _threads(x: Array) -> int:

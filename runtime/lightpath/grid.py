@@ -100,7 +100,8 @@ def band_frequencies(grid: Grid, like: Array) -> tuple[Array, Array]:
     """Frequencies (cycles/m) of the band along y and x, in namespace and precision of the real `like`."""
     xp = array_namespace(like)
     fy, fx = (
-        xp.asarray(grid.frequency_index(axis), dtype=like.dtype) / (grid.padded[axis] * grid.pitch)
+        xp.asarray(grid.frequency_index(axis), dtype=like.dtype, device=like.device)
+        / (grid.padded[axis] * grid.pitch)
         for axis in (0, 1)
     )
     return fy, fx
@@ -111,8 +112,9 @@ def image_frequencies(grid: Grid, like: Array) -> tuple[Array, Array]:
     xp = array_namespace(like)
     height, width = grid.image_shape
     step = grid.pitch / FINE
-    fy = xp.asarray([k if k < (height + 1) // 2 else k - height for k in range(height)], dtype=like.dtype)
-    fx = xp.arange(width // 2 + 1, dtype=like.dtype)
+    kind = {"dtype": like.dtype, "device": like.device}
+    fy = xp.asarray([k if k < (height + 1) // 2 else k - height for k in range(height)], **kind)
+    fx = xp.arange(width // 2 + 1, **kind)
     return fy / (height * step), fx / (width * step)
 
 

@@ -73,7 +73,9 @@ def legendre_surface(terms: Array, y: Array, x: Array, lowest: int = 1) -> Array
     pick = np.zeros((len(places), (order + 1) ** 2))  # where each term stands in the table of i and j
     for number, (i, j) in enumerate(places):
         pick[number, i * (order + 1) + j] = 1
-    table = xp.reshape(terms @ xp.asarray(pick, dtype=terms.dtype), (order + 1, order + 1))
+    table = xp.reshape(
+        terms @ xp.asarray(pick, dtype=terms.dtype, device=terms.device), (order + 1, order + 1)
+    )
     rows, columns = legendre_curve(y[:, 0], order + 1), legendre_curve(x[0, :], order + 1)
     return xp.matrix_transpose(rows) @ table @ columns
 

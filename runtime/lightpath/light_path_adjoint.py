@@ -110,7 +110,8 @@ def pixel_irradiance_adjoint(path: LightPath, gradient: Array) -> Array:
     """Adjoint of `pixel_irradiance`: [..., H, W] to [..., *grid.image_shape]."""
     grid = path.grid
     xp = array_namespace(gradient)
-    fine = xp.zeros((*gradient.shape[:-2], *grid.image_shape), dtype=gradient.dtype)
+    shape = (*gradient.shape[:-2], *grid.image_shape)
+    fine = xp.zeros(shape, dtype=gradient.dtype, device=gradient.device)
     rows, columns = pixel_slices(grid)
     fine[..., rows, columns] = gradient
     return irfft2(rfft2(fine) * pixel_area_spectrum(grid, gradient), grid.image_shape)

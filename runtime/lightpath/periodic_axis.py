@@ -36,7 +36,7 @@ def put(x: Array, runs: list[tuple[int, int]], axis: int, period: int) -> Array:
     xp = array_namespace(x)
     shape = list(x.shape)
     shape[axis] = period
-    whole = xp.zeros(tuple(shape), dtype=x.dtype)
+    whole = xp.zeros(tuple(shape), dtype=x.dtype, device=x.device)
     done = 0
     for start, stop in runs:
         part = _along(whole, start, stop, axis)

@@ -174,15 +174,17 @@ def far_field_matrix(
     complex array [n, len(band)]
     """
     xp = array_namespace(position)
-    sample = xp.arange(count, dtype=position.dtype)
-    angle = (2 * math.pi / padded) * sample[:, None] * xp.asarray(band, dtype=position.dtype)[None, :]
+    kind = {"dtype": position.dtype, "device": position.device}
+    sample = xp.arange(count, **kind)
+    angle = (2 * math.pi / padded) * sample[:, None] * xp.asarray(band, **kind)[None, :]
     inverse = (xp.cos(angle) + 1j * xp.sin(angle)) / padded
     return _far_kernel(position, count, pitch, wavelength, distance) @ inverse
 
 
 def _far_kernel(position: Array, count: int, pitch: float, wavelength: Array, distance: Array) -> Array:
     xp = array_namespace(position)
-    samples = (xp.arange(count, dtype=position.dtype) - (count - 1) / 2) * pitch
+    sample = xp.arange(count, dtype=position.dtype, device=position.device)
+    samples = (sample - (count - 1) / 2) * pitch
     angle = -2 * math.pi / (wavelength * distance) * position[:, None] * samples[None, :]
     return (pitch / (wavelength * distance) ** 0.5) * (xp.cos(angle) + 1j * xp.sin(angle))
 

@@ -19,6 +19,7 @@ from trainer.captures.capture_set import CaptureSet
 from trainer.captures.capture_table import Capture, Moment
 from trainer.captures.held_out import scenes
 from trainer.captures.smoothing import smoothed
+from trainer.device import array_of
 
 # Panel pixels beyond the panel's border that are compared. The splines' reach beyond them is computed too.
 PAST_BORDER = MARGIN - 8
@@ -105,7 +106,8 @@ class Batch:
 
     def errors(self, prediction: Tensor) -> PredictionErrors:
         """Errors of predicted counts above black, Tensor [B, h, w]."""
-        return prediction_errors(self.ids, self.signal, prediction, self.noise, self.mask)
+        arrays = (array_of(t) for t in (self.signal, prediction, self.noise, self.mask))
+        return prediction_errors(self.ids, *arrays)
 
 
 def load(captures: CaptureSet, chosen: Iterable[Capture], dtype: torch.dtype = torch.float32) -> list[Batch]:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from runtime.program.command import Command, Result
 from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
+from trainer.commands.device_option import ALONE, device_option
 from trainer.commands.inputs import (
     captures_argument,
     inputs_of,
@@ -27,6 +29,10 @@ from trainer.commands.verdict_page import (
 )
 from trainer.commands.workers import worker_options, workers_of
 
+if TYPE_CHECKING:
+    from trainer.diagnosis.verdict import Thresholds
+    from trainer.fitting.pool import Pool
+
 MOST_ROWS = 12
 
 
@@ -36,6 +42,7 @@ def options(parser: ArgumentParser) -> None:
     model_options(parser)
     report_option(parser)
     worker_options(parser)
+    device_option(parser, ALONE)
     threshold_options(parser)
 
 
@@ -46,13 +53,20 @@ def run(args: Namespace, screen: Screen) -> Result:
 
     # First: a cluster that does not answer is known at once, and processes begin while this one reads.
     with open_pool(workers_of(args), args.cluster) as pool:
-        captures, known, model = inputs_of(args)
-        from trainer.diagnosis.diagnosis import diagnose
+        from trainer.device import computing_on
 
-        note_what_is_used(captures, screen)
-        refuse_misread(args.captures, screen)
-        with screen.progress("diagnosing") as progress:
-            found = diagnose(captures, model, known, pool, thresholds, progress)
+        with computing_on(args.device):
+            return _diagnose_on(args, screen, pool, thresholds)
+
+
+def _diagnose_on(args: Namespace, screen: Screen, pool: Pool, thresholds: Thresholds) -> Result:
+    captures, known, model = inputs_of(args)
+    from trainer.diagnosis.diagnosis import diagnose
+
+    note_what_is_used(captures, screen)
+    refuse_misread(args.captures, screen)
+    with screen.progress("diagnosing") as progress:
+        found = diagnose(captures, model, known, pool, thresholds, progress)
     if args.report:
         from trainer.diagnosis.comparison import compare
         from trainer.diagnosis.diagnosis import with_previews

@@ -8,6 +8,7 @@ from pathlib import Path
 from runtime.program.command import Command, Result
 from runtime.program.options import comma_list, seed_option, whole
 from runtime.program.screen import Screen
+from trainer.commands.device_option import LIGHT_PATH, device_option
 from trainer.commands.inputs import effects_option
 from trainer.commands.network_options import judge_options, size_options
 from trainer.commands.number_text import LIKENESS
@@ -36,6 +37,9 @@ def options(parser: ArgumentParser) -> None:
     parser.add_argument("--iterations", metavar="N", type=whole(0, 10**6), help="of each phase retrieval")
     judge_options(parser)
     workers_option(parser, "processes for explain (default: one a core)")
+    device_option(
+        parser, f"{LIGHT_PATH}, by this process alone; networks train on a GPU where torch finds one"
+    )
     seed_option(parser)
 
 
@@ -45,6 +49,7 @@ def run(args: Namespace, screen: Screen) -> Result:
 
     from trainer.cycle.evaluation import METHODS, run_evaluation
     from trainer.cycle.evaluation_bench import EvaluationSizes
+    from trainer.device import computing_on
     from trainer.effects.effect_catalogue import catalogue
     from trainer.model.model_file import read_model
     from trainer.training.pretrained_networks import read_pretrained
@@ -56,7 +61,7 @@ def run(args: Namespace, screen: Screen) -> Result:
     if args.model:
         model = read_model(args.model, catalogue(args.effects))
     judges = read_pretrained(args.vgg, args.lpips)
-    with screen.progress("comparing methods") as progress:
+    with computing_on(args.device), screen.progress("comparing methods") as progress:
         found = run_evaluation(
             args.bench, args.methods or METHODS, sizes, judges, model, args.seed, workers_of(args), progress
         )

@@ -10,6 +10,7 @@ from runtime.program.command import Command, Result
 from runtime.program.interrupt import Interrupted, ctrl_c_waits
 from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
+from trainer.commands.device_option import ALONE, device_option
 from trainer.commands.inputs import (
     captures_argument,
     inputs_of,
@@ -48,6 +49,7 @@ def options(parser: ArgumentParser) -> None:
     )
     report_option(parser)
     worker_options(parser)
+    device_option(parser, ALONE)
     threshold_options(parser)
     parser.add_argument(
         "--learn",
@@ -71,7 +73,10 @@ def run(args: Namespace, screen: Screen) -> Result:
     try:
         # First: a cluster that does not answer is known at once, and processes begin while this one reads.
         with open_pool(workers_of(args), args.cluster) as pool:
-            return _explain_on(args, screen, pool, thresholds, added)
+            from trainer.device import computing_on  # now: it loads torch, while the processes begin
+
+            with computing_on(args.device):
+                return _explain_on(args, screen, pool, thresholds, added)
     except KeyboardInterrupt:
         raise Interrupted(_interrupted(added, args)) from None
 

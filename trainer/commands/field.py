@@ -7,6 +7,7 @@ from argparse import ArgumentParser, Namespace
 from runtime.program.command import Command, Result
 from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
+from trainer.commands.device_option import device_option
 from trainer.commands.inputs import (
     captures_argument,
     inputs_of,
@@ -22,6 +23,7 @@ def options(parser: ArgumentParser) -> None:
     """The options of `field`."""
     captures_argument(parser)
     model_options(parser)
+    device_option(parser)
     out_option(parser, "NEW.toml", "where the model with the field goes")
 
 
@@ -30,11 +32,12 @@ def run(args: Namespace, screen: Screen) -> Result:
     captures, _, model = inputs_of(args)
     note_what_is_used(captures, screen)
     from trainer.captures.capture_origin import origin
+    from trainer.device import computing_on
     from trainer.fitting.learned_field import learn_field
     from trainer.model.model_file import write_model
 
     use_every_core()
-    with screen.progress("learning the field at the panel") as progress:
+    with computing_on(args.device), screen.progress("learning the field at the panel") as progress:
         found = learn_field(captures, model, progress)
     write_model(args.out, found.model, origin(captures))
     return {"model": str(args.out), **found.as_json()}

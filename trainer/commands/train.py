@@ -15,6 +15,7 @@ from runtime.program.outputs import Output, emptied
 from runtime.program.progress import part_of
 from runtime.program.screen import Screen
 from trainer.commands.command_line import command_line
+from trainer.commands.device_option import device_option
 from trainer.commands.inputs import captures_argument, inputs_of, model_options
 from trainer.commands.network_options import judge_options, size_options
 from trainer.commands.number_text import LIKENESS
@@ -61,6 +62,12 @@ def options(parser: ArgumentParser) -> None:
         type=whole(1, 10**8),
         default=500,
         help="steps between checkpoints (default 500)",
+    )
+    device_option(
+        parser,
+        "what computes the light path and trains: cpu, or cuda, a GPU (default: cpu, and training on a GPU where torch "
+        "finds one)",
+        default=None,
     )
     seed_option(parser)
 
@@ -114,6 +121,7 @@ def _train(args: Namespace, screen: Screen, first: bool, stepped: Callable[[int]
     """Train, and compare with what the camera saw; the later processes of several return nothing."""
     from dataclasses import asdict
 
+    from trainer.device import computing_on
     from trainer.networks.approximator import read_approximator
     from trainer.training.checkpoint import refuse_other_run
     from trainer.training.image_metrics import noise_floor, prediction_metrics
@@ -129,7 +137,7 @@ def _train(args: Namespace, screen: Screen, first: bool, stepped: Callable[[int]
         refuse_other_run(args.out, {"recipe": asdict(recipe), "seed": args.seed})
     captures, _, model = inputs_of(args)
     use_every_core()
-    with screen.progress("predicting") as progress:
+    with computing_on(args.device or "cpu"), screen.progress("predicting") as progress:
         sets = training_sets(
             captures, model, args.ideal, part_of(progress, 0, 1, "predicting what the model says")
         )
@@ -144,7 +152,7 @@ def _train(args: Namespace, screen: Screen, first: bool, stepped: Callable[[int]
 
         network = train(
             sets.fitted, recipe, args.steps, args.out, sets.held_out, judges, teacher=teacher, seed=args.seed,
-            every=args.every, about=sets.about, progress=say,
+            every=args.every, about=sets.about, device=args.device, progress=say,
         )  # fmt: skip
     if not first:
         return {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 
+from firmware_iface.errors import InputError
 from runtime.program.options import whole
 
 
@@ -24,10 +25,21 @@ def workers_option(parser: ArgumentParser, what: str) -> None:
 
 
 def workers_of(args: Namespace) -> int:
-    """How many processes to use; with one, this process takes every core."""
+    """How many processes to use; with one, this process takes every core.
+
+    Raises
+    ------
+    InputError
+        For several processes, or a cluster, on a GPU.
+    """
     from trainer.fitting.pool import cores
 
-    workers = int(args.workers or cores())
+    on_gpu = getattr(args, "device", "cpu") == "cuda"
+    if on_gpu and (args.workers not in (None, 1) or getattr(args, "cluster", None) is not None):
+        raise InputError(
+            "with --device cuda one process computes on the GPU: leave out --workers and --cluster"
+        )
+    workers = 1 if on_gpu else int(args.workers or cores())
     if workers == 1:
         use_every_core()
     return workers

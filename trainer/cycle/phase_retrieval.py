@@ -13,6 +13,7 @@ approximator.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 
 import numpy as np
@@ -24,6 +25,7 @@ from runtime.lightpath.light_path import LightPath, irradiance, panel_phase, pix
 from runtime.program.progress import Progress
 from runtime.solver import DriveRange, solve
 from trainer.cycle.target_pictures import TargetVolume
+from trainer.device import array_of
 from trainer.effects.effect_catalogue import BUILT_IN
 from trainer.model.bundle_export import acting_on_display, baked_path
 from trainer.model.model import Model, instance_with
@@ -148,6 +150,8 @@ def _through_network(
     else:
         begin = [panel_phase(path, gray.astype(np.int64)) for path, gray in zip(baked, start, strict=True)]
     phase = torch.tensor(np.stack(begin), dtype=torch.float32).requires_grad_(True)
+    if network is not None and phase.device.type != "cpu":  # where networks stay
+        network = copy.deepcopy(network).to(phase.device)
     paths = [[torch_path(model, c.name, z) for c in model.bench.channels] for z in wanted.planes_mm]
     target = torch.as_tensor(wanted.irradiance, dtype=torch.float32)
     weight = torch.as_tensor(wanted.weight, dtype=torch.float32)[:, None]
@@ -167,8 +171,8 @@ def _through_network(
             with torch.no_grad():
                 for c, drive in enumerate(drives):
                     if drive.bounded:
-                        phase[c] = torch.as_tensor(drive.held(phase[c].numpy()), dtype=phase.dtype)
-    return np.stack([drive.gray(p) for drive, p in zip(drives, best.numpy(), strict=True)])
+                        phase[c] = torch.as_tensor(drive.held(array_of(phase[c])), dtype=phase.dtype)
+    return np.stack([drive.gray(p) for drive, p in zip(drives, array_of(best), strict=True)])
 
 
 def loss_of(

@@ -19,6 +19,7 @@ from trainer.captures.capture_table import Capture
 from trainer.captures.patterns import Pattern
 from trainer.cycle.phase_retrieval import CARRIER, OPENING
 from trainer.cycle.target_pictures import TargetVolume
+from trainer.device import computing_on
 from trainer.model.model import Model
 from trainer.networks.lpips import Lpips
 from trainer.training.image_metrics import ImageMetrics, image_metrics, mean_metrics
@@ -104,6 +105,7 @@ def rows_of(captures: CaptureSet, name: str) -> list[Capture]:
     return [c for c in unique.values() if c.extra["kind"] == name]
 
 
+@computing_on("cpu")
 def display_metrics(pairs: Pairs, wanted: TargetVolume, lpips: Lpips | None = None) -> ImageMetrics:
     """Metrics of the camera's pictures against a target, mean over its planes.
 

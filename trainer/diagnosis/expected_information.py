@@ -27,6 +27,7 @@ from trainer.captures.bench_file import Camera
 from trainer.captures.camera_noise import noise_variance
 from trainer.captures.capture_set import chosen, opened
 from trainer.captures.possible_captures import PossibleCapture
+from trainer.device import array_of
 from trainer.diagnosis.separate import with_all_gains
 from trainer.effects.own_effect import OwnEffectError
 from trainer.fitting.jacobian import columns, keys_of
@@ -129,7 +130,7 @@ def _imagined(one: PossibleCapture, model: Model, camera: Camera, earlier: Tenso
     light = predictor.light(model, predictor.trace(model))
     gain = model.gain[one.channel] * exposure[:, None, None]
     signal = counts(predictor.scene, predictor.stages(model), light, gain, None)
-    noise = torch.as_tensor(noise_variance(signal.numpy(), camera), dtype=torch.float32)
+    noise = torch.as_tensor(noise_variance(array_of(signal), camera), dtype=torch.float32)
     mask = (signal + CLEAR * noise.sqrt() < camera.full_scale).to(torch.float32)
     view = in_view(model.bench)
     if view is not None:
@@ -191,7 +192,7 @@ def _slopes(model: Model, batch: Batch) -> tuple[Tensor, list[Tensor]]:
 
 
 def _pixels(picture: Tensor, which: Array) -> Array:
-    return picture.reshape(-1).double().numpy()[which]
+    return array_of(picture.reshape(-1).double())[which]
 
 
 def _normal(rows: Sequence[Array], weight: Array) -> Array:

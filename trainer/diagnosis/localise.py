@@ -15,6 +15,7 @@ from torch import Tensor
 
 from runtime.excess import tile_sums
 from trainer.captures.batches import Batch
+from trainer.device import array_of
 
 CELLS = 16  # tiles along the longer side of the picture
 RINGS = 0.025  # width of a ring of spatial frequencies, cycles/pixel
@@ -58,7 +59,7 @@ class CaptureResidual:
 def residual_of(batch: Batch, prediction: Tensor) -> CaptureResidual:
     """The residual of a batch of one capture, from its predicted counts [1, h, w]."""
     tensors = (batch.signal, prediction, batch.noise, batch.mask)
-    return CaptureResidual(*(t[0].double().numpy() for t in tensors))
+    return CaptureResidual(*(array_of(t[0].double()) for t in tensors))
 
 
 class FieldSums:

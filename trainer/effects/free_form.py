@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from runtime.lightpath.spline_maps import node_weights, weights_at
+from trainer.device import array_of, kept_by_device
 from trainer.prediction.free_stages import PUPIL_EXTENT
 from trainer.prediction.stages import Pupil
 
@@ -63,7 +63,7 @@ def along(curve: Tensor, share: Tensor) -> Tensor:
 
 def on_other_curve_nodes(nodes: NDArray[np.float64], count: int) -> NDArray[np.float64]:
     """The `count` nodes a row that give nearly the same curves as nodes [curves, n]."""
-    there, here = _over_pixels(SAMPLES, count).numpy(), _over_pixels(SAMPLES, nodes.shape[1]).numpy()
+    there, here = (array_of(_over_pixels(SAMPLES, n)) for n in (count, nodes.shape[1]))
     return np.asarray(nodes @ np.linalg.lstsq(there, here, rcond=None)[0].T)
 
 
@@ -84,19 +84,19 @@ def _weights(stage: Any, nodes: tuple[int, int]) -> tuple[Tensor, Tensor]:
     if isinstance(stage, Pupil):
         places = (stage.v[:, 0], stage.u[0, :])
         rows, columns = (
-            _over_band(p.double().numpy().tobytes(), n) for p, n in zip(places, nodes, strict=True)
+            _over_band(array_of(p.double()).tobytes(), n) for p, n in zip(places, nodes, strict=True)
         )
     else:
         rows, columns = (_over_pixels(p, n) for p, n in zip(grid_of(stage), nodes, strict=True))
     return rows, columns
 
 
-@lru_cache(maxsize=32)
+@kept_by_device(32)
 def _over_pixels(pixels: int, nodes: int) -> Tensor:
     return torch.as_tensor(node_weights(pixels, nodes), dtype=torch.float64)
 
 
-@lru_cache(maxsize=32)
+@kept_by_device(32)
 def _over_band(frequencies: bytes, nodes: int) -> Tensor:
     places = np.frombuffer(frequencies, np.float64)
     return torch.as_tensor(weights_at(places, -PUPIL_EXTENT, PUPIL_EXTENT, nodes), dtype=torch.float64)

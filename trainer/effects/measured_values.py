@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.special import j0
 
+from trainer.device import array_of
 from trainer.effects.evidence import Evidence
 from trainer.effects.starts import displacements
 
@@ -34,8 +35,8 @@ def blur_rms(evidence: Sequence[Evidence]) -> dict[str, Any]:
     variances = []
     for one in evidence:
         for k in range(len(one.batch.ids)):
-            sharp = one.prediction[k].double().numpy()
-            blurred, weight = (t[k].double().numpy() for t in (one.batch.signal, one.batch.mask))
+            sharp = array_of(one.prediction[k].double())
+            blurred, weight = (array_of(t[k].double()) for t in (one.batch.signal, one.batch.mask))
             variances.append(_blur_variance(sharp, blurred, weight))
     return {"rms": max(0.05, float(np.sqrt(np.mean(variances))))}
 
@@ -62,9 +63,9 @@ def pixel_pattern(evidence: Sequence[Evidence]) -> dict[str, Any]:
     """
     sums = np.zeros((5, *evidence[0].batch.signal.shape[-2:]))
     for one in evidence:
-        weight = (one.batch.mask / one.batch.noise).double().numpy()
-        expected = one.prediction.double().numpy()
-        beyond = one.batch.signal.double().numpy() - expected
+        weight = array_of((one.batch.mask / one.batch.noise).double())
+        expected = array_of(one.prediction.double())
+        beyond = array_of(one.batch.signal.double()) - expected
         terms = (expected**2, expected, np.ones_like(expected), expected * beyond, beyond)
         sums += np.stack([(weight * t).sum(0) for t in terms])
     gain_spread, offset_spread = LIKELY_GAIN, LIKELY_OFFSET

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from trainer.device import array_of
 from trainer.effects.evidence import Evidence
 from trainer.prediction.predict import light_on_camera, trace
 from trainer.prediction.scene import bare_stages
@@ -62,7 +63,7 @@ def pull(
             gain = (fixed * one.prediction[k]).sum() / (fixed**2).sum()
             residual = (one.batch.signal[k] - one.prediction[k]) * one.batch.mask[k]
             (slope,) = torch.autograd.grad((residual * light * gain).sum(), surface)
-            total += slope.double().numpy()
+            total += array_of(slope.double())
     return total
 
 

@@ -20,6 +20,7 @@ from runtime.lightpath.light_path import image_field, panel_phase, panel_spectru
 from trainer.captures.bench_file import Bench
 from trainer.captures.conventions import Sample
 from trainer.captures.distance_search import best_distance
+from trainer.device import array_of
 from trainer.effects.evidence import Evidence
 from trainer.prediction.predict import bare_irradiance, light_path
 from trainer.prediction.scene import bare_stages, scene_at
@@ -56,7 +57,7 @@ def _found_distance(evidence: Evidence) -> float | None:
     scene, batch = evidence.scene, evidence.batch
     digest = hashlib.sha256()
     for array in (batch.gray, batch.signal, batch.mask):
-        digest.update(array[:SEARCHED].numpy().tobytes())
+        digest.update(array_of(array[:SEARCHED]).tobytes())
     key = (scene.bench, scene.channel, scene.plane_mm, scene.method, digest.digest())
     if key not in _DISTANCES:
         if len(_DISTANCES) >= 64:
@@ -64,9 +65,9 @@ def _found_distance(evidence: Evidence) -> float | None:
         samples = [
             Sample(
                 batch.ids[k],
-                batch.gray[k].numpy().astype(np.uint8),
-                batch.signal[k].float().numpy(),
-                batch.mask[k].numpy() > 0,
+                array_of(batch.gray[k]).astype(np.uint8),
+                array_of(batch.signal[k].float()),
+                array_of(batch.mask[k]) > 0,
                 scene.channel,
                 scene.plane_mm,
             )
@@ -93,8 +94,8 @@ def displacements(evidence: Evidence) -> tuple[NDArray, NDArray, NDArray]:
     weights : float array [n]
     """
     batch = evidence.batch
-    observed = (batch.signal * batch.mask).double().numpy()
-    expected = (evidence.prediction * batch.mask).double().numpy()
+    observed = array_of((batch.signal * batch.mask).double())
+    expected = array_of((evidence.prediction * batch.mask).double())
     height, width = observed.shape[-2:]
     size = min(TILE, height // 2, width // 2)
     taper = np.outer(np.hanning(size + 2)[1:-1], np.hanning(size + 2)[1:-1])
@@ -154,8 +155,8 @@ def ghost_starts(evidence: Sequence[Evidence], most: int = 3) -> Starts:
     """Displacements, panel pixels, at which the residual looks most like the prediction."""
     one = evidence[0]
     batch = one.batch
-    residual = ((batch.signal - one.prediction) * batch.mask).double().numpy()
-    expected = one.prediction.double().numpy()
+    residual = array_of(((batch.signal - one.prediction) * batch.mask).double())
+    expected = array_of(one.prediction.double())
     height, width = expected.shape[-2:]
     taper = np.outer(np.hanning(height + 2)[1:-1], np.hanning(width + 2)[1:-1])
     starts = []
@@ -189,7 +190,7 @@ def coherent_ghost_starts(evidence: Sequence[Evidence], most: int = 2) -> Starts
         total = None
         for k in range(min(SEARCHED, len(batch.ids))):
             spectrum = panel_spectrum(path, panel_phase(path, batch.gray[k : k + 1]))
-            field = at_pixels(scene.grid, image_field(path, spectrum, 0))[0].numpy()
+            field = array_of(at_pixels(scene.grid, image_field(path, spectrum, 0))[0])
             power = float((np.abs(field) ** 2).sum())
             residual = _on_panel_pixels(scene.bench, ((batch.signal - one.prediction) * batch.mask)[k])
             scale = float(one.prediction[k].sum()) / max(power, 1e-30)
@@ -230,13 +231,13 @@ def _near(i: int, j: int, shape: tuple[int, ...]) -> list[tuple[int, int]]:
 def _on_panel_pixels(bench: Bench, picture: torch.Tensor) -> NDArray:
     """A camera's picture summed into the panel pixels that its pixels look at: [H, W]."""
     if bench.camera.registered:
-        return picture.double().numpy()
+        return array_of(picture.double())
     y, x = bench.camera.looks_at()
     rows, columns = np.rint(y).astype(int), np.rint(x).astype(int)
     height, width = bench.panel.shape
     inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
     total = np.zeros((height, width))
-    np.add.at(total, (rows[inside], columns[inside]), picture.double().numpy()[inside])
+    np.add.at(total, (rows[inside], columns[inside]), array_of(picture.double())[inside])
     return total
 
 

@@ -14,6 +14,7 @@ from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.capture_table import Moment
 from trainer.captures.capture_writer import CaptureWriter
 from trainer.captures.patterns import choose_patterns
+from trainer.device import array_of
 from trainer.effects.definition import Effect
 from trainer.model.model import EffectInstance, Model, absent, instance_with
 from trainer.model.model_stages import scene_for, stages_for
@@ -89,7 +90,7 @@ def captures_with(
     with CaptureWriter(folder, bench) as writer, torch.no_grad():
         for number, pattern in enumerate(choose_patterns(bench, "green", bench.distance_mm, patterns, seed)):
             moment = Moment(float(number), float(number))
-            signal = _predict(model, model.present, gray=pattern.gray, moment=moment)[0].double().numpy()
+            signal = array_of(_predict(model, model.present, gray=pattern.gray, moment=moment)[0].double())
             noisy = signal + np.sqrt(noise_variance(signal, bench.camera)) * rng.standard_normal(signal.shape)
             raw = np.clip(np.rint(noisy + bench.camera.black_level), 0, bench.camera.saturation)
             writer.add(pattern.gray, raw.astype(np.uint16), "green", pattern=f"{number:03d}")

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from itertools import product
 
 import torch
 from torch import Tensor
+
+from trainer.device import kept_by_device
 
 
 def zernike_indices(order: int, without_defocus: bool = False) -> list[tuple[int, int]]:
@@ -48,7 +49,7 @@ def zernike_surface(terms: Tensor, y: Tensor, x: Tensor, order: int, without_def
     return y**exponents @ table @ (x.T**exponents).T
 
 
-@lru_cache(maxsize=8)
+@kept_by_device(8)
 def _monomials(order: int, without_defocus: bool) -> Tensor:
     """Coefficient [count, i, j] of y^i x^j in each polynomial."""
     indices = zernike_indices(order, without_defocus)

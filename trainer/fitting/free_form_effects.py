@@ -15,6 +15,7 @@ import torch
 from runtime.lightpath.spline_maps import nodes_over, on_other_nodes
 from runtime.program.progress import Progress, no_progress
 from trainer.captures.batches import Batch
+from trainer.device import array_of
 from trainer.effects.free_form import grid_of, on_other_curve_nodes
 from trainer.fitting.free_form_maps import FreeFormBatch, descend
 from trainer.fitting.gauss_newton import fit
@@ -103,7 +104,7 @@ def _descended(
     curve = present.effect.free_form is not None and present.effect.free_form.curve
     iterations, rounds = (CURVE_ITERATIONS, CURVE_ROUNDS) if curve else (ITERATIONS, ROUNDS)
     found = descend(_stage_of(model, present), parts[0], parts[1], scale, iterations, rounds)
-    return model.having(replace(present, nodes=present.nodes + found["nodes"].double().numpy()))
+    return model.having(replace(present, nodes=present.nodes + array_of(found["nodes"].double())))
 
 
 def _node_shapes(model: Model, name: str, batch: Batch) -> list[tuple[int, int]]:

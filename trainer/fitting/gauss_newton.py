@@ -20,6 +20,7 @@ from torch import Tensor
 from runtime.excess import PredictionErrors, joined
 from runtime.program.progress import Progress
 from trainer.captures.batches import Batch
+from trainer.device import array_of
 from trainer.effects.definition import STAGES
 from trainer.effects.evidence import Evidence
 from trainer.effects.own_effect import measured_by
@@ -178,9 +179,8 @@ def _fit_many(
         slopes = ManySlopes(model, many, predictors, points, table)
         change = slopes.step(residuals)
         # What the few numbers do best when the many have moved.
-        rest = slopes.explained(
-            [r - s for r, s in zip(residuals, slopes.along_with_others(change), strict=True)]
-        ).numpy()
+        along = slopes.along_with_others(change)
+        rest = array_of(slopes.explained([r - s for r, s in zip(residuals, along, strict=True)]))
         accepted = False
         for share in (1.0, 0.5, 0.2, 0.05):
             trial = _moved(slopes.moved(share * change), keys, channels, share * rest)
@@ -242,16 +242,16 @@ def _away(model: Model, keys: tuple[tuple[str, str, int], ...], ranges: np.ndarr
 
 
 def _normal(slopes: list[Tensor]) -> np.ndarray:
-    return sum((s @ s.T).double().numpy() for s in slopes)  # type: ignore[return-value]
+    return sum(array_of((s @ s.T).double()) for s in slopes)  # type: ignore[return-value]
 
 
 def _gradient(slopes: list[Tensor], residuals: list[Tensor]) -> np.ndarray:
-    return sum((s @ r).double().numpy() for s, r in zip(slopes, residuals, strict=True))  # type: ignore[return-value]
+    return sum(array_of((s @ r).double()) for s, r in zip(slopes, residuals, strict=True))  # type: ignore[return-value]
 
 
 def _scatter(slopes: list[Tensor], residuals: list[Tensor]) -> np.ndarray:
     weighted = [s * r for s, r in zip(slopes, residuals, strict=True)]
-    return sum((w @ w.T).double().numpy() for w in weighted)  # type: ignore[return-value]
+    return sum(array_of((w @ w.T).double()) for w in weighted)  # type: ignore[return-value]
 
 
 def _solve(normal: np.ndarray, gradient: np.ndarray, damping: float) -> np.ndarray:

@@ -20,6 +20,7 @@ from trainer.captures.batches import Batch, load
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.capture_table import Capture
 from trainer.captures.held_out import FIT_CAPTURES, sample, split
+from trainer.device import array_of
 from trainer.fitting.free_form_maps import FreeFormBatch, descend
 from trainer.fitting.gains import with_gains
 from trainer.fitting.gauss_newton import fit
@@ -177,7 +178,7 @@ def _descend(
     free = FreeFormStage("panel", shapes, apply, lambda maps: [], spread)
     pixels = sum(float((b.batch.mask > 0).sum()) for b in fitted)
     found = descend(free, fitted, stopping, max(pixels, 1.0), ITERATIONS, rounds, progress)
-    return {name: surface.numpy() for name, surface in found.items()}
+    return {name: array_of(surface) for name, surface in found.items()}
 
 
 def _in_noise_units(model: Model, batches: Sequence[Batch]) -> list[FreeFormBatch]:

@@ -12,6 +12,7 @@ from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.capture_table import Capture
 from trainer.captures.held_out import with_stopping
+from trainer.device import array_of
 from trainer.fitting.free_form_maps import FreeFormBatch, descend
 from trainer.fitting.gains import with_gains
 from trainer.fitting.learned_field import with_learned_field
@@ -51,5 +52,5 @@ def with_learned_stage(
     fitted, stopping = ([FreeFormBatch(model, b) for b in part] for part in (batches, load(captures, last)))
     free = learned_stage(model.bench, stage)
     found = descend(free, fitted, stopping, scale, ITERATIONS, ROUNDS, progress)
-    maps = {name: tensor.numpy() for name, tensor in found.items()}
+    maps = {name: array_of(tensor) for name, tensor in found.items()}
     return with_gains(captures, replace(model, gain={}, learned={**model.learned, stage: maps}), rows)

@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from trainer.device import array_of
 from trainer.effects.definition import STAGES
 from trainer.fitting.jacobian import STEP
 from trainer.fitting.predictor import Predictor
@@ -188,7 +189,7 @@ class ManySlopes:
             slopes = torch.autograd.grad(total, leaves, allow_unused=True)
         return np.concatenate(
             [
-                np.zeros(leaf.numel()) if slope is None else slope.double().numpy().reshape(-1)
+                np.zeros(leaf.numel()) if slope is None else array_of(slope.double()).reshape(-1)
                 for slope, leaf in zip(slopes, leaves, strict=True)
             ]
         )

@@ -24,6 +24,7 @@ from trainer.captures.batches import moments_of
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.capture_table import Moment
 from trainer.captures.held_out import scenes
+from trainer.device import array_of
 from trainer.effects.definition import Effect
 from trainer.model.model import Model
 from trainer.model.model_stages import scene_for, stages_of
@@ -203,7 +204,7 @@ def _single(value: Any) -> Any:
     if isinstance(value, tuple):
         return tuple(_single(part) for part in value)
     if isinstance(value, Tensor):
-        return value.to(torch.complex64 if value.is_complex() else torch.float32).numpy()
+        return array_of(value.to(torch.complex64 if value.is_complex() else torch.float32))
     if value is None or isinstance(value, Grid | int):
         return value
     raise TypeError(f"a light path does not hold {type(value).__name__}")

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from firmware_iface.errors import InputError, nearest
 from runtime.bundle.whole_files import whole_file
+from trainer.device import computing_on
 from trainer.networks.compact_network import CompactNetwork
 from trainer.networks.pix2pix import Pix2Pix
 from trainer.networks.pix2pixhd import Pix2PixHD
@@ -140,13 +141,14 @@ def read_about(path: Path | str) -> dict[str, Any]:
     return dict(header.get("about", {})) if isinstance(header, dict) else {}
 
 
+@computing_on("cpu")
 def read_approximator(path: Path | str) -> tuple[Approximator, dict[str, Any]]:
     """An approximator from its file.
 
     Returns
     -------
     Approximator
-        In evaluation mode.
+        On the CPU, in evaluation mode.
     dict
         Its `about`, as `write_approximator` got it.
 

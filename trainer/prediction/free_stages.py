@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -18,6 +17,7 @@ from torch import Tensor
 from runtime.lightpath.legendre import legendre_count, legendre_curve, legendre_surface
 from runtime.lightpath.light_path import mode_irradiance, panel_phase, panel_spectrum, states
 from trainer.captures.bench_file import Bench
+from trainer.device import array_of, kept_by_device
 from trainer.prediction.panel_field import UNITS, resized, with_field
 from trainer.prediction.predict import light_path
 from trainer.prediction.scene import Scene, Stages
@@ -214,7 +214,7 @@ FREE_STAGES: dict[str, Callable[[Bench], FreeFormStage]] = {
 
 
 def _array(values: Tensor) -> np.ndarray:
-    return values.detach().float().numpy()
+    return array_of(values.float())
 
 
 def _field(height: int, width: int) -> tuple[Tensor, Tensor]:
@@ -245,7 +245,7 @@ LEARNED = "learned"  # table of a model file
 LEARNED_STAGES = ("drive", "pupil", "sensor")  # what is learned at the panel is its field (`panel_field`)
 
 
-@lru_cache(maxsize=8)
+@kept_by_device(8)
 def learned_stage(bench: Bench, stage: str) -> FreeFormStage:
     """What may be learned at a stage: its free form, as far as it is one light path."""
     free = FREE_STAGES[stage](bench)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -27,6 +26,7 @@ from runtime.lightpath.grid import FINE
 from runtime.lightpath.light_path import LightPath, mode_irradiance, panel_phase, panel_spectrum, states
 from runtime.lightpath.modulation import Modulation
 from runtime.lightpath.propagation import far_field_matrix
+from trainer.device import array_of, kept_by_device
 from trainer.prediction.capture_motion import blurred_spectrum, displaced_spectrum
 from trainer.prediction.panel_gradient import has_panel_gradient, image_with_panel_gradient
 from trainer.prediction.pupil_modes import pupil_modes
@@ -139,7 +139,7 @@ def bare_irradiance(scene: Scene, gray: np.ndarray) -> np.ndarray:
     stages = bare_stages(scene)
     with torch.no_grad():
         patterns = torch.as_tensor(gray.astype(np.int64))[None]
-        return np.asarray(light_on_camera(scene, stages, trace(scene, stages, patterns).image)[0])
+        return array_of(light_on_camera(scene, stages, trace(scene, stages, patterns).image)[0])
 
 
 def display_filter(stages: Stages) -> Tensor | None:
@@ -297,7 +297,7 @@ def counts(
     return signal
 
 
-@lru_cache(maxsize=32)
+@kept_by_device(32)
 def camera_positions(scene: Scene) -> tuple[Tensor, Tensor]:
     """Where each camera pixel's centre looks.
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from runtime.lightpath.propagation import band_limit, transfer_function
+from trainer.device import kept_by_device
 from trainer.prediction.scene import Scene, bare_stages
 from trainer.prediction.stages import Pupil
 
@@ -26,7 +26,7 @@ def pupil_modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
     return _bare_modes(scene) if pupil is bare_stages(scene).pupil else _modes(scene, pupil)
 
 
-@lru_cache(maxsize=16)
+@kept_by_device(16)
 def _bare_modes(scene: Scene) -> tuple[Tensor, Tensor]:
     return _modes(scene, bare_stages(scene).pupil)
 
@@ -64,7 +64,7 @@ def _free_space(scene: Scene, pupil: Pupil, offset: Tensor) -> Tensor:
     return _known_transfer(scene, float(pupil.distance), float(offset))
 
 
-@lru_cache(maxsize=4)  # most effects change neither distance nor line
+@kept_by_device(4)  # most effects change neither distance nor line
 def _known_transfer(scene: Scene, distance: float, offset: float) -> Tensor:
     return _transfer(
         scene, bare_stages(scene).pupil, scene.wavelength + offset, torch.tensor(distance, dtype=scene.dtype)

@@ -10,12 +10,13 @@ from scipy.sparse import csr_matrix
 from torch import Tensor
 
 from runtime.camera.sampling import spline_matrix, spline_samples
+from trainer.device import array_of
 
 MOST_PLACES = 400_000  # whose weights are kept: 50 MB
 
 
 def samples_at(coefficients: Tensor, y: Tensor, x: Tensor) -> Tensor:
-    """`spline_samples`, with the weights of the places kept where nothing is differentiated.
+    """`spline_samples`; on the processor with the weights of the places kept, where nothing is differentiated.
 
     Parameters
     ----------
@@ -27,12 +28,13 @@ def samples_at(coefficients: Tensor, y: Tensor, x: Tensor) -> Tensor:
     Tensor [B, h, w]
     """
     differentiated = any(t.requires_grad for t in (coefficients, y, x))
-    if differentiated or y.numel() > MOST_PLACES or coefficients.dtype != torch.float32:
+    kept = coefficients.device.type == "cpu" and coefficients.dtype == torch.float32
+    if differentiated or not kept or y.numel() > MOST_PLACES:
         return spline_samples(coefficients, y, x)
     height, width = coefficients.shape[-2:]
-    places = (t.double().numpy().tobytes() for t in (y, x))
+    places = (array_of(t.double()).tobytes() for t in (y, x))
     weights = _weights(*places, (y.shape[-2], y.shape[-1]), (height, width))
-    sampled = [weights @ one.ravel() for one in coefficients.numpy()]
+    sampled = [weights @ one.ravel() for one in array_of(coefficients)]
     return torch.from_numpy(np.stack(sampled).reshape(-1, *y.shape))
 
 

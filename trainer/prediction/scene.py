@@ -16,6 +16,7 @@ from torch import Tensor
 from runtime.lightpath.grid import Grid, band_frequencies, grid_for, image_frequencies
 from runtime.lightpath.propagation import Aperture, check_sampling
 from trainer.captures.bench_file import Bench
+from trainer.device import kept_by_device
 from trainer.prediction.stages import Drive, Panel, Pupil, Sensor
 
 
@@ -104,7 +105,7 @@ class Stages:
     sensor: Sensor
 
 
-@lru_cache(maxsize=32)
+@kept_by_device(32)
 def bare_stages(scene: Scene) -> Stages:
     """The stages as the bench file has them."""
     bench, grid, dtype = scene.bench, scene.grid, scene.dtype

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from runtime.camera.sampling import panel_on_camera, rectified
 from trainer.captures.bench_file import Bench
+from trainer.device import array_of
 from trainer.prediction.scene import Scene, Stages
 
 Places = tuple[np.ndarray, np.ndarray]
@@ -56,7 +57,7 @@ def _displacement(stages: Stages, shape: tuple[int, ...]) -> Places | None:
     given = stages.sensor.displacement
     if given is None:
         return None
-    dy, dx = (np.broadcast_to(d.detach().cpu().double().numpy(), shape) for d in given)
+    dy, dx = (np.broadcast_to(array_of(d.double()), shape) for d in given)
     return dy, dx
 
 
@@ -69,5 +70,5 @@ def _panel_on_camera(bench: Bench) -> Places:
 
 def _resampled(picture: Tensor, y: np.ndarray, x: np.ndarray) -> Tensor:
     """A picture [h, w] at places in its pixels, as a tensor of its type; zero outside."""
-    values = rectified(picture.detach().cpu().numpy(), y, x)
+    values = rectified(array_of(picture), y, x)
     return torch.as_tensor(values, dtype=picture.dtype, device=picture.device)

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from trainer.device import computing_on
 from trainer.networks.lpips import SMALLEST, Lpips
 from trainer.training.losses import display_encoded, three_planes, where_measured
 from trainer.training.training_pairs import Pairs
@@ -93,6 +94,7 @@ def prediction_metrics(
     return mean_metrics(found)
 
 
+@computing_on("cpu")
 def noise_floor(pairs: Pairs, lpips: Lpips | None = None, seed: int = 0) -> ImageMetrics:
     """Metrics of the measurements against themselves with the camera's noise added once more.
 

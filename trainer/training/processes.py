@@ -15,13 +15,21 @@ def processes() -> tuple[int, int]:
     return local, max(1, int(os.environ.get("WORLD_SIZE", "1")) // local)
 
 
-def launched_fabric(folder: Path | None) -> Any:
-    """A lightning Fabric on the GPU if there is one, with TensorBoard's curves in a folder; started in each process."""
+def launched_fabric(folder: Path | None, device: str | None = None) -> Any:
+    """A lightning Fabric, started in each process.
+
+    Parameters
+    ----------
+    folder : path or None
+        For TensorBoard's curves.
+    device : str or None
+        "cpu" or "cuda"; None: a GPU if there is one.
+    """
     from lightning_fabric import Fabric
     from lightning_fabric.loggers import TensorBoardLogger
 
     local, machines = processes()
-    gpu = torch.cuda.is_available()
+    gpu = device == "cuda" or (device is None and torch.cuda.is_available())
     fabric = Fabric(
         accelerator="cuda" if gpu else "cpu",
         devices=local,

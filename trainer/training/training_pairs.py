@@ -38,7 +38,7 @@ DULL = 0.02  # of the greatest sensitivity: below it the camera measures too lit
 
 @dataclass(frozen=True)
 class Pairs:
-    """Predicted and measured irradiance of N pictures.
+    """Predicted and measured irradiance of N pictures, in the host's memory.
 
     Attributes
     ----------
@@ -121,13 +121,13 @@ def pairs_of(
         raise InputError(f"{captures.folder} has no captures to train on: capture some first")
     height, width = captures.bench.panel.shape
     shape = (len(stacks), len(captures.bench.channels), height, width)
-    predicted, measured, weight, noise = (torch.zeros(shape) for _ in range(4))
+    predicted, measured, weight, noise = (torch.zeros(shape, device="cpu") for _ in range(4))
     for k, stack in enumerate(stacks):
         for plane, capture in enumerate(stack):
             if capture is not None:
                 one = measured_on_panel(model, load_batch(captures, [capture]))
-                predicted[k, plane], measured[k, plane] = one.predicted, one.measured
-                weight[k, plane], noise[k, plane] = one.weight, one.noise
+                predicted[k, plane], measured[k, plane] = one.predicted.cpu(), one.measured.cpu()
+                weight[k, plane], noise[k, plane] = one.weight.cpu(), one.noise.cpu()
         if progress:
             progress((k + 1) / len(stacks))
     counted = measured[weight > 0]

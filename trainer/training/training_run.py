@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from firmware_iface.errors import InputError
+from trainer.device import computing_on
 from trainer.networks.approximator import NETWORK, Approximator, Architecture, write_approximator
 from trainer.networks.discriminator import Discriminator
 from trainer.training.checkpoint import read_checkpoint, write_checkpoint
@@ -47,6 +48,7 @@ def refuse_without_loss(recipe: Recipe, pretrained: PretrainedNetworks) -> None:
         )
 
 
+@computing_on("cpu")  # Fabric takes to a GPU what it trains
 def train(
     pairs: Pairs,
     recipe: Recipe,
@@ -59,6 +61,7 @@ def train(
     seed: int = 0,
     every: int = EVERY,
     about: dict[str, Any] | None = None,
+    device: str | None = None,
     progress: StepReport | None = None,
 ) -> Approximator:
     """A network trained on pairs.
@@ -87,6 +90,8 @@ def train(
         Steps between checkpoints.
     about : dict or None
         Written into the network's file.
+    device : str or None
+        "cpu" or "cuda"; None: a GPU where torch finds one.
     progress : callable or None
         Called with the step and its content loss.
 
@@ -111,6 +116,7 @@ def train(
         seed,
         every,
         about or {},
+        device,
     ).run(held_out, progress)
 
 
@@ -129,9 +135,10 @@ class _TrainingRun:
         seed: int,
         every: int,
         about: dict[str, Any],
+        device: str | None,
     ) -> None:
         refuse_without_loss(recipe, pretrained)
-        self.fabric = launched_fabric(folder)
+        self.fabric = launched_fabric(folder, device)
         self.pairs, self.recipe, self.steps = pairs, recipe, steps
         self.folder, self.every, self.seed, self.about = folder, every, seed, about
         self.pretrained = pretrained

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from runtime.excess import joined
 from trainer.captures.batches import load
 from trainer.captures.capture_set import chosen, opened
+from trainer.device import array_of
 from trainer.diagnosis.proposals.order_shape import Strengths
 from trainer.diagnosis.proposals.probe_maps import (
     AMPLITUDE,
@@ -154,7 +155,7 @@ def _gradients(free: FreeFormStage, one: FreeFormBatch, k: int, names: list[str]
         error = one.squared_error(free, zero, k)
         slopes = torch.autograd.grad(error, [zero[n] for n in names])
     light = float((one.weight[k] * one.batch.signal[k] ** 2).sum())
-    return {n: (s / light).double().numpy() for n, s in zip(names, slopes, strict=True)}
+    return {n: array_of((s / light).double()) for n, s in zip(names, slopes, strict=True)}
 
 
 def _at(free: FreeFormStage, maps: Mapping[str, torch.Tensor], size: float) -> Tensors:

@@ -27,7 +27,7 @@ def _absorbing(pupil: Pupil, transmission: Tensor) -> Pupil:
 def _starts(evidence: Sequence[Any]) -> list[dict[str, float]]:
     """Where fits start: the row and the column that the residual would darken most."""
     pupil = bare_stages(evidence[0].scene).pupil
-    v, u = pupil.v.reshape(-1).numpy(), pupil.u.reshape(-1).numpy()
+    v, u = pupil.v.reshape(-1).cpu().numpy(), pupil.u.reshape(-1).cpu().numpy()
     pulled = pull(evidence, "pupil", lambda p, m: _absorbing(p, 1 + m), (v.size, u.size))
     found = []
     for profile, place, angle in ((pulled.sum(1), v, 0.0), (pulled.sum(0), u, 90.0)):

@@ -1,0 +1,88 @@
+"""Where the light path computes: on the processor, or on a GPU.
+
+torch puts a new tensor on its default device, so `computing_on` around a piece of work decides for all of it: captures
+and models become tensors there, and what follows from them stays. Three things need more than that and are here: the
+way back to NumPy (`array_of`), results that are kept for later (`kept_by_device`), and work on the processor in the
+middle of the rest (`computing_on("cpu")`).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
+from functools import lru_cache, wraps
+from typing import Any, TypeVar, cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from firmware_iface.errors import InputError
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+@contextmanager
+def computing_on(device: str) -> Iterator[None]:
+    """New tensors are on a device; of several processes that torchrun started, each has a GPU of its own.
+
+    Parameters
+    ----------
+    device : str
+        "cpu" or "cuda".
+
+    Raises
+    ------
+    InputError
+        For "cuda" where torch finds no such device.
+    """
+    if device == torch.get_default_device().type:
+        yield
+        return
+    if device == "cpu":
+        with torch.device(device):
+            yield
+        return
+    if not torch.cuda.is_available():
+        raise InputError(
+            "torch finds no CUDA device on this machine: leave out --device, or install a build of torch with CUDA"
+        )
+    with torch.device(device, int(os.environ.get("LOCAL_RANK", "0"))), _whole_single_precision():
+        yield
+
+
+@contextmanager
+def _whole_single_precision() -> Iterator[None]:
+    """Products and convolutions on a GPU keep all 23 bits, where TF32 would leave 10."""
+    kinds: tuple[Any, ...] = (torch.backends.cuda.matmul, torch.backends.cudnn)
+    before = [kind.allow_tf32 for kind in kinds]
+    for kind in kinds:
+        kind.allow_tf32 = False
+    try:
+        yield
+    finally:
+        for kind, was in zip(kinds, before, strict=True):
+            kind.allow_tf32 = was
+
+
+def array_of(tensor: Tensor) -> np.ndarray:
+    """A tensor's values in the host's memory, without its derivatives; on the processor it is the same memory."""
+    return np.asarray(tensor.detach().cpu().numpy())
+
+
+def kept_by_device(most: int) -> Callable[[F], F]:
+    """`lru_cache` for functions that make tensors: at most so many results are kept, each for its device."""
+
+    def kept(function: F) -> F:
+        @lru_cache(maxsize=most)
+        def made(device: torch.device, *args: Hashable) -> Any:
+            return function(*args)
+
+        @wraps(function)
+        def here(*args: Hashable) -> Any:
+            return made(torch.get_default_device(), *args)
+
+        return cast(F, here)
+
+    return kept
