@@ -3,7 +3,8 @@
 torch puts a new tensor on its default device, so `computing_on` around a piece of work decides for all of it: captures
 and models become tensors there, and what follows from them stays. Three things need more than that and are here: the
 way back to NumPy (`array_of`), results that are kept for later (`kept_by_device`), and work on the processor in the
-middle of the rest (`computing_on("cpu")`).
+middle of the rest (`computing_on("cpu")`). In a backward pass torch does not know its default device: what runs there,
+in `runtime.lightpath`, makes new arrays on the device of those that it is given.
 """
 
 from __future__ import annotations
