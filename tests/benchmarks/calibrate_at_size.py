@@ -122,7 +122,7 @@ class Parts:
 
 def peak_mb() -> int:
     """The most memory that this process has had, MB."""
-    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3)
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6)
 
 
 def measured(shape: tuple[int, int], distance_mm: float, colours: list[str], aloud: bool) -> dict[str, Any]:
