@@ -13,7 +13,8 @@ refinement_captures    captures of the displayed picture for a refinement
 
 Child processes (child_processes starts them; process_messages is what they exchange with the supervisor):
 
-solver_process         pictures to patterns (frame_solver, refinement_thread)
+solver_process         pictures to patterns (frame_solver, refinement_client)
+refinement_process     a picture that is refined, a child of the solver's
 camera_process         the camera and its library
 
 For programs:

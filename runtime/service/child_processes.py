@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 
 from runtime.service.message_format import Vocabulary
@@ -19,6 +20,7 @@ PAUSE_S = 0.05  # before a child is started again; doubled with each death soon 
 LONGEST_PAUSE_S = 5.0
 SETTLED_S = 5.0  # a child that lived so long was started well
 PR_SET_PDEATHSIG = 1
+NICER = 5  # than other programs: a third of their share of that core, where they want it, too
 
 
 class ChildProcess:
@@ -32,9 +34,9 @@ class ChildProcess:
         What the module gets after the descriptor of its end of the link.
     vocabulary : Vocabulary
         Messages that may pass over the link.
-    yields : bool
-        Whether it computes for long, on all cores: it is then scheduled below this process, whose heartbeat would wait
-        for it otherwise.
+    schedule : callable or None
+        Called with the number of each process that was just started: `below` or `in_background`; None: it has this
+        process's own priority.
 
     Attributes
     ----------
@@ -42,9 +44,15 @@ class ChildProcess:
         The supervisor's end, non-blocking; None while the process is not running.
     """
 
-    def __init__(self, module: str, argument: str, vocabulary: Vocabulary, yields: bool = False) -> None:
+    def __init__(
+        self,
+        module: str,
+        argument: str,
+        vocabulary: Vocabulary,
+        schedule: Callable[[int], None] | None = None,
+    ) -> None:
         self.module, self.argument, self.vocabulary = module, argument, vocabulary
-        self._yields = yields
+        self._schedule = schedule
         self.link: MessageLink | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._end: threading.Thread | None = None  # of the process before
@@ -68,8 +76,9 @@ class ChildProcess:
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,  # Ctrl-C is for the supervisor, which darkens the lasers first
             )
-        if self._yields:
-            _schedule_below(self._process.pid)
+        if self._schedule is not None:
+            with suppress(OSError):  # it has ended already
+                self._schedule(self._process.pid)
         self._started_s = time.monotonic()
         self.link = MessageLink(ours, self.vocabulary)
         return self.link
@@ -103,12 +112,21 @@ def _wait_for(process: subprocess.Popen[bytes]) -> None:
     process.wait()
 
 
-def _schedule_below(pid: int) -> None:
-    """Give a process that was just started the next lower real-time priority, where this one has one."""
+def below(pid: int) -> None:
+    """Give a process that computes for long, on all cores, the next lower real-time priority than this one's.
+
+    This process's heartbeat would wait for it otherwise. Where this one has no such priority, nothing changes.
+    """
     policy, priority = os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
     if policy in (os.SCHED_RR, os.SCHED_FIFO) and priority > 1:
-        with suppress(OSError):  # it has ended already
-            os.sched_setscheduler(pid, policy, os.sched_param(priority - 1))
+        os.sched_setscheduler(pid, policy, os.sched_param(priority - 1))
+
+
+def in_background(pid: int) -> None:
+    """Leave a process one core, the last of this process's, below all that has real-time priority."""
+    os.sched_setscheduler(pid, os.SCHED_BATCH, os.sched_param(0))
+    os.setpriority(os.PRIO_PROCESS, pid, NICER)
+    os.sched_setaffinity(pid, {max(os.sched_getaffinity(0))})
 
 
 def child_link(fd: str, vocabulary: Vocabulary) -> MessageLink:

@@ -103,6 +103,13 @@ class PatternSolver:
         self.overdrive = np.stack(tables) if slow_share else None
         self._solvers = [Solver(path, frames=frames, **options) for path in self._paths]
 
+    def rehearse(self) -> None:
+        """Set up what the first use sets up, and measure this machine: on a large panel, seconds for each colour."""
+        for solver in self._solvers:
+            solver.rehearse()
+        for _ in self.patterns(np.ones(self.shape, np.float32), time.monotonic_ns()):
+            pass
+
     def patterns(self, target: np.ndarray, deadline_ns: int) -> Iterator[Pattern]:
         """Patterns for a target, each better than the one before.
 

@@ -1,9 +1,11 @@
-"""Messages between the supervisor and its two child processes.
+"""Messages between the supervisor and its two child processes, and between the solver and its own.
 
 From the supervisor to the solver   TargetRing, SolveJob, FreeSlot, RefinePicture, RefinementCapture, Ping
 From the solver to the supervisor   OverdriveTables, PatternRing, SolvedPattern, FailedJob, RefinementEnd, Pong
 From the supervisor to the camera   TakePicture
 From the camera to the supervisor   CameraPicture (the answer to TakePicture has the picture), CameraMissing
+From the solver to the refinement   RefinementTarget, RefinementCapture, StopRefinement
+From the refinement to the solver   RefinedPattern, RefinementEnd
 """
 
 from __future__ import annotations
@@ -101,6 +103,30 @@ class RefinementCapture(NamedTuple):
     width: U32
 
 
+class RefinementTarget(NamedTuple):
+    """The picture to refine, with a memfd, float32 [1, H, W]; otherwise as RefinePicture."""
+
+    number: U32
+    captures: U32
+    black: F32
+    height: U32
+    width: U32
+
+
+class RefinedPattern(NamedTuple):
+    """The refinement wants this pattern displayed and captured; comes with a memfd, uint8 [1, H, W]."""
+
+    crc: U32
+    height: U32
+    width: U32
+    psnr_db: F32
+    shares: Shares  # of one colour, as in SolvedPattern
+
+
+class StopRefinement(NamedTuple):
+    """The picture is no longer displayed."""
+
+
 class RefinementEnd(NamedTuple):
     """A refinement has ended, and why; amplitude PSNR of the captured picture, dB, at first and at best."""
 
@@ -146,5 +172,8 @@ SOLVER = Vocabulary(
         11: RefinementEnd,
         12: OverdriveTables,
     }
+)
+REFINEMENT = Vocabulary(
+    {1: RefinementTarget, 2: RefinementCapture, 3: StopRefinement, 4: RefinedPattern, 5: RefinementEnd}
 )
 CAMERA = Vocabulary({1: CameraPicture, 2: CameraMissing, 3: TakePicture})

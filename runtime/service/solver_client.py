@@ -13,7 +13,7 @@ import numpy as np
 from firmware_iface.errors import InputError
 from runtime.lightpath.overdrive import TABLES
 from runtime.service import process_messages
-from runtime.service.child_processes import ChildProcess
+from runtime.service.child_processes import ChildProcess, below
 from runtime.service.configuration import Configuration
 from runtime.service.event_loop import EventLoop
 from runtime.service.fault_log import FaultLog
@@ -82,7 +82,7 @@ class SolverClient:
         events: SolverEvents,
     ) -> None:
         self.process = ChildProcess(
-            "runtime.service.solver_process", str(configuration.file), process_messages.SOLVER, yields=True
+            "runtime.service.solver_process", str(configuration.file), process_messages.SOLVER, below
         )
         self.shape: tuple[int, int, int] | None = None
         self.colours: tuple[str, ...] = ()

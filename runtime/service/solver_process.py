@@ -38,8 +38,8 @@ from runtime.service.process_messages import (
     TargetRing,
 )
 from runtime.service.protocol import Code
-from runtime.service.refinement_thread import RefinementThread
-from runtime.service.shared_memory import Ring, crc32, make_ring, open_ring, read_sealed, sealed_copy
+from runtime.service.refinement_client import RefinementClient
+from runtime.service.shared_memory import Ring, crc32, make_ring, open_ring, sealed_copy
 from runtime.service.socket_link import MessageLink
 
 SLOTS = 4
@@ -71,7 +71,7 @@ class Worker:
     ) -> None:
         self.link, self.shape, self.configuration = link, shape, configuration
         self.refinement_request: RefinePicture | None = None  # for the picture of the next job
-        self.refinement: RefinementThread | None = None
+        self.refinement: RefinementClient | None = None
         self.ring = make_ring(SLOTS, (fields, *shape[1:]), np.uint8)
         self.free = set(range(SLOTS))
         self.targets: Ring | None = None
@@ -97,10 +97,10 @@ class Worker:
             case RefinePicture():
                 self.refinement_request = message if message.captures else None
                 self.end_refinement()
-            case RefinementCapture(crc, height, width) if fd is not None:
-                counts = read_sealed(fd, (height, width), np.uint16)
+            case RefinementCapture() if fd is not None:
                 if self.refinement is not None:
-                    self.refinement.take(crc, counts)
+                    self.refinement.take(message, fd)
+                os.close(fd)
 
     def target(self, job: SolveJob) -> np.ndarray:
         """The picture of a job, float32 [C, H, W], 0 to 1.
@@ -126,7 +126,7 @@ class Worker:
     def refined_pattern(self, job: SolveJob, target: np.ndarray) -> Pattern | None:
         """The refinement's pattern for a job; None where the job is to be solved."""
         if self.refinement_request is not None:
-            self.refinement = RefinementThread(
+            self.refinement = RefinementClient(
                 self.configuration, target, job.crc, self.refinement_request, self.link.send
             )
             self.refinement_request = None
@@ -189,8 +189,7 @@ def main(fd: str, configuration: str) -> None:
     except InputError as error:
         link.send(FailedJob(0, Code.SOLVER, str(error)))
         return
-    for _ in solver.patterns(np.ones(solver.shape, np.float32), time.monotonic_ns()):
-        pass  # everything that the first use sets up is ready before the first frame
+    solver.rehearse()  # before the first frame, which would be silent for so long that it counted as hung
     if solver.overdrive is not None:
         tables = sealed_copy(solver.overdrive)
         link.send(OverdriveTables(len(solver.overdrive)), fds=[tables])

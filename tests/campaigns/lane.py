@@ -127,7 +127,7 @@ class Lane:
 
     def frame(self) -> None:
         """Show one picture and take the outcomes of earlier ones."""
-        self._next = (self._next + 1) % PICTURES
+        self._next = (self._next + 1) % len(self.pictures)
         try:
             self.latest = self.client.show(self.pictures[self._next])
             self.accepted += 1

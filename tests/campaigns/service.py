@@ -17,6 +17,7 @@ from runtime.bundle.bundle_folder import read_bundle
 from runtime.service import solver_process
 from runtime.service.configuration import read_configuration
 from runtime.service.frame_solver import Pattern, shown_colours
+from runtime.service.process_messages import SolveJob
 from runtime.service.shared_memory import crc32
 from runtime.service.supervisor import Supervisor
 
@@ -46,16 +47,18 @@ def solve(fd: str, configuration: str) -> None:
     shown = shown_colours(settings, read_bundle(settings.bundle))
     lasers = laser_numbers(settings.devices["lasers"], shown)
 
-    def note(worker: solver_process.Worker, job: object, pattern: Pattern, began_ns: int) -> None:
+    def note(
+        worker: solver_process.Worker, job: SolveJob, pattern: Pattern, began_ns: int, refined: bool = False
+    ) -> None:
         for field in pattern.gray:
             os.write(notes, crc32(field).to_bytes(4, "little"))
         for k, field in enumerate(pattern.gray if pattern.brightness else ()):
             laser = lasers[k % len(lasers)]
             if pattern.brightness[k % len(lasers)] > 0:
                 os.write(fields, crc32(field).to_bytes(4, "little") + bytes([1 << laser]))
-        publish(worker, job, pattern, began_ns)  # type: ignore[arg-type]
+        publish(worker, job, pattern, began_ns, refined)
 
-    solver_process.Worker.publish = note  # type: ignore[method-assign,assignment]
+    solver_process.Worker.publish = note  # type: ignore[method-assign]
     solver_process.main(fd, configuration)
 
 

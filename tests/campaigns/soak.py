@@ -6,6 +6,10 @@ panel, the mean time of each stage, light in a wrong field, and the memory of ea
     python -m tests.campaigns.soak --size 1080x1920 --colours --refresh-hz 2 --solve-ms 400 --seconds 150
 
 is a headset of full size that shows three colours in turn. Its camera gives one picture again and again.
+
+    python -m tests.campaigns.soak --size 1080x1920 --refine --refresh-hz 2 --solve-ms 400 --seconds 150
+
+refines one picture all the while, whose frames are to be as punctual as without `--refine`.
 """
 
 from __future__ import annotations
@@ -20,12 +24,16 @@ import sys
 import tempfile
 import time
 import urllib.request
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from runtime.service.client import LostFrame
+from runtime.bundle.bundle_folder import read_bundle, write_bundle
+from runtime.camera.view import View
+from runtime.service.client import LostFrame, RefusedError
+from tests.campaigns import still_camera
 from tests.campaigns.headset import SHAPE, write_configuration
 from tests.campaigns.lane import STALE_MS, Lane
 
@@ -33,6 +41,7 @@ STAGE = re.compile(r'hololoop_frame_stage_seconds_(sum|count)\{stage="(\w+)"\} (
 LIGHT_WITHIN_S = 60.0
 SETTLED = 0.1  # of the frames, before memory counts
 SAMPLES = 50
+CAPTURES = 1000  # of a refinement at most
 
 
 def memory_mb(pid: int) -> float:
@@ -64,6 +73,7 @@ def soak(
     colours: bool = False,
     solve_ms: float | None = None,
     seconds: float | None = None,
+    refined: bool = False,
 ) -> dict[str, Any]:
     """Show `frames` frames, or for a time; the results.
 
@@ -80,6 +90,8 @@ def soak(
         Time for the patterns of a picture; None: a third of a period, 3 at most.
     seconds : float or None, s
         Ends after this time, however many frames were shown.
+    refined : bool
+        Whether all frames are of one picture that is refined again and again, with a network that was never trained.
     """
     solve_ms = solve_ms or min(3.0, 300 / refresh_hz)
     stale_ms = max(STALE_MS, 2 * solve_ms, 2000 / refresh_hz)  # lit until the next pattern is there
@@ -93,14 +105,23 @@ def soak(
         file = write_configuration(
             Path(folder), refresh_hz, solve_ms, stale_ms, colours=colours, shape=shape, metrics_port=port
         )
+        if refined:
+            add_network(file.parent / "bundle", shape)
         lane = Lane(Path(folder), 0, file=file)
+        lane.pictures = lane.pictures[:1] if refined else lane.pictures
         try:
             lit_up = lane.light_up(LIGHT_WITHIN_S)
+            refining = False
             used = {name: cpu_s(pid) for name, pid in processes(lane).items()}
             sent: dict[int, float] = {}
             began = time.monotonic()
             k = 0
             while (done := max(k / frames, (time.monotonic() - began) / (seconds or math.inf))) < 1:
+                refining = refining and lane.client.refined is None
+                if refined and not refining:
+                    with suppress(RefusedError):
+                        lane.client.refine(CAPTURES)
+                        refining = True
                 lane.frame()
                 sent[lane.latest] = time.monotonic()
                 for outcome in lane.outcomes:
@@ -122,6 +143,10 @@ def soak(
             torn = lane.torn()
             stages = stage_ms(port)
             lit_fields, wrongly_lit = lane.lit_fields(), lane.wrongly_lit()
+            log = (Path(folder) / "service.log").read_text()
+            learned = log.count('"predicted"')
+            if not emitting:
+                print(log, end="", file=sys.stderr)
         finally:
             lane.close()
     quantiles = np.percentile(latency_ms or [-1.0], [50, 95, 99, 99.9, 100])  # -1: nothing was shown
@@ -137,6 +162,7 @@ def soak(
         "late": late,
         "lost": lost,
         "lost_without_error": unanswered,
+        "refinement_captures": learned,
         "torn_frames": torn,
         "latency_ms": dict(
             zip(("p50", "p95", "p99", "p99_9", "worst"), quantiles.round(2).tolist(), strict=True)
@@ -145,6 +171,22 @@ def soak(
         "cpu_ms_a_frame": {name: round(1000 * s / max(1, len(latency_ms)), 1) for name, s in used.items()},
         "memory_mb": {name: _growth(samples, frames) for name, samples in grown.items()},
     }
+
+
+def add_network(bundle: Path, shape: tuple[int, int]) -> None:
+    """Put a compact network that was never trained in a bundle of one colour, and where the still camera looks."""
+    import torch
+
+    from trainer.networks.approximator import Approximator, Architecture
+    from trainer.networks.onnx_files import onnx_files
+
+    torch.manual_seed(0)
+    networks = onnx_files(Approximator(Architecture("compact", 8, shape, 1)))
+    found = read_bundle(bundle)
+    down, right = ((n - 1) / (seen - 1) for n, seen in zip(shape, still_camera.SHAPE, strict=True))
+    view = View(still_camera.SHAPE, (right, 0, 0, 0, down, 0, 0, 0, 1))
+    described = {**found.description, "camera": {"view": view.as_json()}}
+    write_bundle(bundle, found.arrays, described, {}, networks=networks, replace=True)
 
 
 def processes(lane: Lane) -> dict[str, int]:
@@ -176,13 +218,20 @@ def main() -> int:
         "--size", type=_size, default=SHAPE, metavar="HxW", help="pixels of the panel (default 24x32)"
     )
     parser.add_argument("--colours", action="store_true", help="three colours in turn")
+    parser.add_argument(
+        "--refine",
+        action="store_true",
+        help="refine one picture all the while (one colour, needs the trainer)",
+    )
     parser.add_argument("--solve-ms", type=float, help="time for a picture's patterns")
     parser.add_argument("--seconds", type=float, help="end after so long")
     parser.add_argument(
         "--json", action="store_true", help="print one JSON object on stdout and nothing else"
     )
     args = parser.parse_args()
-    found = soak(args.frames, args.refresh_hz, args.size, args.colours, args.solve_ms, args.seconds)
+    found = soak(
+        args.frames, args.refresh_hz, args.size, args.colours, args.solve_ms, args.seconds, args.refine
+    )
     if args.json:
         print(json.dumps(found))
     else:

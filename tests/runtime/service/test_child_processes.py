@@ -8,12 +8,13 @@ import signal
 import subprocess
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
-from runtime.service.child_processes import ChildProcess
+from runtime.service.child_processes import NICER, ChildProcess, below, in_background
 from runtime.service.process_messages import SOLVER
 from tests.campaigns.headset import urgent
 from tests.campaigns.lane import Lane
@@ -21,9 +22,11 @@ from tests.campaigns.lane import Lane
 pytestmark = pytest.mark.usefixtures("only_service")
 
 
-@pytest.mark.parametrize(("yields", "lower"), [(True, 1), (False, 0)])
-def test_a_child_that_computes_is_scheduled_below_its_supervisor(yields: bool, lower: int) -> None:
-    child = ChildProcess("http.server", "0", SOLVER, yields)
+@pytest.mark.parametrize(("schedule", "lower"), [(below, 1), (None, 0)])
+def test_a_child_that_computes_is_scheduled_below_its_supervisor(
+    schedule: Callable[[int], None] | None, lower: int
+) -> None:
+    child = ChildProcess("http.server", "0", SOLVER, schedule)
     with urgent():
         policy, priority = os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
         child.start()
@@ -35,6 +38,17 @@ def test_a_child_that_computes_is_scheduled_below_its_supervisor(yields: bool, l
         policy,
         priority - lower if priority else 0,
     )  # without the right to a priority nothing changes
+
+
+def test_a_child_in_the_background_has_one_core_and_no_real_time_priority() -> None:
+    child = ChildProcess("http.server", "0", SOLVER, in_background)
+    with urgent():
+        child.start()
+        assert child._process is not None
+        pid = child._process.pid
+        found = os.sched_getscheduler(pid), os.getpriority(os.PRIO_PROCESS, pid), os.sched_getaffinity(pid)
+    child.stop()
+    assert found == (os.SCHED_BATCH, NICER, {max(os.sched_getaffinity(0))})
 
 
 def test_a_killed_child_is_waited_for_without_priority_before_the_next_one_starts(
