@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -25,6 +26,8 @@ from runtime.lightpath.overdrive import overdrive_tables
 from runtime.networks.onnx_approximator import approximator_of
 from runtime.service.configuration import Configuration
 from runtime.solver import Solution, Solver, shown
+
+Result = TypeVar("Result")
 
 NO_LIGHT = (1e-9,) * len(SIZES_MRAD)  # shares of a colour that is dark
 
@@ -102,11 +105,13 @@ class PatternSolver:
         tables = [overdrive_tables(path.response, slow_share, path.gray_levels) for path in self._paths]
         self.overdrive = np.stack(tables) if slow_share else None
         self._solvers = [Solver(path, frames=frames, **options) for path in self._paths]
+        # What one colour's solver does on one core alone, another's is computed beside.
+        several = len(paths) > 1 and self._solvers[0].on.threads > 1
+        self._pool = ThreadPoolExecutor(len(paths), "colours") if several else None
 
     def rehearse(self) -> None:
         """Set up what the first use sets up, and measure this machine: on a large panel, seconds for each colour."""
-        for solver in self._solvers:
-            solver.rehearse()
+        self._each(lambda k: self._solvers[k].rehearse(), range(len(self._solvers)))
         for _ in self.patterns(np.ones(self.shape, np.float32), time.monotonic_ns()):
             pass
 
@@ -138,22 +143,33 @@ class PatternSolver:
             yield Pattern(gray, 0.0, final=True, dark=True, brightness=dark)
             return
         gray = np.zeros((self._frames, *self.shape), np.uint8)
-        solved = {k: self._solvers[k].frame(target[k], 0) for k in lit}
+        began = time.monotonic_ns()
+        solved = dict(zip(lit, self._each(lambda k: self._solvers[k].frame(target[k], 0), lit), strict=True))
         for k, solution in solved.items():
             gray[:, k] = solution.gray
-        left_ms = (deadline_ns - time.monotonic_ns()) * 1e-6
-        enough = left_ms > sum(one.milliseconds for one in solved.values())  # as much as another start costs
+        now = time.monotonic_ns()
+        enough = deadline_ns - now > now - began  # as much as another start costs
         yield self._pattern(gray, solved, target, final=not enough)
         if enough:
-            for done, k in enumerate(lit):
-                share_ms = (deadline_ns - time.monotonic_ns()) * 1e-6 / (len(lit) - done)
-                if share_ms > 0:
-                    first = solved[k]
-                    better = self._solvers[k].solve(target[k], deadline_ms=share_ms, start=first.phase)
-                    # with a panel's few levels in the loop, a descent that time cuts short can end below its start
-                    if better.expected_psnr_db >= first.expected_psnr_db:
-                        solved[k], gray[:, k] = better, better.gray
+
+            def improve(k: int) -> Solution:
+                first, left_ms = solved[k], (deadline_ns - time.monotonic_ns()) * 1e-6
+                share_ms = left_ms / (1 if self._pool else len(lit) - lit.index(k))
+                if share_ms <= 0:
+                    return first
+                better = self._solvers[k].solve(target[k], deadline_ms=share_ms, start=first.phase)
+                # with a panel's few levels in the loop, a descent that time cuts short can end below its start
+                return better if better.expected_psnr_db >= first.expected_psnr_db else first
+
+            for k, solution in zip(lit, self._each(improve, lit), strict=True):
+                solved[k], gray[:, k] = solution, solution.gray
             yield self._pattern(gray, solved, target, final=True)
+
+    def _each(self, work: Callable[[int], Result], colours: Sequence[int]) -> list[Result]:
+        """What `work` returns for each colour, all at the same time where there are several cores."""
+        if self._pool is None:
+            return [work(k) for k in colours]
+        return list(self._pool.map(work, colours))
 
     def _pattern(
         self, patterns: np.ndarray, solved: dict[int, Solution], target: np.ndarray, final: bool
