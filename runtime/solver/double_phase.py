@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from runtime.lightpath.light_path import LightPath
+from runtime.solver.angles import angle_into, arccos_into
 from runtime.solver.in_place_path import Optics
 from runtime.solver.objective import Objective
 
@@ -52,6 +53,8 @@ class Start:
         height, width = path.grid.shape
         pair = path.source.dtype
         self.wave = xp.zeros((height, width), pair)
+        strip = (3, objective.strip, width)
+        self.rooms = [xp.empty(strip, path.response.dtype) for _ in range(self.backend.threads)]
         tiny = 1e-3 * math.sqrt(objective.power[colour]) + 1e-30
         self.over_source: Array = None
         if self.optics.panel.source is not None or path.leak is not None:
@@ -88,21 +91,22 @@ class Start:
         unmodulated = self.unmodulated
 
         def work(worker: int, rows: slice) -> None:
-            part, new = self.objective.part[worker][: rows.stop - rows.start], phase[rows]
-            here = wave[rows]
+            count = rows.stop - rows.start
+            part, new, here = self.objective.part[worker][:count], phase[rows], wave[rows]
+            half, one, two = (room[:count] for room in self.rooms[worker])
             here *= loud
             if unmodulated is not None:
                 here -= unmodulated[rows]
             xp.abs(here, out=part)
             xp.minimum(part, 1, out=part)
-            xp.arccos(part, out=part)
+            arccos_into(xp, part, half, one)
             odd = rows.start % 2
-            part[odd::2, 1::2] *= -1
-            part[1 - odd :: 2, ::2] *= -1
-            xp.arctan2(here.imag, here.real, out=new)
+            half[odd::2, 1::2] *= -1
+            half[1 - odd :: 2, ::2] *= -1
+            angle_into(xp, here.imag, here.real, new, (one, two, part))
             for number, other in enumerate(others, 1):
-                other[rows] = new + self._alternating(number, rows) * part
-            new += part
+                other[rows] = new + self._alternating(number, rows) * half
+            new += half
 
         self.backend.over_rows(len(phase), self.objective.strip, work)
 
@@ -123,7 +127,8 @@ class Start:
         xp, wave = self.backend.xp, self.wave
 
         def work(worker: int, rows: slice) -> None:
-            xp.arctan2(wave[rows].imag, wave[rows].real, out=phase[rows])
+            rooms = [room[: rows.stop - rows.start] for room in self.rooms[worker]]
+            angle_into(xp, wave[rows].imag, wave[rows].real, phase[rows], rooms)
 
         self.backend.over_rows(len(phase), self.objective.strip, work)
 
