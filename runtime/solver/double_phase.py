@@ -20,6 +20,9 @@ LOUD = 0.98  # share of pixels whose amplitude double phase reproduces; brighter
 SAMPLED = 5  # every so many pixels, an axis, are ranked for that
 FAINTEST = 0.7  # of the amplitude in the middle: fainter edges of the image are corrected only as far as this
 EDGES = 3  # times as far in as the panel's end darkens an even image, edges of a frame get a new start
+TILT = 0.4  # of the way from the middle of the pupil's opening to its edge; less where that is beyond half of the band
+RISE = 8  # times as far as tilted light comes from the side: over this the tilt rises along an edge
+RISE_MOST = 0.3  # of the panel
 WIDE = 0.9  # of the panel's band: with a wider iris double phase errs by more than its edges
 
 
@@ -34,11 +37,15 @@ class Start:
     colour : int
     doubled : bool
         Whether the start is double phase.
+    planes : int
+        Of the colour: a tilted image moves from plane to plane, so it is tilted where there is one.
 
     Attributes
     ----------
+    turned : list of float array [H], [W], rad
+        Phase of the light in the image, of rows and of columns (see `tilted`).
     ramp : list of complex array [H], [W]
-        Tilt of the light in the image, for a pupil whose opening is off the axis, to the middle of what it passes.
+        The same, as factors.
     lift : float array [H, W] or None
         What an amplitude is multiplied by: the panel ends, so the edges of an image get only part of their light.
         None where the start is not double phase, and where the iris is open (WIDE).
@@ -46,7 +53,9 @@ class Start:
         How far in that goes: rows, columns.
     """
 
-    def __init__(self, objective: Objective, path: LightPath, colour: int, doubled: bool) -> None:
+    def __init__(
+        self, objective: Objective, path: LightPath, colour: int, doubled: bool, planes: int = 1
+    ) -> None:
         xp = objective.backend.xp
         self.backend, self.objective, self.colour = objective.backend, objective, colour
         self.optics: Optics = objective.optics[colour * objective.frames][0]
@@ -63,12 +72,13 @@ class Start:
             )
         leak = self.optics.panel.leak
         self.unmodulated = None if leak is None else leak * self.over_source
-        self.ramp = [
-            _turns(cycles, n, pair) for cycles, n in zip(middle_of(path), (height, width), strict=True)
-        ]
+        half_open = doubled and path.grid.band_share < WIDE
+        tilt = tilted(path) if half_open and planes == 1 else middle(path)
+        self.turned = [2 * math.pi * (np.cumsum(cycles) - cycles[0]) for cycles in tilt]
+        self.ramp = [np.exp(1j * turned).astype(pair) for turned in self.turned]
         self.lift: Array = None
         self.edges = 0, 0
-        if doubled and path.grid.band_share < WIDE:
+        if half_open:
             self._find_edges()
 
     def double_phase(self, amplitude: np.ndarray, phase: Array, others: Sequence[Array] = ()) -> None:
@@ -109,6 +119,15 @@ class Start:
             new += half
 
         self.backend.over_rows(len(phase), self.objective.strip, work)
+
+    def retilt(self, motion: tuple[int, int], phase: Array) -> None:
+        """Give a pattern's phase (rad) [H, W] that has been moved (down, right) the tilt of its new place."""
+        down, right = (
+            self.backend.xp.asarray((turned - np.roll(turned, step)).astype(phase.dtype))
+            for turned, step in zip(self.turned, motion, strict=True)
+        )
+        phase += down[:, None]
+        phase += right
 
     def _alternating(self, number: int, rows: slice) -> Array:
         """Signs of a pattern's pixels in these rows, over those of the first pattern's chequerboard."""
@@ -175,19 +194,59 @@ class Start:
             self.backend.over_rows(len(wave), self.objective.strip, unlit)
 
 
-def middle_of(path: LightPath) -> tuple[float, float]:
-    """Middle of the frequencies that the strongest mode's pupil passes, cycles a pixel (rows, columns)."""
+def middle(path: LightPath) -> list[np.ndarray]:
+    """Middle of the frequencies that the pupil passes, cycles a pixel, the same everywhere: [H], [W]."""
+    return [np.full(n, opening(path, axis)[0]) for axis, n in enumerate(path.grid.shape)]
+
+
+def tilted(path: LightPath) -> list[np.ndarray]:
+    """Frequency of the light at each row and each column of an image that keeps more detail than one without a tilt.
+
+    A picture's amplitude has frequencies of either sign, and those of one sign alone have all of its detail. So light
+    whose middle frequency is aside of the middle of the pupil's opening carries more detail on that side. Without a
+    tilt the descent does not find this: where the image's phase is flat, the gradient of what the pupil stops is zero.
+
+    Tilted light comes from the side: along the edge where that is beyond the panel's end, the tilt rises slowly. Where
+    that takes too much of the panel (RISE_MOST), as at large distances, there is none; and none for an opening off the
+    axis, whose pattern has a ramp that keeps the zero order out.
+
+    Returns
+    -------
+    list of float array [H], [W], cycles a pixel
+    """
+    found = []
+    openings = [opening(path, axis) for axis in (0, 1)]
+    on_axis = not any(at for at, _ in openings)
+    for axis, n in enumerate(path.grid.shape):
+        at, half_width = openings[axis]
+        aside = TILT * max(min(half_width, 1 - 3 * half_width), 0.0)
+        pixels = shift(path, axis, at + aside) - shift(path, axis, at)
+        rise = RISE * abs(pixels)
+        if rise > RISE_MOST * n or not on_axis:
+            aside = 0.0
+        along = np.clip(np.arange(n) / max(rise, 1.0), 0, 1)
+        found.append(at + math.copysign(aside, pixels) * along**2 * (3 - 2 * along))
+    return found
+
+
+def opening(path: LightPath, axis: int) -> tuple[float, float]:
+    """Middle and half-width of the frequencies that the strongest mode's pupil passes, cycles a pixel."""
     passed = np.abs(path.transfers[int(np.argmax(path.weights))]) ** 2
-    total = max(float(passed.sum()), 1e-30)
-    middle = []
-    for axis in (0, 1):
-        cycles = np.asarray(path.grid.frequency_index(axis)) / path.grid.padded[axis]
-        mean = float(passed.sum(1 - axis) @ cycles) / total
-        # What a symmetric opening loses to aberrations or rounding is no reason for a ramp.
-        middle.append(mean if abs(mean) > 0.02 * float(cycles[-1]) else 0.0)
-    return middle[0], middle[1]
+    share = passed.sum(1 - axis) / max(float(passed.sum()), 1e-30)
+    cycles = np.asarray(path.grid.frequency_index(axis)) / path.grid.padded[axis]
+    at = float(share @ cycles)
+    # What a symmetric opening loses to aberrations or rounding is no reason for a ramp.
+    at = at if abs(at) > 0.02 * float(cycles[-1]) else 0.0
+    return at, math.sqrt(3 * float(share @ (cycles - at) ** 2))
 
 
-def _turns(cycles: float, count: int, pair: Any) -> np.ndarray:
-    """exp(2 pi i cycles n) at `count` pixels."""
-    return np.exp(2j * math.pi * cycles * np.arange(count)).astype(pair)
+def shift(path: LightPath, axis: int, cycles: float) -> float:
+    """How far (pixels) from its place in the image light of a frequency leaves the panel, towards lower indices."""
+    transfer = path.transfers[int(np.argmax(path.weights))]
+    index = np.asarray(path.grid.frequency_index(axis))
+    at = [int(np.argmin(np.abs(np.asarray(path.grid.frequency_index(a))))) for a in (0, 1)]
+    at[axis] = min(int(np.argmin(np.abs(index - cycles * path.grid.padded[axis]))), len(index) - 2)
+    beside = list(at)
+    beside[axis] += 1
+    step = complex(transfer[tuple(beside)] * np.conj(transfer[tuple(at)]))
+    return -math.atan2(step.imag, step.real) * path.grid.padded[axis] / (2 * math.pi)

@@ -67,7 +67,7 @@ class FirstPhases:
         self.initialiser = None if initialiser is None else Initialiser(initialiser, self.shape)
         begins = self.initialiser is None or self.initialiser.corrects
         self.starts = [
-            Start(objective, stack[0], c, drive.gapless and begins)
+            Start(objective, stack[0], c, drive.gapless and begins, len(stack))
             for c, (stack, drive) in enumerate(zip(stacks, self.drives, strict=True))
         ]
         self.noise: np.ndarray | None = None
@@ -176,6 +176,7 @@ class FirstPhases:
                 phase += fresh
             else:
                 shifted(before[n], motion, phase)
+                self.starts[n // self.frames].retilt(motion, phase)
             for one in parts:
                 follow(phase, found, fresh, one)
             near = all(2 * abs(step) <= edge for step, edge in zip(motion, edges, strict=True))
