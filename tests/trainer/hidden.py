@@ -84,3 +84,8 @@ def with_few_effects(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
         return {name: effect for name, effect in known(*given).items() if name in names}
 
     monkeypatch.setattr(effect_catalogue, "catalogue", few)
+
+
+def without_probes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let diagnoses leave out the stages' free-form probes, which take most of their time, for tests of the rest."""
+    monkeypatch.setattr("trainer.diagnosis.diagnosis.probe_all", lambda *_: [])

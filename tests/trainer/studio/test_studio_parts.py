@@ -406,7 +406,7 @@ def test_a_network_that_is_a_gain_takes_part_and_goes_into_the_bundle(
     captures = captures_with(tmp_path / "uneven", catalogue()["illumination"], uneven, patterns=6)
     project.open_set(captures.folder)
     before = until(lambda: project.set.errors).errors.excess
-    project.train_network(60)
+    project.train_network(20)
     until(lambda: project.work is None and project.notice[1], 200)
     network = project.set.network
     assert network is not None, project.notice
