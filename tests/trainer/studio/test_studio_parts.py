@@ -36,7 +36,7 @@ from trainer.report.ladder import ladder_rows, with_network
 from trainer.report.palettes import DIFFERENCE, palette
 from trainer.studio import gain_tasks, guess_benches, jobs
 from trainer.studio.findings_fixes import fix_of
-from trainer.studio.jobs import CANCELLED, ENDED, WorkerProcess, sentence_of
+from trainer.studio.jobs import CANCELLED, ENDED, WorkerProcess, picture_worker, sentence_of
 from trainer.studio.learned_network import network_of
 from trainer.studio.model_steps import ModelSteps
 from trainer.studio.probe_template import write_effect_of_probe
@@ -51,9 +51,18 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> CaptureSet:
     return captures_with(folder, catalogue()["zero_order"], {"leak_real": 0.2}, patterns=6)
 
 
+@pytest.fixture(scope="module")
+def pictures() -> Iterator[WorkerProcess]:
+    """The process that predicts pictures for all projects, one after the other: each start imports torch."""
+    one = picture_worker()
+    yield one
+    one.close()
+
+
 @pytest.fixture
-def project(tmp_path: Path) -> Iterator[Project]:
-    one = Project(tmp_path)
+def project(tmp_path: Path, pictures: WorkerProcess, monkeypatch: pytest.MonkeyPatch) -> Iterator[Project]:
+    monkeypatch.setattr(pictures, "close", pictures.cancel)
+    one = Project(tmp_path, worker=pictures)
     yield one
     one.close()
 
