@@ -290,7 +290,7 @@ def test_evaluate_prints_its_keys(tmp_path: Path, capsys: pytest.CaptureFixture[
         "--filters",
         "2",
         "--steps",
-        "30",
+        "10",
         "--iterations",
         "20",
     ]
