@@ -76,7 +76,7 @@ class Studio:
         self.log = (home / "studio.log").open("w+")
         self.process = subprocess.Popen(
             [
-                *(sys.executable, "-m", "tests.trainer.studio.few_effects"),
+                *(sys.executable, "-m", "tests.trainer.few_effects"),
                 *("studio", *arguments, "--token", TOKEN, "--no-browser"),
             ],
             cwd=home,

@@ -1,6 +1,6 @@
 """hololoop-trainer with a few effects in its catalogue, which saves the others' trials, also in its processes.
 
-`python -m tests.trainer.studio.few_effects studio ...`. A process that is spawned imports this file first, too.
+`python -m tests.trainer.few_effects studio ...`. A process that is spawned imports this file first, too.
 """
 
 from __future__ import annotations
