@@ -17,7 +17,7 @@ from trainer.effects import catalogue
 
 # What equals another effect at one colour and plane is tested where planes tell them apart: test_bench_facts.py.
 ALONE = {name: f'kind = "{name}"' for name, one in catalogue().items() if not one.same_as}
-ONE_A_STAGE = ("crosstalk", "illumination", "iris", "sensor_response")
+ONE_A_STAGE = ("phase_response", "illumination", "pupil_aberration", "sensor_response")
 
 
 def explained(capsys, captures: Path, folder: Path, *options: object) -> dict:

@@ -22,6 +22,7 @@ pytest.importorskip("panel", reason="the studio needs the extra 'studio'")
 
 from firmware_iface.errors import InputError
 from runtime.excess import RemovedExcess
+from tests.trainer.hidden import with_few_effects
 from trainer.captures.camera_numbers import numbers_text
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.check_set import check_captures
@@ -504,9 +505,12 @@ def test_differences_are_white_at_zero_and_equally_deep_on_both_sides() -> None:
     assert light[0] == pytest.approx(light[-1], abs=25)
 
 
-def test_a_notebook_shows_the_same_views(captures: CaptureSet, tmp_path: Path) -> None:
+def test_a_notebook_shows_the_same_views(
+    captures: CaptureSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import hololoop
 
+    with_few_effects(monkeypatch, "zero_order", "illumination")
     hololoop.compare(captures).view().save(tmp_path / "view.html", resources="inline", title="captures")
     text = (tmp_path / "view.html").read_text(encoding="utf-8")
     assert "\\u2212 predicted" in text or "Measured − predicted" in text
