@@ -6,6 +6,7 @@ import ast
 import json
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -111,6 +112,16 @@ def test_a_missing_package_is_named_with_what_installs_it() -> None:
         "else:\n    raise SystemExit('no error')"
     )
     assert "hololoop" in loaded_after(script)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_effects() -> Iterator[None]:
+    """What is found is what the commands find, which have tests of their own."""
+    from tests.trainer.hidden import with_few_effects
+
+    with pytest.MonkeyPatch.context() as patch:
+        with_few_effects(patch, "distance", "zero_order", "illumination", "phase_response", "sensor_blur")
+        yield
 
 
 @pytest.fixture(scope="module")

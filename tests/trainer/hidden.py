@@ -10,7 +10,6 @@ import pytest
 
 from trainer.cli import main
 from trainer.effects import effect_catalogue
-from trainer.effects.effect_catalogue import Catalogue
 
 BENCH = """
 name = "bench"
@@ -77,10 +76,11 @@ def captured(
 
 
 def with_few_effects(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
-    """Let commands know some effects of the catalogue only, for tests of what all of them would only make longer."""
-    known = effect_catalogue.catalogue
+    """Let commands know some of the built-in effects only, for tests of what all of them would only make longer."""
+    few = tuple(effect for effect in effect_catalogue.BUILT_IN if effect.name in names)
+    monkeypatch.setattr(effect_catalogue, "BUILT_IN", few)
 
-    def few(*given: Any) -> Catalogue:
-        return {name: effect for name, effect in known(*given).items() if name in names}
 
-    monkeypatch.setattr(effect_catalogue, "catalogue", few)
+def without_probes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let diagnoses leave out the stages' free-form probes, which take most of their time, for tests of the rest."""
+    monkeypatch.setattr("trainer.diagnosis.diagnosis.probe_all", lambda *_: [])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.trainer.hidden import LARGER, bench_file, captured, ran, with_few_effects
+from tests.trainer.hidden import LARGER, bench_file, captured, ran, with_few_effects, without_probes
 from trainer.cli import main
 
 RIVALS = (
@@ -56,7 +56,8 @@ def test_at_one_plane_the_equivalent_facts_are_said(key, stated, true, tmp_path,
     assert any("another" in s or "a wrong distance" in s for s in found["suggested_captures"])
 
 
-def test_two_planes_tell_a_wrong_pitch_from_a_wrong_distance(tmp_path, capsys) -> None:
+def test_two_planes_tell_a_wrong_pitch_from_a_wrong_distance(tmp_path, capsys, monkeypatch) -> None:
+    with_few_effects(monkeypatch, *RIVALS)
     captures = captured(capsys, tmp_path, options=TWO_PLANES)
     state(captures, "pitch_um", 7.9)
     found = explained(capsys, captures, tmp_path)
@@ -66,7 +67,8 @@ def test_two_planes_tell_a_wrong_pitch_from_a_wrong_distance(tmp_path, capsys) -
     assert facts["panel.pitch_um"] == pytest.approx(8.0, rel=2e-4)
 
 
-def test_two_planes_show_a_wrong_distance_as_such(tmp_path, capsys) -> None:
+def test_two_planes_show_a_wrong_distance_as_such(tmp_path, capsys, monkeypatch) -> None:
+    with_few_effects(monkeypatch, *RIVALS)
     captures = captured(capsys, tmp_path, 'kind = "distance"\noffset_mm = 1.0', options=TWO_PLANES)
     found = explained(capsys, captures, tmp_path)
     assert [s["added"] for s in found["steps"]] == [None, "distance"]
@@ -115,6 +117,7 @@ def test_images_moved_far_are_not_taken_for_the_wrong_ones(tmp_path, capsys) -> 
 
 def test_a_plane_that_is_misread_is_a_fact_of_the_table(tmp_path, capsys, monkeypatch) -> None:
     with_few_effects(monkeypatch, *RIVALS)
+    without_probes(monkeypatch)
     captures = captured(capsys, tmp_path, options=TWO_PLANES)
     table = captures / "captures.csv"
     assert ",18.0," in table.read_text()
@@ -128,6 +131,7 @@ def test_a_plane_that_is_misread_is_a_fact_of_the_table(tmp_path, capsys, monkey
 
 def test_a_distance_that_is_off_alike_is_no_fact_of_the_table(tmp_path, capsys, monkeypatch) -> None:
     with_few_effects(monkeypatch, *RIVALS)
+    without_probes(monkeypatch)
     captures = captured(capsys, tmp_path, 'kind = "distance"\noffset_mm = 0.5', options=TWO_PLANES)
     found = ran(capsys, "diagnose", captures, "--workers", 1)
     assert found["ranking"][0]["effect"] == "distance" and found["table_facts"] == []
@@ -136,6 +140,7 @@ def test_a_distance_that_is_off_alike_is_no_fact_of_the_table(tmp_path, capsys, 
 @pytest.mark.parametrize("drifts", [False, True])
 def test_an_exposure_that_is_misread_is_a_fact_of_the_table(drifts, tmp_path, capsys, monkeypatch) -> None:
     with_few_effects(monkeypatch, *RIVALS)
+    without_probes(monkeypatch)
     secrets = ('kind = "laser_drift"',) if drifts else ()
     captures = captured(capsys, tmp_path, *secrets)
     table = captures / "captures.csv"

@@ -290,9 +290,9 @@ def test_evaluate_prints_its_keys(tmp_path: Path, capsys: pytest.CaptureFixture[
         "--filters",
         "2",
         "--steps",
-        "30",
+        "10",
         "--iterations",
-        "20",
+        "10",
     ]
     methods = ["ideal", "published", "compact_is_not_one"]
     assert main([*words, "--methods", ",".join(methods)]) == 2

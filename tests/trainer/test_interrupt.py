@@ -80,7 +80,15 @@ def explain(captures: Path, tmp_path: Path) -> Iterator[Callable[[int], Explaini
 
     def start(workers: int) -> Explaining:
         out = tmp_path / "models" / "model.toml"
-        command = [sys.executable, "-m", "trainer.cli", "explain", str(captures), "--out", str(out)]
+        command = [
+            sys.executable,
+            "-m",
+            "tests.trainer.few_effects",
+            "explain",
+            str(captures),
+            "--out",
+            str(out),
+        ]
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "TMPDIR": str(tmp_path / "temporary")}
         process = subprocess.Popen(
             [*command, "--workers", str(workers), "--json", "--quiet"],

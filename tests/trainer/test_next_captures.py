@@ -13,7 +13,7 @@ from PIL import Image
 
 from firmware_iface.errors import DeviceError, InputError
 from firmware_iface.virtual import VirtualHeadset
-from tests.trainer.hidden import bench_file, ran
+from tests.trainer.hidden import bench_file, ran, with_few_effects
 from trainer.captures.acquire import acquire_from
 from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet, read_captures
@@ -36,6 +36,7 @@ from trainer.fitting.pool import open_pool
 from trainer.model.model import Model, absent
 
 KNOWN = catalogue()
+FEW = ("spatial_coherence", "sensor_blur", "zero_order", "crosstalk")
 
 
 @pytest.fixture(autouse=True)
@@ -46,8 +47,7 @@ def _one_core(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def few_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
     """The commands know four effects: what is tested is not the catalogue's."""
-    names = ("spatial_coherence", "sensor_blur", "zero_order", "crosstalk")
-    monkeypatch.setattr("trainer.effects.effect_catalogue.BUILT_IN", tuple(KNOWN[n] for n in names))
+    with_few_effects(monkeypatch, *FEW)
 
 
 @pytest.fixture(scope="module")
@@ -66,9 +66,8 @@ def captures(bench: Path) -> CaptureSet:
 @pytest.fixture(scope="module")
 def doubts(captures: CaptureSet) -> Doubts:
     """What the set leaves in doubt among four candidates."""
-    names = ("spatial_coherence", "sensor_blur", "zero_order", "crosstalk")
     with open_pool(1) as pool:
-        return doubts_of(captures, Model(captures.bench), {n: KNOWN[n] for n in names}, pool)
+        return doubts_of(captures, Model(captures.bench), {n: KNOWN[n] for n in FEW}, pool)
 
 
 @pytest.fixture(scope="module")

@@ -20,6 +20,8 @@ from trainer.effects.effect_catalogue import catalogue
 from trainer.model.model import Model
 from trainer.model.model_file import read_model, write_model
 
+FEW = ("distance", "zero_order", "ghost", "sensor_blur", "phase_response")
+
 
 @pytest.fixture(autouse=True)
 def _one_core(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -54,7 +56,7 @@ def interrupted_after(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     def put(added: int) -> None:
         monkeypatch.undo()
         monkeypatch.setattr("trainer.fitting.pool.cores", lambda: 1)
-        with_few_effects(monkeypatch, "distance", "zero_order", "ghost", "sensor_blur", "phase_response")
+        with_few_effects(monkeypatch, *FEW)
         real, calls, real_diagnose = ladder.add_from, [], ladder.diagnose
 
         def diagnose_ideal_once(captures: CaptureSet, model: Model, *given: Any, **named: Any) -> Diagnosis:
@@ -185,6 +187,7 @@ def test_explain_goes_on_where_ctrl_c_stopped_it(
     assert out.read_text() == text
 
     monkeypatch.undo()
+    with_few_effects(monkeypatch, *FEW)
     assert main([*words, "--model", str(out), "--overwrite", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     last = read_model(out, catalogue())

@@ -31,7 +31,7 @@ from trainer.cycle.target_pictures import photographs
 from trainer.diagnosis.error_budget import error_budget
 from trainer.diagnosis.separate import _difference
 from trainer.effects.effect_catalogue import catalogue
-from trainer.fitting.learned_field import learn_field
+from trainer.fitting.learned_field import PanelFieldFit, learn_field
 from trainer.model.bundle_export import export_bundle
 from trainer.model.model import Model, absent
 from trainer.model.model_file import read_model, write_model
@@ -61,6 +61,12 @@ def bumpy(bench: Bench, size: float = 0.1, seed: int = 0) -> dict[str, np.ndarra
 @pytest.fixture(scope="module")
 def striped(tmp_path_factory: pytest.TempPathFactory) -> CaptureSet:
     return captured(tmp_path_factory.mktemp("striped") / "captures", "stripes")
+
+
+@pytest.fixture(scope="module")
+def learned(striped: CaptureSet) -> PanelFieldFit:
+    """What is learned of it."""
+    return learn_field(striped, Model(striped.bench))
 
 
 def image_of(model: Model, gray: np.ndarray) -> torch.Tensor:
@@ -116,11 +122,13 @@ def test_two_fields_one_after_the_other_are_one() -> None:
 
 @pytest.mark.parametrize(("kind", "error"), [("stripes", 0.03), ("specks", 0.2)])
 def test_what_is_hidden_on_the_panel_is_found(
-    kind: str, error: float, striped: CaptureSet, tmp_path: Path
+    kind: str, error: float, learned: PanelFieldFit, tmp_path: Path
 ) -> None:
     """The learned factor against the bench's own, a number a pixel, up to one complex number."""
-    captures = striped if kind == "stripes" else captured(tmp_path / "captures", kind)
-    found = learn_field(captures, Model(captures.bench))
+    found = learned
+    if kind != "stripes":
+        captures = captured(tmp_path / "captures", kind)
+        found = learn_field(captures, Model(captures.bench))
     assert found.after.excess < 0.05 * found.before.excess
     field = found.model.panel_field
     assert field is not None
@@ -140,9 +148,8 @@ def test_where_nothing_is_hidden_nothing_gets_worse(tmp_path: Path) -> None:
     assert found.after.excess < found.before.excess + 1e-4
 
 
-def test_the_budget_counts_the_field_as_learned(striped: CaptureSet) -> None:
-    model = learn_field(striped, Model(striped.bench)).model
-    budget = error_budget(striped, model)
+def test_the_budget_counts_the_field_as_learned(striped: CaptureSet, learned: PanelFieldFit) -> None:
+    budget = error_budget(striped, learned.model)
     assert budget.named_physics == pytest.approx(0, abs=1e-6)
     assert budget.network > 0.9 * (budget.ideal - budget.noise)
 
@@ -157,11 +164,13 @@ def test_suggested_captures_take_account_of_the_field(striped: CaptureSet) -> No
     assert _difference(one, other, batch) > 1e-3
 
 
-def test_the_headset_gets_the_field_and_shows_better(striped: CaptureSet, tmp_path: Path) -> None:
+def test_the_headset_gets_the_field_and_shows_better(
+    striped: CaptureSet, learned: PanelFieldFit, tmp_path: Path
+) -> None:
     """What the bundle's light path says is what the model says; and the true bench shows more than 3 dB better."""
     from runtime.solver import quality
 
-    model = learn_field(striped, Model(striped.bench)).model
+    model = learned.model
     summary = export_bundle(model, striped, tmp_path / "bundle")
     assert summary["panel_field"] is True
     path = load_light_path(read_bundle(tmp_path / "bundle"))
@@ -176,14 +185,15 @@ def test_the_headset_gets_the_field_and_shows_better(striped: CaptureSet, tmp_pa
     assert shown[1] > shown[0] + 3
 
 
-def test_online_each_picture_has_its_own_field(striped: CaptureSet, tmp_path: Path) -> None:
+def test_online_each_picture_has_its_own_field(
+    striped: CaptureSet, learned: PanelFieldFit, tmp_path: Path
+) -> None:
     """Without a network, round after round from the pattern before; each model can be exported."""
     there = headset("stripes")
-    model = learn_field(striped, Model(striped.bench)).model
     display = BenchDisplay(there, striped.bench, Model(striped.bench))
     settings = CycleSettings(2, RECIPES["compact"], 0, iterations=60, good=2.0, online=True)
     target = photographs(("astronaut",), striped.bench)
-    cycle = run_cycle(model, target, settings, tmp_path / "loop", display)
+    cycle = run_cycle(learned.model, target, settings, tmp_path / "loop", display)
     psnr = [one["astronaut"].psnr_db for one in cycle.history]
     assert psnr[2] > psnr[0] + 0.5
     assert cycle.network is None and not cycle.own

@@ -14,19 +14,20 @@ import torch
 
 from firmware_iface.virtual import make_defect
 from tests.trainer.changing_bench import captured_while_changing
-from trainer.captures.capture_set import CaptureSet, read_captures
+from trainer.captures.capture_set import CaptureSet
 from trainer.captures.capture_table import Moment
 from trainer.captures.held_out import capture_roles
 from trainer.diagnosis.addition import add
+from trainer.diagnosis.probes import ProbeResult, probe
 from trainer.diagnosis.proposals.effect_file import write_effect
 from trainer.diagnosis.proposals.in_time import candidates_in_time
 from trainer.diagnosis.proposals.order_shape import ORDER, TIME, Strengths, clock_of, curves_in
-from trainer.diagnosis.proposals.probe_maps import GAIN, OFFSET, PHASE, map_at
+from trainer.diagnosis.proposals.probe_maps import GAIN, GRAY, OFFSET, PHASE, map_at
 from trainer.diagnosis.proposals.product_shape import product, product_in, strength_of
 from trainer.diagnosis.proposals.proposal_rounds import Proposal
 from trainer.diagnosis.proposals.proposing import Proposals, propose
 from trainer.diagnosis.proposals.reading import Reading
-from trainer.diagnosis.proposals.shapes_tried import readings_of
+from trainer.diagnosis.proposals.shapes_tried import candidates_of, readings_of
 from trainer.diagnosis.proposals.surface_shape import smooth_in
 from trainer.diagnosis.proposals.wave_shape import waves_in
 from trainer.effects import testing
@@ -34,6 +35,7 @@ from trainer.effects.effect_catalogue import catalogue, load_effects
 from trainer.effects.own_effect import applied
 from trainer.fitting.gains import with_gains
 from trainer.fitting.pool import open_pool
+from trainer.fitting.predictor import evaluate_captures
 from trainer.model.bundle_export import export_bundle
 from trainer.model.model import Model, instance_with
 from trainer.prediction.scene import bare_stages, scene_at
@@ -208,13 +210,27 @@ def test_a_wavefront_that_swings_about_flat_is_seen_though_no_steady_probe_shows
     assert export_bundle(model, None, tmp_path / "never")["effects_left_out"] == [first.name]
 
 
-def test_a_panel_that_warms_up_is_a_curve_over_gray_levels_that_changes(tmp_path: Path) -> None:
-    captures = captured_while_changing(
-        tmp_path,
+def captured_while_warming_up(folder: Path) -> CaptureSet:
+    return captured_while_changing(
+        folder,
         lambda n: (
             make_defect("phase_response", gain=1 + 0.012 * (n - 8), s_curvature=0.0, lopsidedness=0.0),
         ),
     )
+
+
+def test_a_panel_that_warms_up_is_seen_as_a_curve_over_gray_levels_that_changes(tmp_path: Path) -> None:
+    captures = captured_while_warming_up(tmp_path)
+    roles = capture_roles(captures)
+    with open_pool(1) as pool:
+        model = with_gains(captures, Model(captures.bench), roles.fitted)
+        first, *_ = candidates_in_time(roles, model, pool, [])
+    assert (first.place, first.reading.name) == (GRAY, "curve_times_line")
+
+
+@pytest.mark.slow
+def test_a_panel_that_warms_up_ends_at_the_noise(tmp_path: Path) -> None:
+    captures = captured_while_warming_up(tmp_path)
     first = accepted(proposed(captures, tmp_path))
     assert first.name == "drive_curve_times_line"
     assert first.excess_after < 1e-4
@@ -276,9 +292,12 @@ def test_bubbles_are_specks_times_the_gray_level(tmp_path: Path) -> None:
 
 def test_nothing_changes_over_the_captures_of_steady_fringes(tmp_path: Path) -> None:
     captures = captured_while_changing(tmp_path, lambda n: (make_defect("fringes"),))
-    first = accepted(proposed(captures, tmp_path))
-    assert first.name == "sensor_fringes"
-    roles = capture_roles(read_captures(captures.folder))
+    roles = capture_roles(captures)
     model = with_gains(captures, Model(captures.bench), roles.fitted)
+    before = evaluate_captures(captures, roles.held_out, model)
+    ids, held = (tuple(c.capture for c in part) for part in (roles.probed, roles.held_out))
+    seen = ProbeResult.judged(probe(captures.folder, ids, held, model, "sensor"), before)
+    steady, *_ = candidates_of([seen], captures.bench, 100.0)
+    assert (steady.place, steady.reading.name) == (GAIN, "fringes")
     with open_pool(1) as pool:
-        assert candidates_in_time(roles, model, pool, [first.candidate]) == []
+        assert candidates_in_time(roles, model, pool, [steady]) == []

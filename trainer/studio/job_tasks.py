@@ -190,7 +190,7 @@ def try_own(
 def learn_panel_field(say: Say, folder: Path, model: Model) -> tuple[Model, float, float]:
     """A field learned at the panel, with the held-out excess before and after."""
     captures = opened(folder)
-    torch.set_num_threads(cores())
+    _share_threads(captures)
     model = _recorded_start(captures, model)
     progress = _progress(say)
     found = learn_field(
@@ -206,7 +206,7 @@ def train_network(say: Say, folder: Path, model: Model, steps: int, out: Path) -
     from trainer.training.training_sets import training_sets
 
     captures = opened(folder)
-    torch.set_num_threads(cores())
+    _share_threads(captures)
     progress = _progress(say)
     sets = training_sets(
         captures, model, progress=lambda done, what="": progress(0.1 * done, "predicting what the model says")
@@ -227,9 +227,13 @@ def train_network(say: Say, folder: Path, model: Model, steps: int, out: Path) -
 def _begin(folder: Path, effects: Sequence[Path]) -> tuple[CaptureSet, Any]:
     forget_effect_files()
     captures = opened(folder)
-    # Threads on pictures this small wait for each other longer than they work.
-    torch.set_num_threads(1 if _is_small(captures) else cores())
+    _share_threads(captures)
     return captures, catalogue(effects)
+
+
+def _share_threads(captures: CaptureSet) -> None:
+    """One thread for small pictures: on those, threads wait for each other longer than they work."""
+    torch.set_num_threads(1 if _is_small(captures) else cores())
 
 
 def _workers(captures: CaptureSet) -> int:

@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 
 from firmware_iface.virtual import VirtualHeadset
 from firmware_iface.virtual.simulated_panel import panel_path_nm
-from runtime.calibration import free_form_fit, information
+from runtime.calibration import information
 from runtime.calibration.colour_captures import colour_captures, colour_patterns
 from runtime.calibration.columns import Columns
 from runtime.calibration.drift import Drift
@@ -41,9 +41,8 @@ from tests.runtime.calibration.drifting import (
 SHAPE = (80, 96)
 
 
-def refitted(monkeypatch: pytest.MonkeyPatch, rough_rms_rad: float) -> tuple[DriftFit, float]:
+def refitted(rough_rms_rad: float) -> tuple[DriftFit, float]:
     """The refit of a headset whose wavefront has drifted, by the rule for large panels; its error, nm rms."""
-    monkeypatch.setattr(free_form_fit, "WORK", 0)
     bench = drifted_bench("panel_wavefront", "distance", shape=SHAPE, rough_rms_rad=rough_rms_rad)
     taker = Taker(devices(VirtualHeadset(bench, 1)), lambda what: None)
     bases = {"green": base(SHAPE)}
@@ -57,14 +56,16 @@ def refitted(monkeypatch: pytest.MonkeyPatch, rough_rms_rad: float) -> tuple[Dri
     return found, float(without_tilt(found.estimate.drift.wavefront(SHAPE) - hidden).std())
 
 
-def test_a_smooth_drift_gets_no_maps_and_is_found_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
-    found, error = refitted(monkeypatch, 0.0)
+@pytest.mark.usefixtures("spared_maps")
+def test_a_smooth_drift_gets_no_maps_and_is_found_as_well() -> None:
+    found, error = refitted(0.0)
     assert not found.estimate.drift.wavefront_nodes_nm.size
     assert error < WAVELENGTH_NM / 170
 
 
-def test_a_rough_drift_gets_maps_where_held_out_patterns_show_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    found, error = refitted(monkeypatch, 0.25)
+@pytest.mark.usefixtures("spared_maps")
+def test_a_rough_drift_gets_maps_where_held_out_patterns_show_it() -> None:
+    found, error = refitted(0.25)
     assert found.estimate.drift.wavefront_nodes_nm.size
     assert error < WAVELENGTH_NM / 170
 

@@ -89,6 +89,7 @@ def test_adapters_learn_what_the_new_light_path_misses(identity: dict[str, bytes
     assert again.errors["kept"] == pytest.approx(check.errors["refitted"], rel=1e-4)
 
 
+@pytest.mark.usefixtures("spared_maps")
 def test_a_calibration_decides_for_the_bundle(tmp_path: Path) -> None:
     """The network believes in a fall-off of light that is not there; the panel is bent: the light path is replaced."""
     folder = tmp_path / "bundle"

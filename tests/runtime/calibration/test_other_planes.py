@@ -18,6 +18,8 @@ from runtime.headset.open_devices import Devices
 from tests.runtime.benches import ideal_path
 from tests.runtime.calibration.drifting import WAVELENGTH_NM, drifted_bench, headset
 
+pytestmark = pytest.mark.usefixtures("spared_maps")
+
 SHAPE, PLANES_MM = (64, 80), (8.0, 10.5)
 OFFSET_MM = 0.18  # of the defect distance
 

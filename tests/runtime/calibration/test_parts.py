@@ -308,6 +308,7 @@ def test_a_slow_panel_is_waited_for_until_little_is_left(share: float, pictures:
     assert share ** (pictures + 1) <= 1 / 512 and (pictures == 0 or share**pictures > 1 / 512)
 
 
+@pytest.mark.usefixtures("spared_maps")
 def test_a_calibration_on_a_slow_panel_finds_the_drift_alone(tmp_path: Path) -> None:
     shape, share = (48, 64), 0.1
     bench = drifted_bench("panel_wavefront", shape=shape)

@@ -24,6 +24,7 @@ from firmware_iface.virtual import BenchDescription, VirtualHeadset, make_defect
 from tests.trainer.studio.chromium import CHROMIUM, FLAGS, MISSING
 from trainer.captures.acquire import acquire_captures
 from trainer.captures.open_bench import nominal_bench
+from trainer.cli import main
 
 pytest.importorskip("panel", reason="the studio needs the extra 'studio'")
 from trainer.studio.gain_tasks import GainPicture, keep
@@ -74,7 +75,10 @@ class Studio:
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
         self.log = (home / "studio.log").open("w+")
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "trainer.cli", "studio", *arguments, "--token", TOKEN, "--no-browser"],
+            [
+                *(sys.executable, "-m", "tests.trainer.few_effects"),
+                *("studio", *arguments, "--token", TOKEN, "--no-browser"),
+            ],
             cwd=home,
             env=environment,
             stdout=subprocess.PIPE,
@@ -431,16 +435,12 @@ def test_without_captures_a_simulated_bench_is_captured_live(browser: Any, tmp_p
         assert time.monotonic() - began < 15
 
 
-def test_a_port_in_use_and_no_folder_are_sentences(studio: Studio, tmp_path: Path) -> None:
+def test_a_port_in_use_and_no_folder_are_sentences(
+    studio: Studio, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
     port = studio.base.rstrip("/").rsplit(":", 1)[1]
     for arguments, said in ((["--port", port], "cannot be used"), (["nowhere"], "is not a folder")):
-        done = subprocess.run(
-            [sys.executable, "-m", "trainer.cli", "studio", *arguments, "--no-browser"],
-            cwd=tmp_path,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=False,
-        )
-        assert done.returncode == 2 and said in done.stderr and done.stderr.count("\n") == 1
+        assert main(["studio", *arguments, "--no-browser"]) == 2
+        error = capsys.readouterr().err
+        assert said in error and error.count("\n") == 1

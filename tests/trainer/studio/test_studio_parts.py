@@ -22,6 +22,7 @@ pytest.importorskip("panel", reason="the studio needs the extra 'studio'")
 
 from firmware_iface.errors import InputError
 from runtime.excess import RemovedExcess
+from tests.trainer.hidden import with_few_effects
 from trainer.captures.camera_numbers import numbers_text
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.check_set import check_captures
@@ -36,7 +37,7 @@ from trainer.report.ladder import ladder_rows, with_network
 from trainer.report.palettes import DIFFERENCE, palette
 from trainer.studio import gain_tasks, guess_benches, jobs
 from trainer.studio.findings_fixes import fix_of
-from trainer.studio.jobs import CANCELLED, ENDED, WorkerProcess, sentence_of
+from trainer.studio.jobs import CANCELLED, ENDED, WorkerProcess, picture_worker, sentence_of
 from trainer.studio.learned_network import network_of
 from trainer.studio.model_steps import ModelSteps
 from trainer.studio.probe_template import write_effect_of_probe
@@ -51,9 +52,18 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> CaptureSet:
     return captures_with(folder, catalogue()["zero_order"], {"leak_real": 0.2}, patterns=6)
 
 
+@pytest.fixture(scope="module")
+def pictures() -> Iterator[WorkerProcess]:
+    """The process that predicts pictures for all projects, one after the other: each start imports torch."""
+    one = picture_worker()
+    yield one
+    one.close()
+
+
 @pytest.fixture
-def project(tmp_path: Path) -> Iterator[Project]:
-    one = Project(tmp_path)
+def project(tmp_path: Path, pictures: WorkerProcess, monkeypatch: pytest.MonkeyPatch) -> Iterator[Project]:
+    monkeypatch.setattr(pictures, "close", pictures.cancel)
+    one = Project(tmp_path, worker=pictures)
     yield one
     one.close()
 
@@ -406,7 +416,7 @@ def test_a_network_that_is_a_gain_takes_part_and_goes_into_the_bundle(
     captures = captures_with(tmp_path / "uneven", catalogue()["illumination"], uneven, patterns=6)
     project.open_set(captures.folder)
     before = until(lambda: project.set.errors).errors.excess
-    project.train_network(60)
+    project.train_network(20)
     until(lambda: project.work is None and project.notice[1], 200)
     network = project.set.network
     assert network is not None, project.notice
@@ -495,9 +505,12 @@ def test_differences_are_white_at_zero_and_equally_deep_on_both_sides() -> None:
     assert light[0] == pytest.approx(light[-1], abs=25)
 
 
-def test_a_notebook_shows_the_same_views(captures: CaptureSet, tmp_path: Path) -> None:
+def test_a_notebook_shows_the_same_views(
+    captures: CaptureSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import hololoop
 
+    with_few_effects(monkeypatch, "zero_order", "illumination")
     hololoop.compare(captures).view().save(tmp_path / "view.html", resources="inline", title="captures")
     text = (tmp_path / "view.html").read_text(encoding="utf-8")
     assert "\\u2212 predicted" in text or "Measured − predicted" in text
