@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
-from runtime.service.frame_solver import PatternSolver
+from runtime.service.configuration import read_configuration
+from runtime.service.frame_solver import Pattern, PatternSolver
+from runtime.service.process_messages import REFINED, SolveJob
+from runtime.service.refinement_client import RefinementClient
+from runtime.service.shared_memory import crc32, make_ring
+from runtime.service.socket_link import MessageLink
+from runtime.service.solver_process import Worker
 from runtime.solver import Solver
 from runtime.solver.array_backend import Backend
-from tests.campaigns.headset import SHAPE
+from tests.campaigns.headset import SHAPE, write_configuration
 from tests.runtime.benches import ideal_path, scene
 
 
@@ -41,3 +51,46 @@ def test_colours_that_are_computed_at_the_same_time_do_not_disturb_each_other() 
         one, several = (next(solver.patterns(target, time.monotonic_ns())) for solver in solvers)
         assert np.mean(one.gray != several.gray) < 1e-3  # sums over rows differ in their last digits
         assert one.psnr_db == pytest.approx(several.psnr_db, abs=1e-3)
+
+
+def test_a_picture_keeps_its_pattern_while_its_refinement_makes_the_first_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A solver that goes on until each deadline would leave a refinement on the same cores no time."""
+    refinement = SimpleNamespace(pattern=None, crc=0, alive=True)
+    refinement.is_alive, refinement.stop = lambda: refinement.alive, lambda: None
+    settings = read_configuration(write_configuration(tmp_path))
+    sent: list[Any] = []
+    link = SimpleNamespace(send=lambda message, fds=(): sent.append(message))
+    worker = Worker(cast(MessageLink, link), (1, *SHAPE), 1, ("green",), settings)
+    solved: list[int] = []
+
+    def solve(target: np.ndarray, deadline_ns: int) -> Iterator[Pattern]:
+        solved.append(deadline_ns)
+        yield Pattern(np.full((1, *SHAPE), len(solved), np.uint8), 20.0, final=True)
+
+    def show(picture: int) -> int:
+        """The first gray level of the pattern for a picture."""
+        ring.slots[0][...] = picture
+        worker.free = set(range(4))
+        worker.jobs.append(SolveJob(0, 1, 0, crc32(ring.slots[0])))
+        with pytest.raises(ConnectionError):
+            worker.run(solve)
+        return int(worker.ring.slots[sent[-1].slot][0, 0, 0])
+
+    def closed(wait: bool) -> None:
+        if wait:
+            raise ConnectionResetError
+
+    ring = make_ring(1, (1, *SHAPE), np.uint16)
+    worker.targets, worker.receive = ring, closed  # type: ignore[method-assign]
+    assert [show(7), show(7)] == [1, 2]
+    worker.refinement = cast(RefinementClient, refinement)
+    refinement.crc = crc32(ring.slots[0])
+    assert [show(7), show(7)] == [2, 2] and len(solved) == 2
+    refinement.pattern = Pattern(np.full((1, *SHAPE), 9, np.uint8), 21.0, final=True)
+    assert show(7) == 9 and sent[-1].flags & REFINED
+    refinement.pattern, refinement.alive = None, False  # it failed
+    assert show(7) == 3
+    refinement.alive = True
+    assert show(8) == 4 and worker.refinement is None  # another picture
