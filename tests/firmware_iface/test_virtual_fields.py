@@ -177,14 +177,18 @@ def test_down_to_the_bytes_the_camera_sees_the_colours_and_no_field_has_another_
     first = truths(bench, grays())
     with emulated(tmp_path, bench) as (remote, panel, lasers, camera):
         assert camera.capture().mean() == pytest.approx(black, abs=0.5)
-        lit_up(lasers)
-        with lasers.beating():
-            counts = camera.capture() - black
-            # a panel that takes no more fields goes on showing the one it had: that one alone is lit when it is due
-            remote.break_part("panel link", "missing_field", None)
-            time.sleep(0.05)
-            alone = camera.capture() - black
-            remote.repair("panel link")
+        for _ in range(5):  # again where a busy machine held up the heartbeat, which makes it dark for good
+            lit_up(lasers)
+            with lasers.beating():
+                counts = camera.capture() - black
+                # a panel that takes no more fields goes on showing the one it had: that one alone is lit when it is due
+                remote.break_part("panel link", "missing_field", None)
+                time.sleep(0.05)
+                alone = camera.capture() - black
+                remote.repair("panel link")
+                lit_throughout = remote.light()[-1][1] > 0
+            if lit_throughout:
+                break
         expected = sum(first)  # 60 ms, of which each colour has a sixth
         assert counts.mean() == pytest.approx(expected.mean(), rel=0.02)
         assert np.corrcoef(counts.ravel(), expected.ravel())[0, 1] > 0.99
