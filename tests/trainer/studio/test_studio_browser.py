@@ -234,8 +234,8 @@ def test_an_earlier_step_is_compared_with_the_present_model(browser: Any, home: 
     for _ in range(8):  # a click on a page that is just being drawn anew may be lost
         with suppress(playwright.TimeoutError):
             button(page, "Compare").click(timeout=5000)
-        page.wait_for_timeout(5000)
-        if page.get_by_label("Second model").is_visible():
+        with suppress(playwright.TimeoutError):
+            page.get_by_label("Second model").wait_for(timeout=15_000)
             break
     page.get_by_label("Second model").select_option("step 0")
     playwright.expect(page.get_by_text("next to step 0")).to_be_visible()
