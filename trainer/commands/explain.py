@@ -170,7 +170,7 @@ def show(result: Result, args: Namespace, screen: Screen) -> None:
     rows = []
     first = args.model.name if args.model else "ideal model"
     for step in result["steps"]:
-        what = step["added"] or _other_change(step) or first
+        what = ", ".join(part for part in (step["added"], _other_change(step)) if part) or first
         also = ", ".join(step["indistinguishable_from"]) or ""
         rows.append((what, step["nrmse"], step["excess"], also))
     screen.table(("added", "nrmse", "excess", "not told apart from"), rows)
@@ -193,7 +193,7 @@ def show(result: Result, args: Namespace, screen: Screen) -> None:
 
 
 def _other_change(step: Result) -> str:
-    """What a step without a new effect did, in words; "" for the first one."""
+    """What a step did besides adding an effect, in words; "" for nothing."""
     if step.get("removed"):
         return f"without {step['removed']}"
     return f"{step.get('form', 'map')} of {step['refined']}" if step.get("refined") else ""

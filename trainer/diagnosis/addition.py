@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from runtime.excess import PredictionErrors, removed_excess
 from runtime.program.progress import Progress, no_progress
 from trainer.captures.batches import load
-from trainer.captures.capture_set import CaptureSet
+from trainer.captures.capture_set import CaptureSet, opened
 from trainer.captures.capture_table import Capture
 from trainer.captures.held_out import FIT_CAPTURES, CaptureRoles, capture_roles, scenes, split, with_stopping
 from trainer.diagnosis.screen import ScreenResult, screen_batches
@@ -102,6 +103,15 @@ def add_from(roles: CaptureRoles, model: Model, start: EffectInstance) -> Model:
     if by_pixel:  # a number for each pixel asks for all pictures that there are
         model = with_measured_values(model, by_pixel, load(roles.captures, split(roles.captures).fitted))
     return model
+
+
+def with_everything_refitted(
+    folder: Path, base: Model, start: EffectInstance
+) -> tuple[Model, PredictionErrors]:
+    """`add_from` on a capture set's folder, and the model's held-out errors: a task for any process."""
+    roles = capture_roles(opened(folder))
+    model = add_from(roles, base, start)
+    return model, evaluate_captures(roles.captures, roles.held_out, model)
 
 
 def gone_on(

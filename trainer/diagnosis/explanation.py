@@ -9,10 +9,11 @@ from typing import Any
 
 from runtime.excess import PredictionErrors, removed_excess
 from runtime.program.progress import Progress, no_progress, part_of
-from trainer.captures.capture_set import CaptureSet, opened
+from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import CaptureRoles, capture_roles
-from trainer.diagnosis.addition import add_from, gone_on, with_maps_again
+from trainer.diagnosis.addition import gone_on, with_everything_refitted, with_maps_again
 from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors, screen_candidates
+from trainer.diagnosis.exchange import exchanged
 from trainer.diagnosis.learned_rest import LearnedRest, learn_rest
 from trainer.diagnosis.ranking import RankedEffect
 from trainer.diagnosis.together import explain_together, is_far
@@ -38,13 +39,13 @@ class ExplanationStep:
     Attributes
     ----------
     added : str or None
-        The effect that was added; None for the first model, and where one was taken out.
+        The effect that was added; None for the first model, and where one was only taken out.
     held_out : PredictionErrors
         Errors of the model after the step.
     indistinguishable_from : tuple of str
         Effects that the captures cannot tell the added one from.
     removed : str or None
-        The effect that was taken out.
+        The effect that was taken out; with `added`, exchanged for that one.
     refined : str or None
         The effect of an earlier step whose map or curve went on in free form.
     form : mapping
@@ -156,6 +157,9 @@ def explain(
     if save:
         save(model)
     steps = [ExplanationStep(None, errors)]
+    rivals: dict[
+        str, dict[str, EffectInstance]
+    ] = {}  # of the effects that were added, those that looked alike
     diagnoses: list[Diagnosis] = []
 
     def without_unnecessary(
@@ -227,6 +231,18 @@ def explain(
             save(model)
         newest = best.effect.name
         model, errors = without_unnecessary(model, errors, [n for n in model.names if n != newest])
+        while (better := exchanged(roles, model, errors, rivals, pool)) is not None:
+            old, new, model, errors = better
+            del rivals[old]
+            model = recorded(model, new, errors, old)
+            steps.append(ExplanationStep(new, errors, removed=old))
+            if save:
+                save(model)
+        rivals[newest] = {
+            r.effect.name: r.model.instance(r.effect.name)
+            for r in found.ranking
+            if r.effect.name in best.indistinguishable_from
+        }
     # A last pass: of every effect but the newest it is known already that the rest cannot do without it.
     if len(model.names) > 1:
         kept = model.names
@@ -251,19 +267,10 @@ def _added(roles: CaptureRoles, found: Diagnosis, pool: Pool) -> tuple[RankedEff
     rival = _rival(found) if found.model.present else None
     ones = [one for one in (found.ranking[0], rival) if one is not None]
     tasks = [(roles.folder, one.base, one.model.instance(one.effect.name)) for one in ones]
-    fitted = pool.map_here_if_one(_with_everything_refitted, tasks)
+    fitted = pool.map_here_if_one(with_everything_refitted, tasks)
     if len(ones) > 1 and removed_excess(fitted[0][1], fitted[1][1]).interval()[0] > 0:
         return ones[1], *fitted[1]
     return ones[0], *fitted[0]
-
-
-def _with_everything_refitted(
-    folder: Path, base: Model, start: EffectInstance
-) -> tuple[Model, PredictionErrors]:
-    """A model with one more effect, and its held-out errors: a task for any process."""
-    roles = capture_roles(opened(folder))
-    model = add_from(roles, base, start)
-    return model, evaluate_captures(roles.captures, roles.held_out, model)
 
 
 def _rival(found: Diagnosis) -> RankedEffect | None:
