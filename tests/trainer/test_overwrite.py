@@ -57,7 +57,7 @@ def interrupted_after(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
         monkeypatch.undo()
         monkeypatch.setattr("trainer.fitting.pool.cores", lambda: 1)
         with_few_effects(monkeypatch, *FEW)
-        real, calls, real_diagnose = ladder.add_from, [], ladder.diagnose
+        real, calls, real_diagnose = ladder._added, [], ladder.diagnose
 
         def diagnose_ideal_once(captures: CaptureSet, model: Model, *given: Any, **named: Any) -> Diagnosis:
             if model.names:
@@ -68,13 +68,13 @@ def interrupted_after(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
 
         monkeypatch.setattr(ladder, "diagnose", diagnose_ideal_once)
 
-        def add_or_stop(*given: Any) -> Model:
+        def add_or_stop(*given: Any) -> Any:
             calls.append(given)
             if len(calls) > added:
                 raise KeyboardInterrupt
             return real(*given)
 
-        monkeypatch.setattr(ladder, "add_from", add_or_stop)
+        monkeypatch.setattr(ladder, "_added", add_or_stop)
 
     return put
 
