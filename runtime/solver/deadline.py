@@ -22,6 +22,14 @@ class Pace:
         """Remember one more duration."""
         self._durations.append(milliseconds)
 
+    def skipped(self) -> None:
+        """Forget the slowest duration, if others are known: the work was left out, as it was expected to take too long.
+
+        What is left out is not measured, so one slow time would keep it from being done for ever.
+        """
+        if len(self._durations) > 1:
+            self._durations.remove(max(self._durations))
+
     @property
     def known(self) -> bool:
         """Whether it was ever measured."""

@@ -335,6 +335,8 @@ class Solver:
             if len(history) > iterations or self.method is None:
                 break
             if not deadline.allows_another(1e3 * (clock - begun)):
+                if len(history) == 1:
+                    self.step.skipped()
                 break
             following = next(p for p in self.phases if p is not now and p is not self.best)
             self.method.step(now, following)

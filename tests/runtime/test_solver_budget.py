@@ -110,6 +110,24 @@ def test_a_slow_iteration_is_planned_for() -> None:
     assert pace.expected < 12
 
 
+def test_one_slow_iteration_does_not_keep_later_solves_from_iterating(half: LightPath) -> None:
+    solver, target = Solver(half), scene(SHAPE)
+    solver.rehearse(target)
+    solver.step.took(10_000.0)  # as where another program took the core away
+    assert solver.solve(target, deadline_ms=500).iterations == 0, "it is planned for at first"
+    assert solver.solve(target, deadline_ms=500).iterations > 0
+
+
+def test_work_whose_every_duration_is_too_long_stays_left_out() -> None:
+    pace = Pace()
+    for took in (30.0, 20.0, 25.0):
+        pace.took(took)
+    for _ in range(5):
+        pace.skipped()
+    assert pace.known
+    assert pace.usual == 20
+
+
 def test_another_iteration_fits_only_before_the_deadline() -> None:
     iteration, rounding = Pace(), Pace()
     iteration.took(10.0)

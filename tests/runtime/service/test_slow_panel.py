@@ -87,7 +87,7 @@ def seen(folder: Path, share: float) -> Seen:
         lane.pictures = [counts[0]] * PICTURES
         for _ in range(15):
             frame()
-        still_db = captured(15)
+        still_db = captured(40)
         assert lane.unanswered() == 0
         shown.extend(one.pattern_crc for one in lane.outcomes if isinstance(one, Shown))
         time.sleep(30 / REFRESH_HZ)
@@ -101,7 +101,7 @@ def test_a_video_is_nearer_to_its_pictures_where_the_bundle_says_that_the_panel_
 ) -> None:
     without, overdriven = (seen(tmp_path / str(share), share) for share in (0.0, SHARE))
     assert overdriven.video_db > without.video_db + 3
-    # how long a still picture is solved differs from run to run, and its patterns with it
+    # a capture of a still picture in which pixels go once around the phase has 18 dB; half of them have 25 or more
     assert overdriven.still_db > without.still_db - 3
     assert without.plain == 1 and without.last, "without the share, every pattern is sent as it is"
     assert overdriven.plain < 0.5 and overdriven.last, "a picture that stays ends as its own pattern"
