@@ -78,6 +78,14 @@ def try_on_few(
     return fitted.model, fitted.errors.excess
 
 
+def try_together_on_few(folder: Path, ids: tuple[str, ...], model: Model, start: EffectInstance) -> float:
+    """The excess on a few captures of one effect and the present ones, all fitted to these alone."""
+    captures = opened(folder)
+    batches = load(captures, chosen(captures, ids))
+    started = fit_from(model, start, batches, iterations=8).model
+    return fit(started, started.names, batches, iterations=8).errors.excess
+
+
 def try_further(
     folder: Path, ids: tuple[str, ...], held_ids: tuple[str, ...], model: Model, name: str, raising: bool
 ) -> CandidateFit:

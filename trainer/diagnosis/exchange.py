@@ -10,8 +10,15 @@ from collections.abc import Mapping
 from runtime.excess import PredictionErrors, removed_excess
 from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.addition import with_everything_refitted
+from trainer.diagnosis.candidate_fits import try_together_on_few
+from trainer.diagnosis.ranking import telling_captures
 from trainer.fitting.pool import Pool
+from trainer.fitting.predictor import evaluate_captures
 from trainer.model.model import EffectInstance, Model
+
+# Of the excess: what an exchange leaves at most. While others are missing, the wrong one may suit the captures a little
+# better.
+CLEARLY = 0.5
 
 Rivals = Mapping[
     str, Mapping[str, EffectInstance]
@@ -41,11 +48,21 @@ def exchanged(
         for new, fitted in others.items()
         if old in model.names and new not in model.names
     ]
+    if not pairs:
+        return None
+    # What a model cannot explain of few captures, with its numbers free to suit these alone, it cannot explain of all.
+    few = telling_captures(roles, model)
+    left = evaluate_captures(roles.captures, few, model).excess
+    ids = tuple(c.capture for c in few)
+    on_few = pool.map_here_if_one(
+        try_together_on_few, [(roles.folder, ids, model.without(old), fitted) for old, _, fitted in pairs]
+    )
+    pairs = [pair for pair, excess in zip(pairs, on_few, strict=True) if excess < CLEARLY * left]
     tasks = [(roles.folder, model.without(old), fitted) for old, _, fitted in pairs]
     found = list(zip(pairs, pool.map_here_if_one(with_everything_refitted, tasks), strict=True))
     if not found:
         return None
     (old, new, _), (other, after) = min(found, key=lambda one: one[1][1].excess)
-    if removed_excess(errors, after).interval()[0] <= 0:
+    if after.excess > CLEARLY * errors.excess or removed_excess(errors, after).interval()[0] <= 0:
         return None
     return old, new, other, after

@@ -231,7 +231,10 @@ def explain(
             save(model)
         newest = best.effect.name
         model, errors = without_unnecessary(model, errors, [n for n in model.names if n != newest])
-        while (better := exchanged(roles, model, errors, rivals, pool)) is not None:
+        while (
+            not found.thresholds.complete(errors.excess, ideal.excess)
+            and (better := exchanged(roles, model, errors, rivals, pool)) is not None
+        ):
             old, new, model, errors = better
             del rivals[old]
             model = recorded(model, new, errors, old)

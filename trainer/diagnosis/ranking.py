@@ -140,7 +140,7 @@ def try_near(
     """
     if len(screened) + len(others) < 2:
         return try_all(roles, model, screened, pool, report, start, end)
-    telling = _telling(roles, model)
+    telling = telling_captures(roles, model)
     few = tuple(c.capture for c in telling)
     screened = sorted(screened, key=lambda s: not s.start.effect.rugged)
     tasks = [(roles.folder, few, model, s.start) for s in screened]
@@ -158,7 +158,7 @@ def try_near(
     return try_further_all(roles, again, False, pool)
 
 
-def _telling(roles: CaptureRoles, model: Model) -> list[Capture]:
+def telling_captures(roles: CaptureRoles, model: Model) -> list[Capture]:
     """The capture of each colour and plane of which a model leaves most unexplained, in counts."""
     left = {}
     for c in roles.fitted:
@@ -271,10 +271,10 @@ def rank(
 
 
 def _is_plainer(one: CandidateFit, best: CandidateFit, known: Catalogue, thresholds: Thresholds) -> bool:
-    """Whether a candidate says as much as the best one with at most half as many numbers, or as its plain form."""
+    """Whether a candidate says as much as the best: as its plain form, less rare, or in half of the numbers."""
     if not thresholds.inseparable(removed_excess(one.held_out, best.held_out), best.held_out.excess):
         return False
-    if known[best.effect].same_as == one.effect:
+    if known[best.effect].same_as == one.effect or known[best.effect].rare > known[one.effect].rare:
         return True
     return known[one.effect].measure is None and 2 * _numbers(one) <= _numbers(best)
 

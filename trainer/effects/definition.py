@@ -130,6 +130,8 @@ class Effect:
         `apply` takes when a capture was taken as the keyword `moment`: the effect changes from capture to capture.
     same_as : str
         The effect that it equals in captures of one colour and plane, where it is no candidate; "" for none.
+    rare : bool
+        Few benches have it: an effect that captures cannot tell it from is named before it.
     free_form : FreeForm or None
         How the effect's map or curve goes on where its polynomials end.
     formula : str
@@ -155,6 +157,7 @@ class Effect:
     takes_order: bool = False
     takes_moment: bool = False
     same_as: str = ""
+    rare: bool = False
     free_form: FreeForm | None = None
     formula: str = ""
     description: str = ""
@@ -177,6 +180,7 @@ def effect(
     measure: Callable[..., dict[str, Any]] | None = None,
     told_to: str | None = None,
     same_as: str = "",
+    rare: bool = False,
     free_form: FreeForm | None = None,
     formula: str = "",
 ) -> Callable[[Callable[..., Any]], Effect]:
@@ -188,7 +192,7 @@ def effect(
 
     Parameters
     ----------
-    stage, acts_on, parameters, orders, starts, touches_iris, rugged, measure, same_as, free_form, formula
+    stage, acts_on, parameters, orders, starts, touches_iris, rugged, measure, same_as, rare, free_form, formula
         As in `Effect`.
     told_to : str, optional
         The former name of `acts_on`.
@@ -241,6 +245,7 @@ def effect(
             "order" in given,
             "moment" in given,
             same_as,
+            rare,
             free_form,
             formula.strip(),
             text.description,
