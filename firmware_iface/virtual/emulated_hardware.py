@@ -23,7 +23,7 @@ from firmware_iface.virtual.fault_injection import Faults
 from firmware_iface.virtual.further_defects import SlowResponse
 from firmware_iface.virtual.i2c import LaserBoard
 from firmware_iface.virtual.oak import OakModel, expose_bench
-from firmware_iface.virtual.usb.panel_board import BoardModel, LitPattern
+from firmware_iface.virtual.usb.panel_board import EVERY_OUTPUT, BoardModel, LitPattern
 from firmware_iface.virtual.virtual_devices import LitField
 
 TICK_S = 0.001
@@ -156,7 +156,7 @@ class EmulatedHardware:
         ----------
         name : str
             "key" or "interlock" (bool), "celsius", "photodiodes" (False: cut), "efficiency" (of every diode; 1: as
-            calibrated).
+            calibrated), "gated" (False: the gates are open, as where a panel has no light outputs).
         value : bool or float
 
         Raises
@@ -166,6 +166,9 @@ class EmulatedHardware:
         """
         if name in ("key", "interlock", "celsius"):
             setattr(self.lasers, name, value)
+            return
+        if name == "gated":
+            self.lasers.gates = (lambda: self.board.outputs) if value else (lambda: EVERY_OUTPUT)
             return
         if name not in ("photodiodes", "efficiency"):
             raise InputError(f"the laser board has no '{name}'.")

@@ -56,7 +56,6 @@ solve_ms = {solve_ms}
 stale_limit_ms = {stale_limit_ms}
 metrics_port = {metrics_port}
 [panel]
-bus = "virtual:{folder}/hardware.sock"
 {panel}[lasers]
 bus = "virtual:{folder}/hardware.sock"
 power = {{ {power} }}
@@ -77,6 +76,7 @@ def write_configuration(
     patterns: int = 1,
     half_width: float = 1.0,
     slow_share: float = 0.0,
+    display: bool = False,
 ) -> Path:
     """A bundle, a bench and a configuration in `folder`; returns the configuration's path.
 
@@ -103,6 +103,8 @@ def write_configuration(
         Of the iris, as a share of the panel's band.
     slow_share : float
         Of the phase before that the panel keeps for a period, as the bundle says; the bench's panel is not slow.
+    display : bool
+        Whether the panel mirrors a screen, of 1080 x 1920 pixels, in place of the emulated board.
     """
     small = shape == SHAPE
     distance_mm = DISTANCE_MM * shape[0] / SHAPE[0]
@@ -124,6 +126,10 @@ def write_configuration(
         camera = 'kind = "tests.campaigns.still_camera:still_camera"'
     fields = len(shown) * patterns
     panel = "refresh_hz = 1000.0\n" if small else f"refresh_hz = {60 * fields}\ntimeout_ms = 500\n"
+    if display:
+        panel = 'kind = "tests.campaigns.screen:screen"\n' + panel
+    else:
+        panel = f'bus = "virtual:{folder}/hardware.sock"\n' + panel
     file.write_text(
         CONFIGURATION.format(
             folder=folder,

@@ -5,7 +5,8 @@ panel, the mean time of each stage, light in a wrong field, and the memory of ea
 
     python -m tests.campaigns.soak --size 1080x1920 --colours --refresh-hz 2 --solve-ms 400 --seconds 150
 
-is a headset of full size that shows three colours in turn. Its camera gives one picture again and again.
+is a headset of full size that shows three colours in turn. Its camera gives one picture again and again. With
+`--display` in place of `--size` and `--colours`, its panel mirrors a screen of that size, in one colour.
 
     python -m tests.campaigns.soak --size 1080x1920 --refine --refresh-hz 2 --solve-ms 400 --seconds 150
 
@@ -33,7 +34,7 @@ import numpy as np
 from runtime.bundle.bundle_folder import read_bundle, write_bundle
 from runtime.camera.view import View
 from runtime.service.client import LostFrame, RefusedError
-from tests.campaigns import still_camera
+from tests.campaigns import screen, still_camera
 from tests.campaigns.headset import SHAPE, write_configuration
 from tests.campaigns.lane import STALE_MS, Lane
 
@@ -74,6 +75,7 @@ def soak(
     solve_ms: float | None = None,
     seconds: float | None = None,
     refined: bool = False,
+    display: bool = False,
 ) -> dict[str, Any]:
     """Show `frames` frames, or for a time; the results.
 
@@ -92,6 +94,8 @@ def soak(
         Ends after this time, however many frames were shown.
     refined : bool
         Whether all frames are of one picture that is refined again and again, with a network that was never trained.
+    display : bool
+        Whether the panel mirrors a screen, which is not looked at: of torn frames and lit fields nothing is known then.
     """
     solve_ms = solve_ms or min(3.0, 300 / refresh_hz)
     stale_ms = max(STALE_MS, 2 * solve_ms, 2000 / refresh_hz)  # lit until the next pattern is there
@@ -103,12 +107,20 @@ def soak(
         with socket.create_server(("127.0.0.1", 0)) as free:
             port = free.getsockname()[1]
         file = write_configuration(
-            Path(folder), refresh_hz, solve_ms, stale_ms, colours=colours, shape=shape, metrics_port=port
+            Path(folder),
+            refresh_hz,
+            solve_ms,
+            stale_ms,
+            colours=colours,
+            shape=shape,
+            metrics_port=port,
+            display=display,
         )
         if refined:
             add_network(file.parent / "bundle", shape)
         lane = Lane(Path(folder), 0, file=file)
         lane.pictures = lane.pictures[:1] if refined else lane.pictures
+        lane.remote.set_to("gated", not display)
         try:
             lit_up = lane.light_up(LIGHT_WITHIN_S)
             refining = False
@@ -140,9 +152,9 @@ def soak(
             frames, emitting = k, lane.lit()
             used = {name: cpu_s(pid) - used[name] for name, pid in processes(lane).items()}
             unanswered = lane.unanswered()
-            torn = lane.torn()
+            torn = None if display else lane.torn()
             stages = stage_ms(port)
-            lit_fields, wrongly_lit = lane.lit_fields(), lane.wrongly_lit()
+            lit_fields, wrongly_lit = (None, None) if display else (lane.lit_fields(), lane.wrongly_lit())
             log = (Path(folder) / "service.log").read_text()
             learned = log.count('"predicted"')
             if not emitting:
@@ -223,14 +235,24 @@ def main() -> int:
         action="store_true",
         help="refine one picture all the while (one colour, needs the trainer)",
     )
+    parser.add_argument("--display", action="store_true", help="a panel of 1080x1920 that mirrors a screen")
     parser.add_argument("--solve-ms", type=float, help="time for a picture's patterns")
     parser.add_argument("--seconds", type=float, help="end after so long")
     parser.add_argument(
         "--json", action="store_true", help="print one JSON object on stdout and nothing else"
     )
     args = parser.parse_args()
+    if args.display and args.colours:
+        parser.error("a panel that mirrors a screen shows one colour: leave --colours out")
     found = soak(
-        args.frames, args.refresh_hz, args.size, args.colours, args.solve_ms, args.seconds, args.refine
+        args.frames,
+        args.refresh_hz,
+        screen.SHAPE if args.display else args.size,
+        args.colours,
+        args.solve_ms,
+        args.seconds,
+        args.refine,
+        args.display,
     )
     if args.json:
         print(json.dumps(found))

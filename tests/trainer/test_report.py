@@ -23,7 +23,7 @@ from trainer.report import write_report
 from trainer.report.heat_maps import blocks, heat_map, place
 from trainer.report.ladder import ladder_rows
 
-VOID = {"meta", "img", "br", "link", "input", "hr"}
+VOID = {"meta", "img", "br", "link", "input", "hr", "wbr"}
 HOSTILE = '<script>alert("1")</script> & $\\frac{a}$'
 
 
