@@ -9,9 +9,13 @@ from runtime.excess import PredictionErrors
 from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet, chosen, opened
 from trainer.fitting.gauss_newton import fit
-from trainer.fitting.predictor import evaluate_captures
+from trainer.fitting.predictor import evaluate_captures, excess_on
 from trainer.fitting.refit import fit_from, least_for_order, raise_orders, settled
-from trainer.model.model import EffectInstance, Model
+from trainer.model.model import EffectInstance, Model, absent
+
+# An effect that starts anew is back where it was where it leaves the excess that there was, up to the first of these
+# factors, and nowhere near where it leaves more than the second times as much.
+BACK, NOWHERE = 1.1, 10.0
 
 
 @dataclass(frozen=True)
@@ -96,6 +100,27 @@ def try_further(
     if raising:
         fitted = raise_orders(fitted, [name], batches, least_for_order)
     return _judged(name, fitted.model, captures, held_ids)
+
+
+def try_again(
+    folder: Path, ids: tuple[str, ...], held_ids: tuple[str, ...], model: Model, name: str
+) -> CandidateFit | None:
+    """Fit effect `name` of a model anew from where it does nothing, then all effects together.
+
+    Returns
+    -------
+    CandidateFit or None
+        None where it alone comes back to where it was, or nowhere near: to fit all together would change nothing.
+    """
+    captures = opened(folder)
+    batches = load(captures, chosen(captures, ids))
+    present = model.instance(name)
+    fresh = absent(present.effect, model.bench, present.order)
+    alone = fit(model.having(fresh), [name], batches, iterations=8)
+    was = excess_on(model, batches)
+    if was / BACK < alone.errors.excess < was * BACK or alone.errors.excess > NOWHERE * was:
+        return None
+    return _judged(name, settled(alone.model, batches).model, captures, held_ids)
 
 
 def try_together(
