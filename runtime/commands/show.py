@@ -27,8 +27,9 @@ dark afterwards, whatever happens. Pictures are 16-bit gray PNGs of the camera's
 
 With --in-turn red,green,blue, the patterns are those of pictures in several colours: the first three are shown in turn
 as fields of one picture, each lit by its own laser alone, then the next three, and so on. The panel has to show fields
-(a panel board of protocol version 2, or a DLPC900). The camera sees the sum: give it an exposure of whole frames. What
-it sees is saved under the name of the first of the patterns.
+(a panel board of protocol version 2, or a DLPC900). Each colour is lit for as long as its pattern needs, which `solve`
+writes into its PNGs; other files are lit alike. The camera sees the sum: give it an exposure of whole frames. What it
+sees is saved under the name of the first of the patterns.
 
 With --emulated, the headset of a virtual bench is emulated down to the bytes of its buses and driven through the real
 pyusb, smbus2 and depthai libraries, as real hardware would be."""
@@ -78,7 +79,7 @@ def run(args: Namespace, screen: Screen) -> Result:
         shown: list[dict[str, Any]] = []
         for paths in pictures:
             begin = time.perf_counter()
-            _show([grays[path] for path in paths], channels, devices)
+            _show([grays[path] for path in paths], channels, _times(paths), devices)
             took_ms = 1000 * (time.perf_counter() - begin)
             if args.in_turn and not shown:  # where no field is shown yet, no laser may shine
                 devices.light_all(channels)
@@ -130,8 +131,16 @@ def _pictures(args: Namespace) -> list[list[Path]]:
     return [args.patterns[k : k + each] for k in range(0, len(args.patterns), each)]
 
 
-def _show(grays: list[np.ndarray], channels: list[str], devices: Devices) -> None:
-    """Show one pattern, or one for each channel in turn."""
+def _times(paths: list[Path]) -> list[float]:
+    """Of the light of each colour: what it needs for its balance, or all alike where a file does not say that."""
+    from runtime.solver.pattern_files import read_given
+
+    given = [one for one in map(read_given, paths) if one is not None]
+    return [min(given) / one for one in given] if len(given) == len(paths) else [1.0] * len(paths)
+
+
+def _show(grays: list[np.ndarray], channels: list[str], times: list[float], devices: Devices) -> None:
+    """Show one pattern, or one for each channel in turn, each lit for a share of its field's light."""
     import numpy as np
 
     from firmware_iface.panel.fields import colours_in_turn
@@ -142,7 +151,7 @@ def _show(grays: list[np.ndarray], channels: list[str], devices: Devices) -> Non
     if len({gray.shape for gray in grays}) > 1:
         raise InputError("the patterns of a picture have different sizes; give those of one picture together")
     lasers = [devices.lasers.channels.index(channel) for channel in channels]
-    frame = colours_in_turn(np.stack(grays), lasers, [1.0] * len(grays), devices.panel.field_us)
+    frame = colours_in_turn(np.stack(grays), lasers, times, devices.panel.field_us)
     devices.panel.show_fields(frame)
 
 

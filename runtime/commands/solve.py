@@ -177,9 +177,10 @@ def run(args: Namespace, screen: Screen) -> Result:
                     progress=_iterations_of(progress, *solves, iterations, names[0][0].name),
                 )
                 grays = solution.gray.reshape(len(group), args.frames, *shape)
-                for channel, name, gray, quality in zip(group, names, grays, solution.qualities, strict=True):
+                solved = zip(group, names, grays, solution.qualities, solution.given, strict=True)
+                for channel, name, gray, quality, given in solved:
                     for frame, one in enumerate(name):
-                        write_pattern(one, gray[frame])
+                        write_pattern(one, gray[frame], given)
                         patterns.append(
                             {
                                 "target": str(target),

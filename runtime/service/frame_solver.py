@@ -51,7 +51,8 @@ class Pattern:
         the colour's patterns, and raised by 1 / (1 - s) on a panel that keeps the share s of the phase before; empty
         where they were not asked for.
     brightness : tuple of float
-        Light of each colour, as a share of what a white picture has; empty for a picture of one field, which has all.
+        Light of each colour, as a share of what a white picture has in the colour that needs most; empty for a picture
+        of one field, which has all.
     """
 
     gray: np.ndarray
@@ -108,6 +109,7 @@ class PatternSolver:
         # What one colour's solver does on one core alone, another's is computed beside.
         several = len(paths) > 1 and self._solvers[0].on.threads > 1
         self._pool = ThreadPoolExecutor(len(paths), "colours") if several else None
+        self._white = 0.0  # what a white picture gets, once that is known
 
     def rehearse(self) -> None:
         """Set up what the first use sets up, and measure this machine: on a large panel, seconds for each colour."""
@@ -142,6 +144,8 @@ class PatternSolver:
             gray = np.zeros((self.fields, *self.shape[1:]), np.uint8)
             yield Pattern(gray, 0.0, final=True, dark=True, brightness=dark)
             return
+        if self.fields > 1 and not self._white:
+            self._white = self._given_to_white()
         gray = np.zeros((self._frames, *self.shape), np.uint8)
         began = time.monotonic_ns()
         solved = dict(zip(lit, self._each(lambda k: self._solvers[k].frame(target[k], 0), lit), strict=True))
@@ -181,11 +185,26 @@ class PatternSolver:
             for k, path in enumerate(self._paths):
                 spots = brightest_spots(path, gray[:, k], self._mrad) if k in solved else NO_LIGHT
                 shares += raised(spots, self._slow_share)
-        # a pattern puts all of its light into the picture, however bright that is: the light's time makes it right
-        brightness = tuple(float(c.mean()) for c in target) if self.fields > 1 else ()
+        brightness = self._brightness(solved) if self.fields > 1 else ()
         lowest_db = min(solution.expected_psnr_db for solution in solved.values())
         fields = gray.reshape(self.fields, *self.shape[1:])
         return Pattern(fields, lowest_db, final, shares=shares, brightness=brightness)
+
+    def _brightness(self, solved: dict[int, Solution]) -> tuple[float, ...]:
+        """For how much of its light's time each colour is lit.
+
+        However bright a picture is, its pattern puts the same light somewhere. The time makes the picture right, so it
+        goes with what a target of 1 gets: of a dark picture, more light goes where it is not wanted.
+        """
+        needed = [self._white / solved[k].given[0] if k in solved else 0.0 for k in range(len(self.colours))]
+        most = max(1.0, *needed)
+        return tuple(share / most for share in needed)
+
+    def _given_to_white(self) -> float:
+        """What a white picture gets in the colour that gets least."""
+        white = np.ones(self.shape[1:], np.float32)
+        solutions = self._each(lambda k: self._solvers[k].solve(white, 1), range(len(self.colours)))
+        return min(one.given[0] for one in solutions)
 
 
 def brightest_spots(path: LightPath, grays: np.ndarray, mrad_per_pixel: float) -> tuple[float, ...]:

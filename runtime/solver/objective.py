@@ -87,6 +87,7 @@ class Objective:
         self.floor: list[float] = []
         self.looks = 0
         self.scale = [1.0] * len(stacks)
+        self.asked, self.lit = ([1.0] * len(stacks) for _ in range(2))
         self.loss, self.squared_error, self.peak = math.inf, math.inf, 1.0
 
     def aim(self, targets: np.ndarray) -> None:
@@ -102,6 +103,7 @@ class Objective:
                 if self.approximator is None and not bare:
                     wanted += FLOOR
                     xp.sqrt(wanted, out=wanted)
+            self.asked[c] = self._mean(xp.asarray(targets[c]))
         self.floor = []
         top = float(self.wanted.max())
         self.peak = top if self.approximator is None and not bare else math.sqrt(top)
@@ -120,6 +122,7 @@ class Objective:
         if self.frames > 1:
             self.light *= 1 / self.frames
         first = not self.floor
+        self.lit = [self._mean(light) for light in self.light]
         if first:
             self.mean_light = [float(self.light[c].mean()) for c in range(len(self.stacks))]
             self.floor = [FLOOR * mean for mean in self.mean_light]
@@ -162,6 +165,14 @@ class Objective:
         """Amplitude PSNR of the last look, on the solver's own grid."""
         return 20 * math.log10(self.peak / max(math.sqrt(self.squared_error), 1e-15))
 
+    @property
+    def given(self) -> tuple[float, ...]:
+        """Irradiance that a target of 1 gets at the phase of the last look, for each colour: the ratio of their means.
+
+        Light that does not follow the target counts, too: the eye sees it.
+        """
+        return tuple(lit / asked for lit, asked in zip(self.lit, self.asked, strict=True))
+
     def curvature(self, pattern: int) -> float:
         """The loss's approximate second derivative over a pixel's phase, for a path that loses no light."""
         colour = pattern // self.frames
@@ -171,6 +182,12 @@ class Objective:
         rms = math.sqrt(self.squared_error)
         bend = self.penalty.curvature(self.scale[colour], self.mean_light[colour], rms)
         return bend * share * len(self.stacks[colour])
+
+    def _mean(self, values: Array) -> float:
+        """Mean of [K, H, W] where it counts."""
+        if self.weight is None:
+            return float(values.mean())
+        return float((values * self.weight).sum()) / (float(self.weight.sum()) * len(values))
 
     def _measure(self, c: int, k: int) -> tuple[float, ...]:
         light, wanted, weight, floor = self.light[c, k], self.wanted[c, k], self.weight, self.floor[c]

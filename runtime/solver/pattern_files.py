@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,9 +10,12 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from firmware_iface.errors import InputError
 from runtime.bundle.whole_files import whole_file
+
+GIVEN = "hololoop-given"
 
 
 @dataclass(frozen=True)
@@ -90,10 +94,39 @@ def pattern_files(
     return files
 
 
-def write_pattern(path: Path, gray: np.ndarray) -> None:
-    """Write gray levels, uint8 [H, W], as an 8-bit gray PNG that appears whole or not at all."""
+def write_pattern(path: Path, gray: np.ndarray, given: float | None = None) -> None:
+    """Write gray levels, uint8 [H, W], as an 8-bit gray PNG that appears whole or not at all.
+
+    `given`, the irradiance that a target of 1 should get (`Solution.given`), is kept in the PNG's text: colours that
+    are shown in turn have no balance without it.
+    """
+    text = PngInfo()
+    if given is not None:
+        text.add_text(GIVEN, repr(float(given)))
     with whole_file(path) as file:
-        Image.fromarray(gray).save(file, format="PNG")
+        Image.fromarray(gray).save(file, format="PNG", pnginfo=text)
+
+
+def read_given(path: Path) -> float | None:
+    """What a target of 1 should get from the pattern in a file; None where the file does not say so.
+
+    Raises
+    ------
+    InputError
+        Where it says something else than a number above 0; and as `read_pattern`.
+    """
+    read_pattern(path)
+    with Image.open(path) as image:
+        said = image.info.get(GIVEN)
+    if said is None:
+        return None
+    try:
+        given = float(said)
+    except ValueError:
+        given = math.nan
+    if not 0 < given < math.inf:
+        raise InputError(f"{path} says {GIVEN} = {said}, which is no number above 0: solve the picture again")
+    return given
 
 
 def read_pattern(path: Path) -> np.ndarray:

@@ -31,6 +31,10 @@ class Solution:
         loop, that of the gray levels.
     milliseconds : float, ms
         From the target to the gray levels.
+    given : tuple of float
+        Irradiance that a target of 1 gets, for each colour, as `expected_psnr_db` is known: the light of a dark picture
+        goes where it is not wanted, too. Colours in turn are right where each has light for a time in proportion to
+        1 / given.
     """
 
     gray: np.ndarray
@@ -38,6 +42,7 @@ class Solution:
     psnr_db: tuple[float, ...]
     expected_psnr_db: float
     milliseconds: float
+    given: tuple[float, ...]
     _judge: Callable[[], tuple[Quality, ...]] = field(repr=False)
 
     @property

@@ -149,6 +149,7 @@ class Solver:
         self.solved = 0
         self.follows = False  # whether `best` is of the picture in `before`
         self.best = self.phases[0]
+        self.given: tuple[float, ...] = ()  # of `best`
         self.begin, self.step, self.finish = Pace(), Pace(), Pace()
 
     def solve(
@@ -273,7 +274,7 @@ class Solver:
         history: list[float] = []
         rounding = self.objective.rounding
         stages: tuple[float, ...] = (0.0,)
-        at_first = (math.inf, -math.inf)
+        at_first = (math.inf, -math.inf, self.given)
         if rounding is not None:
             at_first = self._rounded(self.phases[0])
             self.begun_from[...] = self.phases[0]
@@ -286,10 +287,11 @@ class Solver:
         clock = time.perf_counter()
         expected = max(history)
         if rounding is not None:
-            loss, expected = self._rounded(self.best)
+            loss, expected, self.given = self._rounded(self.best)
             # a descent that is cut short, or goes on for long, can end below its start
             if loss > at_first[0]:
-                self.best[...], expected = self.begun_from, at_first[1]
+                self.best[...] = self.begun_from
+                _, expected, self.given = at_first
         self.grays.reverse()
         for drive, phase, gray in zip(self.drives, self.best, self.grays[0], strict=True):
             drive.gray(self.on.to_host(phase), gray)
@@ -300,13 +302,13 @@ class Solver:
         gray, phase = (a.reshape(*leading, *self.shape) for a in (gray, phase))
         self.solved += 1
         judge = partial(self._judged, self.grays[0], targets, self.solved)
-        return Solution(gray, phase, tuple(history), expected, 1e3 * (done - begun), judge)
+        return Solution(gray, phase, tuple(history), expected, 1e3 * (done - begun), self.given, judge)
 
-    def _rounded(self, phase: Any) -> tuple[float, float]:
-        """The loss and the PSNR (dB) of the panel's levels that are nearest to a phase."""
+    def _rounded(self, phase: Any) -> tuple[float, float, tuple[float, ...]]:
+        """The loss, the PSNR (dB) and what a target of 1 gets, of the panel's levels that are nearest to a phase."""
         assert self.objective.rounding is not None
         self.objective.rounding.sharpness = math.inf
-        return self.objective.look(phase), self.objective.psnr_db
+        return self.objective.look(phase), self.objective.psnr_db, self.objective.given
 
     def _descend(
         self,
@@ -325,6 +327,7 @@ class Solver:
         if self.method is not None:
             self.method.begin()
         lowest = self.objective.look(now)
+        self.given = self.objective.given
         clock = time.perf_counter()
         if not history:
             history.append(self.objective.psnr_db)
@@ -344,7 +347,7 @@ class Solver:
             loss = self.objective.look(now)
             history.append(self.objective.psnr_db)
             if loss < lowest:
-                lowest, self.best = loss, now
+                lowest, self.best, self.given = loss, now, self.objective.given
             before, clock = clock, time.perf_counter()
             self.step.took(1e3 * (clock - before))
 

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from firmware_iface.errors import InputError
 from firmware_iface.virtual import open_headset
 from runtime.cli import main
+from runtime.solver.pattern_files import read_given, read_pattern, write_pattern
 
 BENCH = """
 [panel]
@@ -86,18 +88,20 @@ bit_depth = 16
 )
 
 
-@pytest.mark.parametrize("emulated", [False, True])
+@pytest.mark.parametrize(
+    ("emulated", "given"), [(False, None), (True, None), (False, (2.0, 0.5, 1.0))], ids=str
+)
 def test_colours_in_turn_are_seen_together(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, emulated: bool
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, emulated: bool, given: tuple[float, ...] | None
 ) -> None:
-    """The camera's picture is the sum of the colours, each of its own pattern, for a sixth of the time."""
+    """The camera's picture is the sum of the colours, each of its own pattern, for a sixth of the time at most."""
     bench = tmp_path / "bench.toml"
     bench.write_text(COLOUR, encoding="utf-8")
     colours, paths, grays = ["red", "green", "blue"], [], []
     for name in colours:
         grays.append(np.random.default_rng(len(name)).integers(0, 256, (48, 64), dtype=np.uint8))
         paths.append(tmp_path / f"picture-{name}.png")
-        Image.fromarray(grays[-1]).save(paths[-1])
+        write_pattern(paths[-1], grays[-1], given and given[len(paths) - 1])
     words = ["show", *paths, "--in-turn", ",".join(colours), "--headset", bench, "--exposure-ms", 16.66]
     words += ["--out", tmp_path / "seen", "--json", *(["--emulated"] if emulated else [])]
     code, result, err = run(capsys, *words)
@@ -108,13 +112,27 @@ def test_colours_in_turn_are_seen_together(
     assert one["seen"] == str(tmp_path / "seen" / "picture-red-seen.png")
     truth = open_headset(str(bench))
     black = truth.description.camera.black_level
-    expected = sum(truth.expected_counts(g, c) - black for g, c in zip(grays, colours, strict=True))
+    times = [0.5 / one for one in given or (0.5, 0.5, 0.5)]
+    alone = [truth.expected_counts(g, c) - black for g, c in zip(grays, colours, strict=True)]
+    expected = sum(t * one for t, one in zip(times, alone, strict=True))
     counts = seen(one["seen"])
     expected = expected * 16.66 / 10 / 6
     if counts.max() <= 1023:  # an OAK's ten bits
         expected, black = expected / 64, black / 64
     assert np.corrcoef(counts.ravel(), np.asarray(expected).ravel())[0, 1] > 0.97
     assert counts.mean() - black == pytest.approx(np.mean(expected), rel=0.05)
+
+
+def test_a_pattern_says_what_it_gives_or_nothing(tmp_path: Path) -> None:
+    path, gray = tmp_path / "pattern.png", np.full((4, 6), 7, np.uint8)
+    write_pattern(path, gray)
+    assert read_given(path) is None
+    write_pattern(path, gray, 0.1)
+    assert read_given(path) == 0.1 and np.array_equal(read_pattern(path), gray)
+    for wrong in (0.0, float("nan"), float("inf"), -1.0):
+        write_pattern(path, gray, wrong)
+        with pytest.raises(InputError, match="no number above 0"):
+            read_given(path)
 
 
 def test_patterns_that_are_no_pictures_of_these_colours_are_refused(

@@ -83,7 +83,7 @@ s_curvature = 0.15
 
 
 def test_the_camera_sees_each_colour_alone_in_the_frame_that_it_is_shown_in(tmp_path: Path) -> None:
-    """Against the bench's noise-free truth, each colour for a time in proportion to its brightness in the target."""
+    """Against the bench's noise-free truth, each colour for a time that makes up for what its pattern should give."""
     spec = str(tmp_path / "bench.toml")
     Path(spec).write_text(IN_COLOUR)
     truth = open_headset(spec)
@@ -92,10 +92,11 @@ def test_the_camera_sees_each_colour_alone_in_the_frame_that_it_is_shown_in(tmp_
     target = target_of("astronaut", channels, bench.panel.shape)
     gray = np.random.default_rng(0).integers(0, 256, target.shape, dtype=np.uint8)
     with emulated(spec, seed=2, fields=3) as devices:
-        seen = seen_by_camera(devices, bench, gray, target)
+        given = np.array([1.0, 2.5, 1.6])
+        seen = seen_by_camera(devices, bench, gray, given, target)
     black = bench.camera.black_level
     expected = np.stack([truth.expected_counts(g, c) - black for g, c in zip(gray, channels, strict=True)])
-    expected = expected * target.mean((1, 2), keepdims=True)
+    expected = expected / given[:, None, None]
     scale = np.vdot(expected, seen.light) / np.vdot(expected, expected)
     for light, wanted in zip(seen.light, scale * expected, strict=True):
         assert light.mean() == pytest.approx(wanted.mean(), rel=0.02)

@@ -47,12 +47,17 @@ def target_of(name: str, channels: Sequence[str], shape: tuple[int, int]) -> np.
     return fit_area(planes, shape).astype(np.float32)
 
 
-def seen_by_camera(devices: Devices, bench: Bench, gray: np.ndarray, target: np.ndarray) -> CameraPicture:
-    """The camera's picture of gray levels [C, H, W], mean of several shots; several colours are shown in turn."""
+def seen_by_camera(
+    devices: Devices, bench: Bench, gray: np.ndarray, given: np.ndarray, target: np.ndarray
+) -> CameraPicture:
+    """The camera's picture of gray levels [C, H, W], mean of several shots; several colours are shown in turn.
+
+    `given` [C] is the irradiance that a target of 1 should get from each pattern.
+    """
     channels = [c.name for c in bench.channels]
     if len(channels) == 1:
         return _in_one_colour(devices, bench, gray, target)
-    return _in_turn(devices, bench, gray, target)
+    return _in_turn(devices, bench, gray, given, target)
 
 
 def _in_one_colour(devices: Devices, bench: Bench, gray: np.ndarray, target: np.ndarray) -> CameraPicture:
@@ -67,18 +72,19 @@ def _in_one_colour(devices: Devices, bench: Bench, gray: np.ndarray, target: np.
     return CameraPicture(light[None], quality(light, target[0]))
 
 
-def _in_turn(devices: Devices, bench: Bench, gray: np.ndarray, target: np.ndarray) -> CameraPicture:
+def _in_turn(
+    devices: Devices, bench: Bench, gray: np.ndarray, given: np.ndarray, target: np.ndarray
+) -> CameraPicture:
     """All colours in turn, and then each of them alone in the same frame, since the camera sees their sum.
 
-    The exposure is of one frame. Each colour has light for a time in proportion to its brightness in the target: a
-    pattern puts all of its light into the picture. Where the sum saturates, all have less time.
+    The exposure is of one frame. Each colour has light for as long as its target needs: the darker that is, the more a
+    pattern gives it. Where the sum saturates, all have less time.
     """
     channels = [c.name for c in bench.channels]
     lasers = [devices.lasers.channels.index(channel) for channel in channels]
     camera, field_us = devices.camera, devices.panel.field_us
     camera.exposure_ms = min(1e-3 * field_us * len(channels), camera.longest_exposure_ms)
-    times = target.mean(axis=(1, 2))
-    times = times / times.max()
+    times = given.min() / given
 
     def show(times: np.ndarray) -> None:
         devices.panel.show_fields(colours_in_turn(gray, lasers, times.tolist(), field_us))

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -153,6 +153,13 @@ def run_demo(
     }
 
 
+class Solved(NamedTuple):
+    """A picture's patterns, or one colour's: gray levels, and the irradiance that a target of 1 should get."""
+
+    gray: np.ndarray
+    given: np.ndarray
+
+
 def _make_empty(folder: Path) -> None:
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(
@@ -171,8 +178,8 @@ def _patterns(
     pictures: Sequence[str],
     folder: Path,
     say: Progress,
-) -> list[tuple[str, np.ndarray, dict[str, np.ndarray]]]:
-    """(name, target [C, H, W], gray levels [C, H, W] by source) of every picture.
+) -> list[tuple[str, np.ndarray, dict[str, Solved]]]:
+    """(name, target [C, H, W], patterns of all colours by source) of every picture.
 
     Sources are the bundles, and the oracle on `headset`.
     """
@@ -188,31 +195,39 @@ def _patterns(
             what = name if len(channels) == 1 else f"{name}, {channel}"
             some = part_of(say, begin / len(pictures), (begin + part) / len(pictures), what)
             solved.append(_solved(headset, bundles, channel, target[c], some))
-            for which, levels in solved[-1].items():
+            for which, one in solved[-1].items():
                 colour = "" if len(channels) == 1 else f"-{channel}"
-                write_pattern(folder / f"{name}-{which}{colour}.png", levels)
-        found.append((name, target, {which: np.stack([one[which] for one in solved]) for which in solved[0]}))
+                write_pattern(folder / f"{name}-{which}{colour}.png", one.gray)
+        together = {
+            which: Solved(*map(np.stack, zip(*(colour[which] for colour in solved), strict=True)))
+            for which in solved[0]
+        }
+        found.append((name, target, together))
     return found
 
 
 def _solved(
     headset: VirtualHeadset, bundles: dict[str, Path], channel: str, target: np.ndarray, say: Progress
-) -> dict[str, np.ndarray]:
-    """Gray levels [H, W] by source, for one colour's target [H, W]."""
-    gray = {}
+) -> dict[str, Solved]:
+    """Pattern [H, W] by source, for one colour's target [H, W]."""
+    solved = {}
     for k, (which, bundle) in enumerate(bundles.items()):
         say(0.1 * k, f"solving, {which}")
-        gray[which] = solve(load_light_path(read_bundle(bundle), channel), target, ITERATIONS).gray
+        found = solve(load_light_path(read_bundle(bundle), channel), target, ITERATIONS)
+        solved[which] = Solved(found.gray, np.array(found.given[0]))
     asking = part_of(say, 0.2, 1.0, "asking the oracle")
-    gray["oracle"] = _oracle(headset, target, channel, gray["after"], asking)
-    return gray
+    gray = _oracle(headset, target, channel, solved["after"].gray, asking)
+    solved["oracle"] = Solved(gray, headset.true_irradiance(gray, channel).mean() / target.mean())
+    return solved
 
 
 def _show(
-    devices: Devices, bench: Bench, name: str, target: np.ndarray, gray: dict[str, np.ndarray], folder: Path
+    devices: Devices, bench: Bench, name: str, target: np.ndarray, solved: dict[str, Solved], folder: Path
 ) -> DisplayedPicture:
     """A picture with each of its patterns, as the camera measures it."""
-    camera = {which: seen_by_camera(devices, bench, levels, target) for which, levels in gray.items()}
+    camera = {
+        which: seen_by_camera(devices, bench, one.gray, one.given, target) for which, one in solved.items()
+    }
     for which, one in camera.items():
         write_picture(folder / f"{name}-{which}-seen.png", one.light)
     return DisplayedPicture(

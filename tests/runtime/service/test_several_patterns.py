@@ -29,7 +29,7 @@ from runtime.service.process_messages import SOLVER, PatternRing
 from runtime.service.protocol import LaserState, PartState, Shown
 from runtime.service.shared_memory import crc32, make_ring
 from runtime.service.socket_link import MessageLink
-from runtime.solver import Quality, quality, shown
+from runtime.solver import Quality, quality, shown, solve
 from tests.campaigns.headset import SHAPE, connected, hardware, served, write_configuration
 from tests.campaigns.lane import Lane
 from tests.runtime.benches import converted, ideal_path, scene
@@ -59,6 +59,7 @@ def test_two_patterns_of_one_colour_are_nearer_to_the_picture_than_one(tmp_path:
     levels = tuple(range(0, 256, 64))
     path = dataclasses.replace(ideal_path(SHAPE, 6e-3, 0.7, np.float32), gray_levels=levels)
     found: dict[int, Quality] = {}
+    white = shown(path, solve(path, np.ones(SHAPE), 1, frames=2, grid="panel").gray[0]).mean()
     for patterns in (1, 2, 4):
         solver = PatternSolver({"green": path}, frames=patterns, grid="panel")
         assert solver.shape == (1, *SHAPE) and solver.fields == patterns
@@ -66,8 +67,10 @@ def test_two_patterns_of_one_colour_are_nearer_to_the_picture_than_one(tmp_path:
         last = made[-1]
         assert [p.final for p in made] == [False, True] and last.gray.shape == (patterns, *SHAPE)
         assert len({crc32(gray) for gray in last.gray}) == patterns
-        assert last.brightness == ((pytest.approx(linear().mean(), rel=1e-4),) if patterns > 1 else ())
         light = [shown(path, gray) for gray in last.gray]
+        assert len(last.brightness) == (patterns > 1)
+        for share in last.brightness:  # what the picture needs, of the time that white needs
+            assert share == pytest.approx(linear().mean() * white / np.mean(light), rel=0.1)
         found[patterns] = quality(np.mean(light, axis=0), linear())
         alone = [quality(one, linear()).psnr_db for one in light]
         assert found[patterns].psnr_db > max(alone) + (1 if patterns > 1 else -0.01)
@@ -83,9 +86,25 @@ def test_patterns_of_three_colours_are_in_the_order_of_their_fields(tmp_path: Pa
     assert gray.shape == (6, *SHAPE) and [bool(one.any()) for one in gray] == [True, False, True] * 2
     for colour in (0, 2):
         assert quality(mean_light(gray[colour::3]), target[colour]).psnr_db > 15
-    assert made[-1].brightness == pytest.approx((linear().mean(), 0, linear().mean() / 2), rel=1e-4)
+    first, without, third = made[-1].brightness
+    given = [mean_light(gray[colour::3]).mean() for colour in (0, 2)]
+    assert without == 0 and first * given[0] == pytest.approx(2 * third * given[1], rel=0.02)
     (dark,) = solver.patterns(np.zeros_like(target), time.monotonic_ns())
     assert dark.dark and dark.gray.shape == (6, *SHAPE) and dark.brightness == (0, 0, 0)
+
+
+def test_a_dark_colour_has_as_much_less_light_as_the_picture_says() -> None:
+    """Behind a half-open iris a dark picture gets less of its pattern's light than a bright one."""
+    path = ideal_path(SHAPE, 6e-3, 0.5, np.float32)
+    solver = PatternSolver({"red": path, "green": path}, grid="panel")
+    target = np.stack([linear(), linear() ** 4])
+    *_, last = solver.patterns(target, time.monotonic_ns() + 400_000_000)
+    light = np.stack([shown(path, gray) for gray in last.gray])
+    alone = [one.sum() / wanted.sum() for one, wanted in zip(light, target, strict=True)]
+    assert alone[1] / alone[0] < 0.95 * target[0].mean() / target[1].mean(), "not in proportion to its mean"
+    balanced = light * np.array(last.brightness)[:, None, None]
+    red, green = (one.sum() / wanted.sum() for one, wanted in zip(balanced, target, strict=True))
+    assert green == pytest.approx(red, rel=0.03)
 
 
 def test_the_next_picture_of_a_video_starts_from_the_patterns_before(tmp_path: Path) -> None:
