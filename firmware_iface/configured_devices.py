@@ -198,8 +198,8 @@ def open_lasers(table: Table, gated: GatedLight | None = None) -> Any:
     return open_board(bus, laser_channels(table), gated)
 
 
-def open_camera(table: Table) -> Any:
-    """The camera of a configuration's [camera].
+def open_camera(table: Table, timeout_s: float = 1.0) -> Any:
+    """The camera of a configuration's [camera]; an OAK that gives no picture for `timeout_s` is an error.
 
     Raises
     ------
@@ -218,7 +218,7 @@ def open_camera(table: Table) -> Any:
             settings.address,
             frames_per_s=settings.frames_per_s,
             exposure_ms=settings.exposure_ms,
-            timeout_s=1.0,
+            timeout_s=timeout_s,
             starved_s=0.5,
         )
     from firmware_iface.virtual.remote_hardware import RemoteCamera, reach

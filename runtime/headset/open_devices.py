@@ -16,6 +16,7 @@ from firmware_iface.errors import InputError
 
 FULL = 1.0  # power where none is given: the most that the safety controller allows
 FRAMES_HZ = 60.0  # of an emulated panel
+SIMULATED_S = 60.0  # a simulated picture, which no camera waits for, may take as long as its optics compute
 
 
 @dataclass(frozen=True)
@@ -106,6 +107,7 @@ def open_tables(tables: Mapping[str, Any], fields: int = 1, pulses: int = 1) -> 
         laser_power,
         open_camera,
         open_panel,
+        simulated,
     )
     from firmware_iface.lasers.guarded_lasers import open_guarded_lasers
     from firmware_iface.virtual.remote_hardware import i2c_bus
@@ -113,7 +115,8 @@ def open_tables(tables: Mapping[str, Any], fields: int = 1, pulses: int = 1) -> 
     bus = str(tables["lasers"].get("bus"))
     panel_table = {**tables["panel"], "fields": fields}
     with ExitStack() as stack:
-        camera = stack.enter_context(closing(open_camera(tables["camera"])))
+        patience = {"timeout_s": SIMULATED_S} if simulated(tables) else {}
+        camera = stack.enter_context(closing(open_camera(tables["camera"], **patience)))
         gated = gated_light(panel_table, pulses)
         panel = stack.enter_context(closing(open_panel(panel_table, gated)))
         bus = i2c_bus(bus) if bus.startswith("virtual:") else bus
