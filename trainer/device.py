@@ -16,10 +16,13 @@ from functools import lru_cache, wraps
 from typing import Any, TypeVar, cast
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from firmware_iface.errors import InputError
+from runtime.program.interrupt import ctrl_c_waits
+
+with ctrl_c_waits():  # in the middle of it, Ctrl-C is lost, or ends the process without a word
+    import torch
+    from torch import Tensor
 
 F = TypeVar("F", bound=Callable[..., Any])
 

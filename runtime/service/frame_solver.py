@@ -109,11 +109,12 @@ class PatternSolver:
         # What one colour's solver does on one core alone, another's is computed beside.
         several = len(paths) > 1 and self._solvers[0].on.threads > 1
         self._pool = ThreadPoolExecutor(len(paths), "colours") if several else None
-        self._white = 0.0  # what a white picture gets, once that is known
+        self._white = 0.0  # what a white picture gets in the colour that gets least, once that is known
 
     def rehearse(self) -> None:
         """Set up what the first use sets up, and measure this machine: on a large panel, seconds for each colour."""
-        self._each(lambda k: self._solvers[k].rehearse(), range(len(self._solvers)))
+        white = self._each(lambda k: self._solvers[k].rehearse(), range(len(self._solvers)))
+        self._white = min(one.given[0] for one in white)
         for _ in self.patterns(np.ones(self.shape, np.float32), time.monotonic_ns()):
             pass
 
@@ -145,7 +146,7 @@ class PatternSolver:
             yield Pattern(gray, 0.0, final=True, dark=True, brightness=dark)
             return
         if self.fields > 1 and not self._white:
-            self._white = self._given_to_white()
+            self.rehearse()
         gray = np.zeros((self._frames, *self.shape), np.uint8)
         began = time.monotonic_ns()
         solved = dict(zip(lit, self._each(lambda k: self._solvers[k].frame(target[k], 0), lit), strict=True))
@@ -199,12 +200,6 @@ class PatternSolver:
         needed = [self._white / solved[k].given[0] if k in solved else 0.0 for k in range(len(self.colours))]
         most = max(1.0, *needed)
         return tuple(share / most for share in needed)
-
-    def _given_to_white(self) -> float:
-        """What a white picture gets in the colour that gets least."""
-        white = np.ones(self.shape[1:], np.float32)
-        solutions = self._each(lambda k: self._solvers[k].solve(white, 1), range(len(self.colours)))
-        return min(one.given[0] for one in solutions)
 
 
 def brightest_spots(path: LightPath, grays: np.ndarray, mrad_per_pixel: float) -> tuple[float, ...]:

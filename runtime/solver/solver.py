@@ -235,17 +235,21 @@ class Solver:
             self.first.cold(optics_targets, self.phases[0], soon=True)
         return self._improve(targets, begun, iterations, deadline_ms, None)
 
-    def rehearse(self, target: np.ndarray | None = None) -> None:
-        """Measure how long the start, an iteration and the rounding take on this machine."""
+    def rehearse(self, target: np.ndarray | None = None) -> Solution:
+        """Measure how long the start, an iteration and the rounding take on this machine, on a white picture or another.
+
+        What `frame` goes on from stays as it is.
+        """
         targets = self._checked(np.ones(self.shape) if target is None else target)
         before, best, follows = self.before.copy(), self.best.copy(), self.follows
         for _ in range(2):  # the first touches memory for the first time and is not counted
             self.begin, self.step, self.finish = Pace(), Pace(), Pace()
             begun = time.perf_counter()
             self.first.cold(self._aim(targets), self.phases[0])
-            self._improve(targets, begun, 3, None, None)
+            solution = self._improve(targets, begun, 3, None, None)
         self.before, self.best[...], self.follows = before, best, follows
         self.first.fits = False
+        return solution
 
     def _begun(
         self, target: np.ndarray, iterations: int | None, deadline_ms: float | None
