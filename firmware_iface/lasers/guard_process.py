@@ -40,7 +40,7 @@ class Guard:
         self._failure: str | None = (
             None  # a failure between requests; reported until the lasers are armed again
         )
-        self._request_at = self._acted_at = time.monotonic()
+        self._heard_at = self._acted_at = time.monotonic()
 
     def run(self) -> None:
         """Serve until the client ends. The lasers are dark when this returns or raises."""
@@ -52,8 +52,9 @@ class Guard:
                     packet = self._client.recv(PACKET)
                     if not packet:
                         return
-                    self._request_at = time.monotonic()
-                    self._client.send(json.dumps(self._answer(packet)).encode())
+                    answer = self._answer(packet)
+                    self._heard_at = time.monotonic()  # until now it waited for this answer
+                    self._client.send(json.dumps(answer).encode())
                 if time.monotonic() >= due:
                     self._act()
         except ConnectionError:
@@ -67,7 +68,7 @@ class Guard:
         self._acted_at = time.monotonic()
         if not (self._armed and self._lasers):
             return
-        if self._acted_at - self._request_at > LEASE_S:
+        if self._acted_at - self._heard_at > LEASE_S and not self._is_asked():
             self._stop("the program that drives the lasers was silent for 100 ms, so they were switched off")
             return
         try:
@@ -77,6 +78,10 @@ class Guard:
                 self._lasers.heartbeat()
         except DeviceError as error:
             self._stop(str(error))
+
+    def _is_asked(self) -> bool:
+        """Whether a request waits, because this process had to wait for the processor, or the client has ended."""
+        return bool(select.select([self._client], [], [], 0.0)[0])
 
     def _stop(self, failure: str) -> None:
         self._armed, self._ramp, self._failure = False, None, failure

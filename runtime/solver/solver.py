@@ -236,7 +236,7 @@ class Solver:
         return self._improve(targets, begun, iterations, deadline_ms, None)
 
     def rehearse(self, target: np.ndarray | None = None) -> Solution:
-        """Measure how long the start, an iteration and the rounding take on this machine, on a white picture or another.
+        """Measure how long the start, an iteration and the rounding take here, on a white picture or another.
 
         What `frame` goes on from stays as it is.
         """
