@@ -142,9 +142,9 @@ def _registration(values: dict[str, Any]) -> str:
     """Where the camera looks, in a sentence."""
     view = values["registration"]
     return (
-        f"<p>Against its homography the camera is moved by {view['shift_y_px']:.3f} rows and "
-        f"{view['shift_x_px']:.3f} columns of the panel and turned by {view['rotation_mrad']:.3f} mrad; its own blur "
-        f"is {view['blur_y_px2']:.3f} and {view['blur_x_px2']:.3f} square pixels, its stray light "
+        f"<p>Against its homography the camera is moved by {view['shift_y_px']:z.3f} rows and "
+        f"{view['shift_x_px']:z.3f} columns of the panel and turned by {view['rotation_mrad']:z.3f} mrad; its own blur "
+        f"is {view['blur_y_px2']:z.3f} and {view['blur_x_px2']:z.3f} square pixels, its stray light "
         f"{100 * view['stray']:.2f} % of the mean.</p>"
     )
 

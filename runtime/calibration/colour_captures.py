@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,18 +63,27 @@ class ColourCaptures:
     noise: Noise
 
 
-def colour_patterns(channel: str, base: ColourLightPath, seed: int) -> ColourPatterns:
-    """The patterns of one colour, solved through the light path as it was; `seed` says which random grains."""
-    path, shape = base.path, base.path.grid.shape
-    still = Estimate(Drift(), View(shape))
-    period = best_period(base, channel, still, sampler(still.view, path.grid, 1))
+def colour_patterns(bases: Mapping[str, ColourLightPath], seed: int) -> dict[str, ColourPatterns]:
+    """The patterns of each colour, solved through the light path as it was; `seed` says which random grains.
+
+    The grains are the same arrays for all colours, which saves their memory.
+    """
+    shape = next(iter(bases.values())).path.grid.shape
+    fitted = [grains(shape, size, seed + k) for k, size in enumerate(GRAINS)]
     kept = [grains(shape, size, seed + 1000 + k) for k, size in enumerate(HELD_OUT)]
-    return ColourPatterns(
-        solve(path, np.maximum(dot_pattern(shape, dot_spacing(shape)), 1e-3), SOLVING).gray,
-        [grating(shape, period, g) for g in swept(path)],
-        [grains(shape, size, seed + k) for k, size in enumerate(GRAINS)],
-        [*kept, proof_pattern(base, channel, Drift())],
-    )
+    dots = np.maximum(dot_pattern(shape, dot_spacing(shape)), 1e-3)
+    still = Estimate(Drift(), View(shape))
+    patterns = {}
+    for channel, base in bases.items():
+        path = base.path
+        period = best_period(base, channel, still, sampler(still.view, path.grid, 1))
+        patterns[channel] = ColourPatterns(
+            solve(path, dots, SOLVING).gray,
+            [grating(shape, period, g) for g in swept(path)],
+            fitted,
+            [*kept, proof_pattern(base, channel, Drift())],
+        )
+    return patterns
 
 
 def proof_pattern(base: ColourLightPath, channel: str, drift: Drift) -> np.ndarray:

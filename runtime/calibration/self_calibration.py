@@ -169,7 +169,7 @@ def calibrate(
     approximator = approximator_of(bundle, (len(channels), *shape))
     settling = settling_periods(slow_response_share(bundle))
     say(0.0, "solving what is to be shown")
-    patterns = {c: colour_patterns(c, bases[c], seed) for c in channels}
+    patterns = colour_patterns(bases, seed)
     started = time.perf_counter()
     gratings = sum(len(swept(base.path)) for base in bases.values())
     many = len(channels) * (len(GRAINS) + len(HELD_OUT) + 8) + gratings + 2

@@ -207,7 +207,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.campaigns.faults", description=__doc__)
     parser.add_argument("--count", type=int, default=10000, help="faults (default 10000)")
     parser.add_argument("--seed", type=int, default=0, help="of the faults' kinds and order (default 0)")
-    parser.add_argument("--headsets", type=int, default=3, help="in parallel (default 3)")
+    most = min(3, os.cpu_count() or 1)  # where several share a core, they are hardly ever lit
+    parser.add_argument("--headsets", type=int, default=most, help=f"in parallel (default {most})")
     parser.add_argument("--table", type=Path, help="also write the table by kind, Markdown, to this file")
     parser.add_argument(
         "--json", action="store_true", help="print one JSON object on stdout and nothing else"

@@ -47,9 +47,7 @@ def refitted(rough_rms_rad: float) -> tuple[DriftFit, float]:
     taker = Taker(devices(VirtualHeadset(bench, 1)), lambda what: None)
     bases = {"green": base(SHAPE)}
     black, floor = taker.darkness()
-    captures = {
-        "green": colour_captures(taker, "green", colour_patterns("green", bases["green"], 0), black, floor)
-    }
+    captures = {"green": colour_captures(taker, "green", colour_patterns(bases, 0)["green"], black, floor)}
     view, new = start_view(captures["green"], None, SHAPE, SHAPE)
     found, _ = refit(bases, captures, view, new, no_progress)
     hidden = panel_path_nm(bench.defects[0], *SHAPE, SHAPE[1] / SHAPE[0])  # type: ignore[arg-type]
