@@ -44,6 +44,7 @@ from trainer.model.model import Model
 
 FIRST, MOST = 4, 13
 COUNTS = (4, 6, 8, 10, 13)
+NOTHING = 1e-9  # scales: the rounding of an error that is zero
 OTHERS = ("zero_order", "laser_drift", "crosstalk")
 ALIKE = (
     {"spatial_coherence", "sensor_blur", "temporal_coherence"},
@@ -181,12 +182,15 @@ def wanted_model(captures: CaptureSet, hidden: list[str], known: Catalogue, pool
 
 
 def error_of(captures: CaptureSet, model: Model) -> float:
-    """Geometric mean of the standard errors of a model's numbers, in units of their scales."""
+    """Geometric mean of the standard errors of a model's numbers, in units of their scales.
+
+    Numbers that change nothing, such as the extent of a halo that is not there, have none.
+    """
     fitted = fit(model, model.names, load(captures, fit_rows(captures)))
     spread = np.sqrt(np.diag(fitted.covariance)[: len(fitted.keys)])
     scales = [model.instance(e).effect.parameter(p).scale for e, p, _ in fitted.keys]
     relative = spread / np.array(scales)
-    return float(np.exp(np.log(relative[relative > 0]).mean()))
+    return float(np.exp(np.log(relative[relative > NOTHING]).mean()))
 
 
 def sharpened(

@@ -18,10 +18,12 @@ from trainer.captures.acquire import acquire_from
 from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.further_captures import copy_captures, new_ids
+from trainer.captures.held_out import holds_out
 from trainer.captures.patterns import PATTERN_KINDS, pattern_of_kind
 from trainer.captures.possible_captures import PossibleCapture, possible_captures
 from trainer.cli import main
 from trainer.diagnosis.capture_choice import next_captures
+from trainer.diagnosis.diagnosis import diagnose
 from trainer.diagnosis.doubts import Doubts, Rival, doubts_of, fit_rows
 from trainer.diagnosis.expected_information import (
     ExpectedInformation,
@@ -113,7 +115,8 @@ def test_what_can_be_captured_has_all_planes_and_exposures_and_nothing_that_was_
     assert {one.kind for one in found} == set(PATTERN_KINDS)
     usual = captures.captures[0].exposure_ms
     assert all(one.exposures_ms[one.usual] == usual for one in found)
-    assert all(np.allclose(one.exposures_ms, [usual / 4, usual, 4 * usual], rtol=1e-3) for one in found)
+    times = np.array([0.25, 0.5, 1, 2, 4, 8])
+    assert all(np.allclose(one.exposures_ms, usual * times, rtol=1e-3) for one in found)
     there = {captures.gray(c).tobytes() for c in captures.captures}
     assert not there & {one.gray.tobytes() for one in found if one.plane_mm == 8.0}
     assert len({(one.plane_mm, one.gray.tobytes()) for one in found}) == len(found)
@@ -205,7 +208,10 @@ def test_without_rivals_the_captures_sharpen_the_numbers(
     with open_pool(1) as pool:
         found = next_captures(captures, alone, possible_captures(captures, [8.0], 2), 2, pool)
     assert all("sharpens spatial_coherence" in one.why or "extent" in one.why for one in found.chosen)
-    assert found.chosen[0].expected_gain > found.chosen[1].expected_gain > 0
+    judge, better = found.chosen
+    assert holds_out(len({c.pattern for c in captures.captures}))
+    assert "to judge by" in judge.why and "to judge by" not in better.why
+    assert better.expected_gain > judge.expected_gain > 0
     assert 0 < found.parameter_excess < 2e-4
 
 
@@ -217,6 +223,13 @@ def test_an_effect_that_is_in_the_model_is_doubted_too(captures: CaptureSet) -> 
         assert found.diagnosis.verdict == "complete"
         assert [(r.of, r.name) for r in found.rivals] == [(name, other)]
         assert found.model.names == (name,)
+
+
+def test_a_model_that_has_every_effect_there_is_gets_its_verdict(captures: CaptureSet) -> None:
+    model = fitted(captures, "spatial_coherence")
+    with open_pool(1) as pool:
+        found = diagnose(captures, model, {"spatial_coherence": KNOWN["spatial_coherence"]}, pool)
+    assert found.verdict == "complete" and found.ranking == ()
 
 
 def test_a_distance_at_one_plane_may_be_a_wavelength(tmp_path: Path) -> None:

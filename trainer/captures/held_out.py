@@ -58,11 +58,16 @@ def split(captures: CaptureSet) -> CaptureSplit:
     for channel, plane in scenes(used):
         rows = [c for c in used if (c.channel, c.plane_mm) == (channel, plane)]
         patterns = list(dict.fromkeys(c.pattern for c in rows))
-        out = set(patterns[1::3])
+        out = {p for k, p in enumerate(patterns) if holds_out(k)}
         for c in rows:
             (held if c.pattern in out else fitted).append(c)
     is_held_out = bool(held)
     return CaptureSplit(tuple(fitted), tuple(held or fitted[-1:]), is_held_out, left_out)
+
+
+def holds_out(place: int) -> bool:
+    """Whether the pattern at this place among those of its colour and plane, from 0 on, is held out."""
+    return place % 3 == 1
 
 
 def scenes(captures: Iterable[Capture]) -> list[tuple[str, float]]:

@@ -15,7 +15,7 @@ from trainer.captures.capture_set import CaptureSet
 from trainer.captures.capture_table import Capture
 from trainer.captures.patterns import PATTERN_KINDS, Gray, pattern_of_kind
 
-EXPOSURES = (0.25, 1.0, 4.0)  # of what is usual for the colour
+EXPOSURES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # of what is usual for the colour
 TURNS = 2  # patterns of each kind in each colour and plane, at least
 MANY_SCENES = 4  # colours and planes from which on one of each kind is enough
 PICTURE = "smooth_picture"  # whose computation says whether a plane is in reach

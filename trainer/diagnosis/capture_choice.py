@@ -13,6 +13,7 @@ import numpy as np
 from firmware_iface.errors import InputError
 from runtime.program.progress import Progress, no_progress
 from trainer.captures.capture_set import CaptureSet
+from trainer.captures.held_out import holds_out
 from trainer.captures.patterns import Gray
 from trainer.captures.possible_captures import PossibleCapture
 from trainer.diagnosis.doubts import Doubts
@@ -28,7 +29,7 @@ from trainer.fitting.pool import Pool
 from trainer.formatting import number
 
 Scene = tuple[str, float]
-JUDGED = 2  # patterns of a colour and plane from which on one of them is held out
+NEVER = 1e3  # captures: the price where the last one would be held out
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class NextCapture:
     why : str
         What it says, in words.
     expected_gain : float, nats
-        Information that it adds to the captures before it.
+        Information that it adds to the captures that were chosen before it, or would add if it were fitted, too.
     """
 
     channel: str
@@ -87,7 +88,7 @@ class NextCaptures:
     Attributes
     ----------
     chosen : tuple of NextCapture
-        Best first, each given those before it.
+        In the order in which they are to be taken, which decides which are held out.
     parameter_excess : float
         Excess that the errors of the model's numbers may make in a picture, in the worst of all possible captures
         with the usual exposure in the colours of the set.
@@ -118,8 +119,9 @@ def next_captures(
     """Choose captures by the information that they are expected to add.
 
     Of the information on the model's numbers half the logarithm of the determinant counts (D-optimality), of that on
-    each rival's share half its logarithm. A colour and plane that has a single pattern gets a second one next,
-    because the first is fitted, and without a second nothing judges there.
+    each rival's share half its logarithm. Captures that will be held out say nothing to the fits, so they are chosen to
+    be the lesser ones, and count as a price. A new colour and plane gets two patterns: the first is fitted, and without
+    a second nothing judges there.
 
     Parameters
     ----------
@@ -225,26 +227,55 @@ def _greedy(
     left = [k for k, one in enumerate(predicted) if one]
     found: list[NextCapture] = []
     patterns = dict(patterns)
-    last: Scene | None = None
-    while left and len(found) < count:
-        unjudged = [k for k in left if possible[k].scene == last and patterns.get(last, 0) < JUDGED]
+
+    def best(keys: Sequence[int], rest: int) -> tuple[int, int]:
+        """The capture, and its exposure, that says most for its price."""
         options = [
-            (state.gain(one), k, e)
-            for k in unjudged or left
+            (state.gain(one) / _price(patterns.get(possible[k].scene, 0), rest), k, e)
+            for k in keys
             for e, one in enumerate(predicted[k])
             if one.saturated <= MOST_SATURATED or e == 0
         ]
-        gain, k, e = max(options)
+        return max(options)[1:]
+
+    def capture(k: int, e: int, judges: bool) -> NextCapture:
         one, information = possible[k], predicted[k][e]
-        why = state.why(information) + ("; a second pattern there, to judge by" if unjudged else "")
-        found.append(
-            NextCapture(one.channel, one.plane_mm, one.kind, one.gray, one.exposures_ms[e], why, float(gain))
-        )
-        state.add(information)
-        last = one.scene
-        patterns[last] = patterns.get(last, 0) + 1
+        why = state.why(information) + ("; a second pattern there, to judge by" if judges else "")
+        gain = float(state.gain(information))
+        return NextCapture(one.channel, one.plane_mm, one.kind, one.gray, one.exposures_ms[e], why, gain)
+
+    while left and len(found) < count:
+        rest = count - len(found)
+        k, e = best(left, rest)
         left.remove(k)
+        scene = possible[k].scene
+        place = patterns.get(scene, 0)
+        pair = [capture(k, e, holds_out(place) and rest == 1)]
+        state.add(predicted[k][e])
+        others = [j for j in left if possible[j].scene == scene]
+        if rest > 1 and others and _price(place, rest) == 2:
+            j, f = best(others, rest)
+            left.remove(j)
+            # The better one goes where it is fitted.
+            pair.insert(0 if holds_out(place) else 1, capture(j, f, True))
+        found += pair
+        patterns[scene] = place + len(pair)
     return found
+
+
+def _price(place: int, rest: int) -> float:
+    """How many captures it takes to have one more fitted in a colour and plane that has `place` patterns.
+
+    Parameters
+    ----------
+    rest : int
+        How many can be taken.
+    """
+    if place == 0:
+        return 2  # the second is held out, and nothing judges there without it
+    if not holds_out(place):
+        return 1
+    return 2 if rest > 1 else NEVER
 
 
 def _parameter_excess(

@@ -62,6 +62,8 @@ def fitted_ranking(
     (list of RankedEffect, list of CandidateFit)
         The ranking, best first, and every fit that was made.
     """
+    if not order:  # the model has every effect that there is
+        return [], []
     complete = thresholds.complete(before.excess, ideal_excess)
 
     def raised(fits: Sequence[CandidateFit]) -> list[CandidateFit]:
