@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from runtime.lightpath.legendre import legendre_count
+from runtime.program.plain_values import plain
 from tests.trainer.hidden import bench_file
 from trainer.captures.acquire import acquire_from
 from trainer.captures.batches import Batch, load
@@ -17,6 +18,7 @@ from trainer.effects.testing import captures_with
 from trainer.fitting.gauss_newton import fit
 from trainer.fitting.refit import least_for_order, raise_orders
 from trainer.model.model import EffectInstance, Model, absent, instance_with
+from trainer.model.parameters import describe, json_values
 
 KNOWN = catalogue()
 LEAK = ("leak_real", "leak_imaginary")
@@ -107,3 +109,16 @@ def test_a_value_stays_in_its_physical_range(tmp_path: Path) -> None:
     captures = captures_with(tmp_path, effect, {"fill_factor": 1.0}, patterns=3)
     found = fitted(captures, instance_with(effect, captures.bench, {"fill_factor": 0.99}))
     assert 0.99 < float(found.values["fill_factor"]) <= 1.0
+
+
+def test_a_value_that_changes_nothing_has_no_error_instead_of_none_at_all(tmp_path: Path) -> None:
+    """Where a ghost that is not there would lie: an error of zero would say that it is known exactly."""
+    effect = KNOWN["ghost"]
+    captures = captures_with(tmp_path, effect, {"amplitude": 0.0}, patterns=3)
+    model = Model(captures.bench).having(instance_with(effect, captures.bench, {"shift_y": 3.0}))
+    found = fit(model, ["ghost"], batches_of(captures), fixed={("ghost", "amplitude")}).model.present[0]
+    assert found.errors is not None
+    assert np.isnan(found.errors["shift_y"]) and np.isnan(found.errors["shift_x"])
+    said = json_values(found, captures.bench)
+    assert plain(said)["shift_y_px"]["error"] is None
+    assert "±" not in describe(found, captures.bench)

@@ -31,6 +31,7 @@ from trainer.diagnosis.expected_information import (
     information_of_possible,
     prior,
 )
+from trainer.diagnosis.explanation import explain
 from trainer.effects.effect_catalogue import catalogue
 from trainer.effects.testing import small_bench
 from trainer.fitting.gauss_newton import fit
@@ -223,6 +224,17 @@ def test_an_effect_that_is_in_the_model_is_doubted_too(captures: CaptureSet) -> 
         assert found.diagnosis.verdict == "complete"
         assert [(r.of, r.name) for r in found.rivals] == [(name, other)]
         assert found.model.names == (name,)
+
+
+def test_a_part_of_a_set_is_explained_as_if_it_were_the_whole(captures: CaptureSet, tmp_path: Path) -> None:
+    part = replace(captures, captures=captures.captures[:-1])
+    (tmp_path / "copy").mkdir()
+    copy = copy_captures(part, tmp_path / "copy")
+    known = {n: KNOWN[n] for n in FEW}
+    with open_pool(1) as pool:
+        one, other = (explain(c, Model(c.bench), known, pool) for c in (part, copy))
+    assert [s.as_json() for s in one.steps] == [s.as_json() for s in other.steps]
+    assert len(one.model.names) == 1
 
 
 def test_a_model_that_has_every_effect_there_is_gets_its_verdict(captures: CaptureSet) -> None:

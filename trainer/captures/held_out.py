@@ -166,6 +166,11 @@ class CaptureRoles:
         """Folder of the capture set."""
         return self.captures.folder
 
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Ids of all captures of the set, which may be a part of those in its folder."""
+        return tuple(c.capture for c in self.captures.captures)
+
 
 def capture_roles(captures: CaptureSet) -> CaptureRoles:
     """Choose captures for fits, the screen, the probes and the judgement.

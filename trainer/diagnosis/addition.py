@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from runtime.excess import PredictionErrors, removed_excess
 from runtime.program.progress import Progress, no_progress
 from trainer.captures.batches import load
-from trainer.captures.capture_set import CaptureSet, opened
+from trainer.captures.capture_set import CaptureSet, chosen, opened
 from trainer.captures.capture_table import Capture
 from trainer.captures.held_out import FIT_CAPTURES, CaptureRoles, capture_roles, scenes, split, with_stopping
 from trainer.diagnosis.screen import ScreenResult, screen_batches
@@ -106,10 +106,11 @@ def add_from(roles: CaptureRoles, model: Model, start: EffectInstance) -> Model:
 
 
 def with_everything_refitted(
-    folder: Path, base: Model, start: EffectInstance
+    folder: Path, ids: tuple[str, ...], base: Model, start: EffectInstance
 ) -> tuple[Model, PredictionErrors]:
-    """`add_from` on a capture set's folder, and the model's held-out errors: a task for any process."""
-    roles = capture_roles(opened(folder))
+    """`add_from` on captures of a folder, and the model's held-out errors: a task for any process."""
+    captures = opened(folder)
+    roles = capture_roles(replace(captures, captures=tuple(chosen(captures, ids))))
     model = add_from(roles, base, start)
     return model, evaluate_captures(roles.captures, roles.held_out, model)
 

@@ -139,7 +139,7 @@ def _black_level(model: Model, planes: tuple[float, ...]) -> EqualFacts:
 def _relative_error(model: Model, name: str, stated: float) -> float:
     """Standard error of a fitted offset as a share of what is stated; the largest of several, 0 without errors."""
     errors = model.instance(name).errors
-    return 0.0 if errors is None else float(np.max(errors["offset"])) / abs(stated)
+    return 0.0 if errors is None else float(np.nanmax(errors["offset"], initial=0.0)) / abs(stated)
 
 
 def _wavelengths(bench: Bench, captures: CaptureSet, ratio: float, error: float) -> list[EqualFact]:

@@ -58,7 +58,7 @@ def exchanged(
         try_together_on_few, [(roles.folder, ids, model.without(old), fitted) for old, _, fitted in pairs]
     )
     pairs = [pair for pair, excess in zip(pairs, on_few, strict=True) if excess < CLEARLY * left]
-    tasks = [(roles.folder, model.without(old), fitted) for old, _, fitted in pairs]
+    tasks = [(roles.folder, roles.ids, model.without(old), fitted) for old, _, fitted in pairs]
     found = list(zip(pairs, pool.map_here_if_one(with_everything_refitted, tasks), strict=True))
     if not found:
         return None

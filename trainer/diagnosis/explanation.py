@@ -269,7 +269,7 @@ def _added(roles: CaptureRoles, found: Diagnosis, pool: Pool) -> tuple[RankedEff
     """
     rival = _rival(found) if found.model.present else None
     ones = [one for one in (found.ranking[0], rival) if one is not None]
-    tasks = [(roles.folder, one.base, one.model.instance(one.effect.name)) for one in ones]
+    tasks = [(roles.folder, roles.ids, one.base, one.model.instance(one.effect.name)) for one in ones]
     fitted = pool.map_here_if_one(with_everything_refitted, tasks)
     if len(ones) > 1 and removed_excess(fitted[0][1], fitted[1][1]).interval()[0] > 0:
         return ones[1], *fitted[1]

@@ -31,6 +31,7 @@ from trainer.fitting.predictor import Predictor, lights_of
 from trainer.model.model import Model, Values
 
 HOLD = 0.01  # `hold` of fits far from the truth
+NO_CHANGE = 1e-5  # of the signal's rms: where a number's scale changes less, captures do not determine it
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,8 @@ def fit(
     """Fit the named effects of a model, and the gains, to batches.
 
     Stops after `iterations`, or when a step lowers the excess by less than `tolerance` of it and less than 2e-6.
-    Errors of values are standard errors from the residuals themselves (a sandwich estimate), so misfit widens them.
+    Errors of values are standard errors from the residuals themselves (a sandwich estimate), so misfit widens them; NaN
+    where the captures do not determine a value.
 
     Parameters
     ----------
@@ -103,7 +105,7 @@ def _fit(
     predictors = [Predictor(model, b) for b in batches]
     keys = tuple(key for key in keys_of(model, free) if key[:2] not in fixed)
     ranges = _typical_ranges(model, keys)
-    scale = float(joined([b.errors(torch.zeros_like(b.signal)) for b in batches]).variance.sum())
+    scale = _signal(batches)
     first = min((model.instance(n).effect.stage for n in free), key=STAGES.index, default="sensor")
     points = [p.trace(model) for p in predictors]
     if not model.gain or any(b.channel not in model.gain for b in batches):
@@ -149,7 +151,8 @@ def _fit(
     model = with_measured_values(model, free, batches)
     inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
     covariance = inverse @ scatter @ inverse
-    return FitResult(_with_errors(model, keys, covariance), errors, covariance, keys)
+    spread = _spread(model, keys, covariance, normal, scale)
+    return FitResult(_with_errors(model, keys, spread), errors, covariance, keys)
 
 
 def _fit_many(
@@ -171,6 +174,7 @@ def _fit_many(
         model = with_gain(model, predictors, lights_of(model, predictors, points))
     channels = list(dict.fromkeys(b.channel for b in batches))
     residuals, errors = weighted_residuals(model, predictors, points)
+    scale = _signal(batches)
     for iteration in range(iterations):
         if progress:
             progress(iteration / iterations)
@@ -196,17 +200,19 @@ def _fit_many(
             break
     table = slopes_of(model, keys, channels, predictors, points)
     slopes = ManySlopes(model, many, predictors, points, table)
-    spread = slopes.errors(residuals)
+    spread_of_many = slopes.errors(residuals)
     model = with_measured_values(model, free, batches)
-    inverse = np.linalg.pinv(_normal(table), rcond=1e-12, hermitian=True)
+    normal = _normal(table)
+    inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
     covariance = inverse @ _scatter(table, residuals) @ inverse
     every = (*keys, *keys_of(model, many))
     whole = np.zeros((len(every) + len(channels),) * 2)
     places = [*range(len(keys)), *range(len(every), len(whole))]
     whole[np.ix_(places, places)] = covariance
     inner = np.arange(len(keys), len(every))
-    whole[inner, inner] = spread**2
-    return FitResult(_with_errors(model, every, whole), errors, whole, every)
+    whole[inner, inner] = spread_of_many**2
+    spread = np.concatenate([_spread(model, keys, covariance, normal, scale), spread_of_many])
+    return FitResult(_with_errors(model, every, spread), errors, whole, every)
 
 
 @torch.no_grad()
@@ -271,8 +277,26 @@ def _moved(
     return replace(model, gain=gain)
 
 
-def _with_errors(model: Model, keys: tuple[tuple[str, str, int], ...], covariance: np.ndarray) -> Model:
-    spread = np.sqrt(np.maximum(np.diag(covariance), 0))
+def _signal(batches: Sequence[Batch]) -> float:
+    """Sum of squares of the signal about its mean, counts squared."""
+    return float(joined([b.errors(torch.zeros_like(b.signal)) for b in batches]).variance.sum())
+
+
+def _spread(
+    model: Model,
+    keys: tuple[tuple[str, str, int], ...],
+    covariance: np.ndarray,
+    normal: np.ndarray,
+    signal: float,
+) -> np.ndarray:
+    """Standard errors of the numbers; NaN for one that the captures do not determine, as it changes nothing in them."""
+    scales = np.array([model.instance(e).effect.parameter(p).scale for e, p, _ in keys])
+    count = len(keys)
+    spread = np.sqrt(np.maximum(np.diag(covariance)[:count], 0))
+    return np.where(np.diag(normal)[:count] * scales**2 > NO_CHANGE**2 * signal, spread, np.nan)
+
+
+def _with_errors(model: Model, keys: tuple[tuple[str, str, int], ...], spread: np.ndarray) -> Model:
     for name in dict.fromkeys(k[0] for k in keys):
         present = model.instance(name)
         moved = [p.name for p in present.effect.parameters if not p.per_pixel]

@@ -13,7 +13,10 @@ from trainer.model.model import EffectInstance
 
 
 def json_values(present: EffectInstance, bench: Bench) -> dict[str, dict[str, Any]]:
-    """{name with unit: {"value", "error", "unit"}}; per-channel values by channel name, maps of pixels left out."""
+    """{name with unit: {"value", "error", "unit"}}; per-channel values by channel name, maps of pixels left out.
+
+    An error is None before a fit, and NaN where the captures do not determine the value.
+    """
     result = {}
     for p in present.effect.parameters:
         if p.per_pixel:
@@ -31,6 +34,12 @@ def _plain(parameter: Parameter, values: np.ndarray, bench: Bench) -> Any:
     if parameter.per_channel:
         return {c.name: values[k].tolist() for k, c in enumerate(bench.channels)}
     return values.tolist()
+
+
+def _rms(errors: np.ndarray) -> float:
+    """Root mean square of the errors of those values that have one; NaN where none has."""
+    known = errors[np.isfinite(errors)]
+    return float(np.sqrt((known**2).mean())) if known.size else float("nan")
 
 
 def describe(present: EffectInstance, bench: Bench) -> str:
@@ -52,7 +61,7 @@ def describe(present: EffectInstance, bench: Bench) -> str:
                 name = f"{label} " if len(bench.channels) == 1 else f"{label} ({channel.name}) "
                 words.append(f"{name}{measured(float(values[k]), float(errors[k]), p.unit)}")
         else:
-            size, error = float(np.sqrt((away**2).sum())), float(np.sqrt((errors**2).mean()))
+            size, error = float(np.sqrt((away**2).sum())), _rms(errors)
             words.append(f"{label} {measured(size, error, p.unit)} in {values.size} terms")
     if present.nodes is not None and present.effect.free_form is not None:
         form, (rows, columns) = present.effect.free_form, present.nodes.shape
