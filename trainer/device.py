@@ -10,6 +10,8 @@ in `runtime.lightpath`, makes new arrays on the device of those that it is given
 from __future__ import annotations
 
 import os
+import threading
+from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache, wraps
@@ -86,6 +88,38 @@ def kept_by_device(most: int) -> Callable[[F], F]:
         @wraps(function)
         def here(*args: Hashable) -> Any:
             return made(torch.get_default_device(), *args)
+
+        return cast(F, here)
+
+    return kept
+
+
+def kept_for_same(most: int) -> Callable[[F], F]:
+    """Keep the last results of a function that makes tensors from objects that never change.
+
+    The arguments are compared by identity, as objects that hold arrays have no quick equality. The result is kept for
+    its device; with derivatives nothing is kept, as that would keep what the backward pass needs.
+    """
+
+    def kept(function: F) -> F:
+        known: OrderedDict[tuple[Any, ...], tuple[Any, tuple[Any, ...]]] = OrderedDict()
+        lock = threading.Lock()
+
+        @wraps(function)
+        def here(*args: Any) -> Any:
+            if torch.is_grad_enabled():
+                return function(*args)
+            key = (torch.get_default_device(), *map(id, args))
+            with lock:
+                if key in known:
+                    known.move_to_end(key)
+                    return known[key][0]
+            result = function(*args)
+            with lock:
+                known[key] = result, args  # the arguments live on, so that no other object gets their ids
+                while len(known) > most:
+                    known.popitem(last=False)
+            return result
 
         return cast(F, here)
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from runtime.excess import PredictionErrors, joined
 from trainer.fitting.predictor import Predictor
+from trainer.fitting.side_by_side import side_by_side
 from trainer.model.model import Model
 from trainer.prediction.predict import Trace
 
@@ -75,12 +76,14 @@ def columns(
     """
     light = predictor.light(model, point)
     base = predictor.counts(model, light)
-    result = []
-    for key in keys:
+
+    def slope(key: tuple[str, str, int]) -> Tensor:
         step = column_step(model, key)
         stage = model.instance(key[0]).effect.stage
         moved = predictor.predict(stepped(model, key, step), stage, point)
-        result.append((moved - base) / step)
+        return (moved - base) / step
+
+    result = side_by_side(slope, keys, base[0].numel())
     louder = replace(model, gain={c: g * 1.01 for c, g in model.gain.items()})
     result.append((predictor.counts(louder, light) - base) / 0.01)
     return base, result

@@ -11,6 +11,7 @@ from runtime.excess import PredictionErrors, joined
 from trainer.captures.batches import Batch, load_batch
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.capture_table import Capture
+from trainer.fitting.side_by_side import side_by_side
 from trainer.model.model import Model
 from trainer.model.model_stages import scene_for, stages_of
 from trainer.prediction.predict import Trace, counts, light_on_camera, trace
@@ -48,12 +49,14 @@ class Predictor:
         if before is not None and start == "sensor":
             return before
         shared = None if model.in_time else self.stages(model)
-        parts = []
-        for k in range(self.batch.gray.shape[0]):
+
+        def part(k: int) -> Trace:
             stages = shared or self.stages(model, k)
             one = None if before is None else Trace(before.spectrum[k : k + 1], before.image[k : k + 1])
             gray, earlier = self.batch.gray[k : k + 1], self.earlier(stages, k)
-            parts.append(trace(self.scene, stages, gray, start, one, earlier))
+            return trace(self.scene, stages, gray, start, one, earlier)
+
+        parts = side_by_side(part, range(self.batch.gray.shape[0]), self.batch.gray[0].numel())
         return Trace(torch.cat([p.spectrum for p in parts]), torch.cat([p.image for p in parts]))
 
     def earlier(self, stages: Stages, k: int) -> Tensor | None:
@@ -90,13 +93,14 @@ def lights_of(model: Model, predictors: Sequence[Predictor], points: Sequence[Tr
 
 
 def evaluate_captures(captures: CaptureSet, rows: Sequence[Capture], model: Model) -> PredictionErrors:
-    """Errors of a model on captures, one in memory at a time."""
+    """Errors of a model on captures: of large ones, one in memory at a time."""
+
+    def errors(row: Capture) -> PredictionErrors:
+        batch = load_batch(captures, [row])
+        return batch.errors(Predictor(model, batch).predict(model))
+
     with torch.no_grad():
-        parts = []
-        for row in rows:
-            batch = load_batch(captures, [row])
-            parts.append(batch.errors(Predictor(model, batch).predict(model)))
-        return joined(parts)
+        return joined(side_by_side(errors, rows, captures.bench.panel.width * captures.bench.panel.height))
 
 
 @torch.no_grad()

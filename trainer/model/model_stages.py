@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +12,8 @@ import torch
 
 from trainer.captures.bench_file import Bench
 from trainer.captures.capture_table import Moment
+from trainer.device import kept_for_same
+from trainer.effects.definition import STAGES
 from trainer.effects.own_effect import applied
 from trainer.model.model import EffectInstance, Model
 from trainer.prediction.free_stages import with_learned
@@ -62,11 +65,26 @@ def stages_for(
         Where an effect of the user's own fails: with its file and line.
     """
     stages = bare_stages(scene)
+    made = {}
+    for name in STAGES:
+        ones = [p for p in present if p.effect.stage == name and (moment or not p.effect.takes_moment)]
+        if not ones:
+            continue
+        at = moment if any(one.effect.takes_moment for one in ones) else None
+        if tensors:
+            made[name] = _stage(scene, getattr(stages, name), ones, tensors, at)
+        else:
+            made[name] = KEPT_STAGES[name](scene, getattr(stages, name), at, *ones)
+    return replace(stages, **made) if made else stages
+
+
+def _stage(
+    scene: Scene, stage: Any, present: Sequence[EffectInstance], tensors: Any, moment: Moment | None
+) -> Any:
+    """One stage with its effects."""
     row = scene.channel_row()
     for one in present:
-        if one.effect.takes_moment and moment is None:
-            continue
-        given = (tensors or {}).get(one.effect.name, {})
+        given = tensors.get(one.effect.name, {})
         arguments: dict[str, Any] = {}
         for p in one.effect.parameters:
             value = given.get(p.name)
@@ -77,13 +95,22 @@ def stages_for(
             arguments["order"] = one.order
         if one.effect.takes_moment:
             arguments["moment"] = moment
-        name = one.effect.stage
-        stage = applied(one.effect, getattr(stages, name), arguments)
+        stage = applied(one.effect, stage, arguments)
         if one.nodes is not None and one.effect.free_form is not None:
             nodes = torch.as_tensor(one.nodes, dtype=scene.dtype)
             stage = one.effect.free_form.added(stage, nodes, row)
-        stages = replace(stages, **{name: stage})
-    return stages
+    return stage
+
+
+def _kept_stages() -> Callable[..., Any]:
+    @kept_for_same(2)  # a fit's model and its trial: they differ in one stage, and share the others
+    def made(scene: Scene, stage: Any, moment: Moment | None, *present: EffectInstance) -> Any:
+        return _stage(scene, stage, present, {}, moment)
+
+    return made
+
+
+KEPT_STAGES = {name: _kept_stages() for name in STAGES}
 
 
 def stages_of(scene: Scene, model: Model, tensors: Any = None, moment: Moment | None = None) -> Stages:

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from runtime.lightpath.propagation import band_limit, transfer_function
-from trainer.device import kept_by_device
+from trainer.device import kept_by_device, kept_for_same
 from trainer.prediction.scene import Scene, bare_stages
 from trainer.prediction.stages import Pupil
 
 
 def pupil_modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
-    """The pupil's modes; cached where no effect changes the pupil.
+    """The pupil's modes; kept where no effect changes the pupil, and for the last pupils.
 
     Returns
     -------
@@ -23,12 +23,17 @@ def pupil_modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
         Transfer functions.
     weights : Tensor [M]
     """
-    return _bare_modes(scene) if pupil is bare_stages(scene).pupil else _modes(scene, pupil)
+    return _bare_modes(scene) if pupil is bare_stages(scene).pupil else _last_modes(scene, pupil)
 
 
 @kept_by_device(16)
 def _bare_modes(scene: Scene) -> tuple[Tensor, Tensor]:
     return _modes(scene, bare_stages(scene).pupil)
+
+
+@kept_for_same(2)  # of a fit's model and of its trial
+def _last_modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
+    return _modes(scene, pupil)
 
 
 def _modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
