@@ -27,16 +27,17 @@ from trainer.diagnosis.diagnosis import diagnose
 from trainer.diagnosis.doubts import Doubts, Rival, doubts_of, fit_rows
 from trainer.diagnosis.expected_information import (
     ExpectedInformation,
+    covariance,
     information_of_captures,
     information_of_possible,
     prior,
 )
 from trainer.diagnosis.explanation import explain
 from trainer.effects.effect_catalogue import catalogue
-from trainer.effects.testing import small_bench
+from trainer.effects.testing import captures_with, small_bench
 from trainer.fitting.gauss_newton import fit
 from trainer.fitting.pool import open_pool
-from trainer.model.model import Model, absent
+from trainer.model.model import Model, absent, instance_with
 
 KNOWN = catalogue()
 FEW = ("spatial_coherence", "sensor_blur", "zero_order", "crosstalk")
@@ -126,30 +127,37 @@ def test_what_can_be_captured_has_all_planes_and_exposures_and_nothing_that_was_
     assert len(possible_captures(captures, [8.0], 40)) >= 40
 
 
-def test_the_information_is_that_of_the_fit(captures: CaptureSet) -> None:
-    """Errors from the expected information are those that the fit finds from its residuals."""
-    model = fitted(captures, "spatial_coherence")
+def test_the_errors_that_are_expected_are_those_of_the_fit(tmp_path: Path) -> None:
+    """On pictures with shot noise, which a fit of squared counts does not weigh by its size."""
+    effect = KNOWN["zero_order"]
+    truth = {"leak_real": 0.06, "leak_imaginary": -0.03, "fill_factor": 0.95}
+    captures = captures_with(tmp_path / "captures", effect, truth)
     rows = fit_rows(captures)
+    start = Model(captures.bench).having(instance_with(effect, captures.bench, truth))
+    found = fit(start, [effect.name], load(captures, rows))
     ids = tuple(c.capture for c in rows)
-    numbers = prior(model) + sum(
-        one.numbers for one in information_of_captures(captures.folder, ids, model, (), 0.0)
+    what = information_of_captures(captures.folder, ids, found.model, (), 0.0)
+    normal, scatter = (
+        prior(found.model) + sum(m) for m in zip(*((w.normal, w.scatter) for w in what), strict=True)
     )
-    expected = np.sqrt(np.diag(np.linalg.inv(numbers)))
-    effect = model.instance("spatial_coherence")
-    assert effect.errors is not None
-    for place, name in enumerate(("extent_y", "extent_x")):
-        scale = effect.effect.parameter(name).scale
-        assert 0.4 < expected[place] * scale / float(effect.errors[name]) < 1.5
+    scales = [effect.parameter(p).scale for _, p, _ in found.keys]
+    expected = np.sqrt(np.diag(covariance(normal, scatter)))[: len(scales)] * scales
+    assert expected == pytest.approx(np.sqrt(np.diag(found.covariance))[: len(scales)], rel=0.05)
+
+
+def precision(one: ExpectedInformation) -> float:
+    """One over the variance of the first number, if the others are known."""
+    return float(one.normal[0, 0] ** 2 / one.scatter[0, 0]) if one.scatter[0, 0] else 0.0
 
 
 def test_more_light_says_more_and_saturated_pixels_say_nothing(captures: CaptureSet) -> None:
     model = fitted(captures, "spatial_coherence")
     usual = captures.captures[0].exposure_ms
     dark, light, blind = said(captures, shown(captures, exposures=(usual / 4, usual, 1e6)), model)
-    assert 3 < light.numbers[0, 0] / dark.numbers[0, 0] < 20
+    assert 3 < precision(light) / precision(dark) < 20
     assert dark.saturated <= light.saturated < 0.05
     assert blind.saturated > 0.99
-    assert np.abs(blind.numbers).max() < 1e-3 * light.numbers[0, 0]
+    assert precision(blind) < 1e-3 * precision(light)
 
 
 def test_a_rival_that_other_numbers_imitate_cannot_be_told(captures: CaptureSet) -> None:

@@ -20,6 +20,7 @@ from trainer.diagnosis.doubts import Doubts
 from trainer.diagnosis.expected_information import (
     MOST_SATURATED,
     ExpectedInformation,
+    covariance,
     information_of_captures,
     information_of_possible,
     prior,
@@ -118,10 +119,10 @@ def next_captures(
 ) -> NextCaptures:
     """Choose captures by the information that they are expected to add.
 
-    Of the information on the model's numbers half the logarithm of the determinant counts (D-optimality), of that on
-    each rival's share half its logarithm. Captures that will be held out say nothing to the fits, so they are chosen to
-    be the lesser ones, and count as a price. A new colour and plane gets two patterns: the first is fitted, and without
-    a second nothing judges there.
+    Of the covariance of the model's numbers minus half the logarithm of the determinant counts (D-optimality), of the
+    information on each rival's share half its logarithm. Captures that will be held out say nothing to the fits, so
+    they are chosen to be the lesser ones, and count as a price. A new colour and plane gets two patterns: the first is
+    fitted, and without a second nothing judges there.
 
     Parameters
     ----------
@@ -160,10 +161,11 @@ def next_captures(
 
 @dataclass
 class _Information:
-    """Information gathered so far: of the model's numbers, and of each rival's numbers and share."""
+    """What the captures so far say: of the model's numbers, and of each rival's numbers and share."""
 
     doubts: Doubts
-    numbers: np.ndarray
+    normal: np.ndarray
+    scatter: np.ndarray
     rivals: list[np.ndarray]
 
     @classmethod
@@ -174,18 +176,21 @@ class _Information:
             first = prior(rival.model)
             rivals.append(np.pad(first, (0, 1)))
             rivals[-1][-1, -1] = 1.0  # the share is somewhere from 0 to 1
-        state = cls(doubts, prior(doubts.model), rivals)
+        first = prior(doubts.model)
+        state = cls(doubts, first, first, rivals)
         for one in there:
             state.add(one)
         return state
 
     def add(self, one: ExpectedInformation) -> None:
-        self.numbers = self.numbers + one.numbers
+        self.normal = self.normal + one.normal
+        self.scatter = self.scatter + one.scatter
         self.rivals = [a + b for a, b in zip(self.rivals, one.rivals, strict=True)]
 
     def gains(self, one: ExpectedInformation) -> tuple[float, list[float]]:
         """Nats that a capture adds: on the numbers, and on each rival's share."""
-        numbers = 0.5 * (_log_det(self.numbers + one.numbers) - _log_det(self.numbers))
+        more = _log_det(self.normal + one.normal) - _log_det(self.normal)
+        numbers = more - 0.5 * (_log_det(self.scatter + one.scatter) - _log_det(self.scatter))
         shares = [
             0.5 * math.log(_of_share(a + b) / _of_share(a))
             for a, b in zip(self.rivals, one.rivals, strict=True)
@@ -207,8 +212,10 @@ class _Information:
         keys = keys_of(self.doubts.model, self.doubts.model.names)
         if not keys:
             return "sharpens the brightness of the model"
-        before = np.sqrt(np.diag(np.linalg.inv(self.numbers)))[: len(keys)]
-        after = np.sqrt(np.diag(np.linalg.inv(self.numbers + one.numbers)))[: len(keys)]
+        then = covariance(self.normal + one.normal, self.scatter + one.scatter)
+        before, after = (
+            np.sqrt(np.diag(c))[: len(keys)] for c in (covariance(self.normal, self.scatter), then)
+        )
         k = int(np.argmin(after / before))
         effect, name, _ = keys[k]
         parameter = self.doubts.model.instance(effect).effect.parameter(name)
@@ -285,9 +292,9 @@ def _parameter_excess(
     predicted: Sequence[Sequence[ExpectedInformation]],
 ) -> float:
     """Excess that the errors of the numbers may make in a picture, at worst."""
-    covariance = np.linalg.inv(state.numbers)
+    spread = covariance(state.normal, state.scatter)
     excess = [
-        float((covariance * one[p.usual].excess).sum())
+        float((spread * one[p.usual].excess).sum())
         for p, one in zip(possible, predicted, strict=True)
         if one and p.channel in captures.channels
     ]

@@ -1,9 +1,12 @@
-"""What a capture would say: Fisher information of a model's numbers, and of what tells it from its rivals.
+"""What a capture would say: of a model's numbers, and of what tells it from its rivals.
 
-For a capture with predicted counts y, noise of variance v in each pixel and slopes J, the information of the numbers
-is J' V^-1 J. A rival's prediction differs from the model's by d. The information on the share t of the rival in
-model + t d, with the rival's own numbers left free, is what the captures say of the choice between the two: a rival
-that could imitate the model by other numbers gains nothing. Information of several captures adds up.
+For a capture with predicted counts y, noise of variance v in each pixel and slopes J, a fit of squared counts gives the
+numbers the covariance (J'J)^-1 J'VJ (J'J)^-1: noisy pixels weigh as much as others, so a longer exposure is not always
+better. J'J and J'VJ of several captures add up.
+
+A rival's prediction differs from the model's by d. The information on the share t of the rival in model + t d,
+J' V^-1 J with the rival's own numbers left free, is what the captures say of the choice between the two: a rival that
+could imitate the model by other numbers gains nothing. It adds up, too.
 
 References
 ----------
@@ -50,10 +53,11 @@ class ExpectedInformation:
 
     Attributes
     ----------
-    numbers : array [n, n]
-        Information of the model's numbers in units of their scales, then of the logarithms of the gains.
+    normal, scatter : array [n, n]
+        J'J and J'VJ of the model's numbers in units of their scales, then of the logarithms of the gains; counts in
+        units of the noise at half of full scale.
     rivals : tuple of arrays [m, m]
-        For each rival: the same for the rival's numbers and the gains, and last its share t.
+        For each rival: the information on the rival's numbers and the gains, and last on its share t.
     difference : tuple of float
         For each rival: squared difference of the predictions, gain left free, over the variance of the signal.
     excess : array [n, n]
@@ -62,11 +66,18 @@ class ExpectedInformation:
         Share of the pixels.
     """
 
-    numbers: Array
+    normal: Array
+    scatter: Array
     rivals: tuple[Array, ...]
     difference: tuple[float, ...]
     excess: Array
     saturated: float
+
+
+def covariance(normal: Array, scatter: Array) -> Array:
+    """Of the numbers that a fit of squared counts finds."""
+    inverse = np.linalg.inv(normal)
+    return np.asarray(inverse @ scatter @ inverse)
 
 
 def prior(model: Model) -> Array:
@@ -145,6 +156,8 @@ def _information(
     model = with_all_gains(model, batch.channel)
     base, slopes = _slopes(model, batch)
     others = [_slopes(with_all_gains(r, batch.channel), batch) for r in rivals]
+    camera = model.bench.camera
+    unit = float(noise_variance(np.array(camera.full_scale / 2), camera))
     size = batch.mask[0].numel()
     which = np.random.default_rng(0).permutation(size)[:PIXELS]
     share = len(which) / size
@@ -168,7 +181,8 @@ def _information(
             difference.append(left / max(variance, 1e-30))
         found.append(
             ExpectedInformation(
-                _normal(rows, weight),
+                _normal(rows, mask / unit / share),
+                _normal(rows, mask * noise / unit**2 / share),
                 tuple(pairs),
                 tuple(difference),
                 _normal(rows, mask) / max(variance, 1e-30),
