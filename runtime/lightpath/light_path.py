@@ -176,10 +176,11 @@ def mode_irradiance(path: LightPath, spectrum: Array) -> Array:
 
 def sum_modes(path: LightPath, fields: Iterable[Array]) -> Array:
     """Sum of weighted |z|^2 over the modes' fields on the fine image grid."""
-    total = 0
+    total = None
     for mode, z in enumerate(fields):
         xp = array_namespace(z)
-        total = total + path.weights[mode] * (xp.real(z) ** 2 + xp.imag(z) ** 2)
+        light = path.weights[mode] * (xp.real(z) ** 2 + xp.imag(z) ** 2)
+        total = light if total is None else total + light
     return total
 
 

@@ -258,10 +258,26 @@ def flattened(image: np.ndarray, valid: np.ndarray) -> np.ndarray:
     amplitude = np.sqrt(np.maximum(image, 0)).astype(np.float32)
     amplitude = gaussian_filter(amplitude, 0.7, mode="nearest")
     wide = max(4.0, min(16.0, min(image.shape) / 8))
-    detail = amplitude - gaussian_filter(amplitude, wide, mode="nearest")
-    spread = np.sqrt(gaussian_filter(detail**2, wide, mode="nearest"))
+    detail = amplitude - _slow_part(amplitude, wide)
+    spread = np.sqrt(np.maximum(_slow_part(detail**2, wide), 0))
     floor = 0.1 * float(np.sqrt(np.mean(detail**2))) + 1e-12
     return np.where(valid, detail / (spread + floor), 0).astype(np.float32)
+
+
+def _slow_part(picture: np.ndarray, width: float) -> np.ndarray:
+    """A Gaussian blur of a standard deviation in pixels; the border repeats beyond itself.
+
+    Through the Fourier transform, which takes a fraction of the time of a wide kernel.
+    """
+    beyond = int(4 * width)  # where the Gaussian has ended
+    rows, columns = (spfft.next_fast_len(n + 2 * beyond, real=True) for n in picture.shape)
+    room = [(beyond, size - n - beyond) for n, size in zip(picture.shape, (rows, columns), strict=True)]
+    spectrum = spfft.rfft2(np.pad(picture, room, mode="edge"))
+    fy, fx = spfft.fftfreq(rows).astype(np.float32), spfft.rfftfreq(columns).astype(np.float32)
+    spectrum *= np.exp(-2 * (np.pi * width * fy[:, None]) ** 2)
+    spectrum *= np.exp(-2 * (np.pi * width * fx) ** 2)
+    blurred = spfft.irfft2(spectrum, s=(rows, columns))
+    return np.asarray(blurred[beyond : beyond + picture.shape[0], beyond : beyond + picture.shape[1]])
 
 
 def tile_correlations(

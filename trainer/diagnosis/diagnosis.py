@@ -32,6 +32,8 @@ from trainer.formatting import number
 from trainer.model.model import Model
 from trainer.model.parameters import describe
 
+SHARES = 2  # of a screen, for each worker
+
 
 @dataclass(frozen=True)
 class Diagnosis:
@@ -301,7 +303,8 @@ def screen_all(
     roles: CaptureRoles, model: Model, effects: Sequence[Effect], pool: Pool, report: Progress
 ) -> list[ScreenResult]:
     """Screen every effect, shared out among the pool's workers."""
-    shares = min(pool.workers, len(effects)) or 1
+    # More shares than workers, so that none waits long for the last; each costs the slopes of all that is present.
+    shares = min(SHARES * pool.workers if pool.workers > 1 else 1, len(effects)) or 1
     ids = tuple(c.capture for c in roles.screened)
     tasks = [(roles.folder, ids, model, tuple(effects[k::shares])) for k in range(shares)]
     report(0.05, f"screening {len(effects)} effects")

@@ -26,7 +26,7 @@ from runtime.lightpath.grid import FINE
 from runtime.lightpath.light_path import LightPath, mode_irradiance, panel_phase, panel_spectrum, states
 from runtime.lightpath.modulation import Modulation
 from runtime.lightpath.propagation import far_field_matrix
-from trainer.device import array_of, kept_by_device
+from trainer.device import array_of, kept_by_device, kept_for_same
 from trainer.prediction.capture_motion import blurred_spectrum, displaced_spectrum
 from trainer.prediction.panel_gradient import has_panel_gradient, image_with_panel_gradient
 from trainer.prediction.pupil_modes import pupil_modes
@@ -229,10 +229,7 @@ def light_on_camera(
     """
     grid, camera = scene.grid, scene.bench.camera
     sensor = stages.sensor
-    transfer = _pixel_area(scene, sensor)
-    for extra in (stages.pupil.irradiance_filter, sensor.irradiance_filter, sensor.blur):
-        if extra is not None:
-            transfer = transfer * extra
+    transfer = _camera_transfer(scene, stages.pupil, sensor)
     if sensor.displacement is not None:
         dy, dx = sensor.displacement
         rows = torch.arange(dy.shape[-2], dtype=dy.dtype)[:, None]
@@ -258,6 +255,16 @@ def light_on_camera(
         else:
             spectrum = blurred_spectrum(sensor, spectrum, read, measured)
     return read(spectrum)
+
+
+@kept_for_same(2)  # of a fit's model and of its trial
+def _camera_transfer(scene: Scene, pupil: Pupil, sensor: Sensor) -> Tensor:
+    """Transfer function of all that blurs irradiance: the pixel's area, source extent, ghosts, the camera."""
+    transfer = _pixel_area(scene, sensor)
+    for extra in (pupil.irradiance_filter, sensor.irradiance_filter, sensor.blur):
+        if extra is not None:
+            transfer = transfer * extra
+    return transfer
 
 
 def counts(
