@@ -119,10 +119,10 @@ def next_captures(
 ) -> NextCaptures:
     """Choose captures by the information that they are expected to add.
 
-    Of the covariance of the model's numbers minus half the logarithm of the determinant counts (D-optimality), of the
-    information on each rival's share half its logarithm. Captures that will be held out say nothing to the fits, so
-    they are chosen to be the lesser ones, and count as a price. A new colour and plane gets two patterns: the first is
-    fitted, and without a second nothing judges there.
+    What counts is half the logarithm of the factor by which a capture shrinks the determinant of the covariance of the
+    model's numbers (D-optimality), and half that of the growth of the information on each rival's share. Captures that
+    will be held out say nothing to the fits, so they are chosen to be the lesser ones, and count as a price. A new
+    colour and plane gets two patterns: the first is fitted, and without a second nothing judges there.
 
     Parameters
     ----------
