@@ -114,6 +114,9 @@ class Program:
         return run(args.chosen, args)
 
     def _stopped(self, sentence: str, code: int) -> int:
+        # Where Ctrl-C fell into code that is made from text, as a dataclass's is, `python -m` ends by the signal
+        # instead of this exit code, whatever was done about it. The next such code takes that back.
+        exec("")
         with suppress(OSError, ValueError):
             print(f"{self.name}: {one_line(sentence)}", file=sys.stderr)
         return code

@@ -267,6 +267,24 @@ def test_what_goes_wrong_is_one_line(
     assert err.startswith(f"{program.name}: {message}")
 
 
+def test_ctrl_c_in_code_made_from_text_keeps_the_exit_code(tmp_path: Path) -> None:
+    """As in a dataclass that a module defines while it is imported."""
+    (tmp_path / "interrupted.py").write_text(
+        "import sys\n"
+        "from runtime import cli\n"
+        "from runtime.program.program import Program\n"
+        "def interrupt(*_):\n"
+        "    exec('import os, signal, time; os.kill(os.getpid(), signal.SIGINT); time.sleep(9)')\n"
+        "Program._main = interrupt\n"
+        "sys.exit(cli.main())\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "interrupted"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr.startswith("hololoop-runtime: interrupted; ")
+
+
 @BY_NAME
 def test_our_own_missing_modules_are_not_the_users_fault(program: Program) -> None:
     program = failing(program, ModuleNotFoundError("no module", name="runtime.nothing"))
