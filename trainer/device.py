@@ -59,6 +59,17 @@ def computing_on(device: str) -> Iterator[None]:
 
 
 @contextmanager
+def one_thread() -> Iterator[None]:
+    """Each tensor is computed by one thread: on small arrays, more would wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@contextmanager
 def _whole_single_precision() -> Iterator[None]:
     """Products and convolutions on a GPU keep all 23 bits, where TF32 would leave 10."""
     kinds: tuple[Any, ...] = (torch.backends.cuda.matmul, torch.backends.cudnn)

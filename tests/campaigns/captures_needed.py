@@ -44,7 +44,6 @@ from trainer.model.model import Model
 
 FIRST, MOST = 4, 13
 COUNTS = (4, 6, 8, 10, 13)
-NOTHING = 1e-9  # scales: the rounding of an error that is zero
 OTHERS = ("zero_order", "laser_drift", "crosstalk")
 ALIKE = (
     {"spatial_coherence", "sensor_blur", "temporal_coherence"},
@@ -184,13 +183,17 @@ def wanted_model(captures: CaptureSet, hidden: list[str], known: Catalogue, pool
 def error_of(captures: CaptureSet, model: Model) -> float:
     """Geometric mean of the standard errors of a model's numbers, in units of their scales.
 
-    Numbers that change nothing, such as the extent of a halo that is not there, have none.
+    Numbers that the captures do not determine, such as the extent of a halo that is not there, have none.
     """
-    fitted = fit(model, model.names, load(captures, fit_rows(captures)))
-    spread = np.sqrt(np.diag(fitted.covariance)[: len(fitted.keys)])
-    scales = [model.instance(e).effect.parameter(p).scale for e, p, _ in fitted.keys]
-    relative = spread / np.array(scales)
-    return float(np.exp(np.log(relative[relative > NOTHING]).mean()))
+    found = fit(model, model.names, load(captures, fit_rows(captures)))
+    relative = []
+    for name, parameter, index in found.keys:
+        present = found.model.instance(name)
+        assert present.errors is not None
+        error = float(present.errors[parameter].reshape(-1)[index])
+        relative.append(error / present.effect.parameter(parameter).scale)
+    known = np.array([r for r in relative if r > 0])  # nan is not
+    return float(np.exp(np.log(known).mean()))
 
 
 def sharpened(

@@ -125,6 +125,11 @@ def load(captures: CaptureSet, chosen: Iterable[Capture], dtype: torch.dtype = t
     ]
 
 
+def signal_variance(batches: Iterable[Batch]) -> float:
+    """Sum of squares of the signals about their means, counts squared: what an excess is a share of."""
+    return sum(float(b.errors(torch.zeros_like(b.signal)).variance.sum()) for b in batches)
+
+
 @lru_cache(maxsize=4)
 def in_view(bench: Bench) -> np.ndarray | None:
     """Which camera pixels look at the panel, or at most PAST_BORDER panel pixels beyond it.

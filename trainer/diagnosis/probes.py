@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from runtime.excess import PredictionErrors, RemovedExcess, joined, removed_excess
-from trainer.captures.batches import load, load_batch
+from trainer.captures.batches import load, load_batch, signal_variance
 from trainer.captures.capture_set import chosen, opened
 from trainer.captures.held_out import with_stopping
 from trainer.fitting.free_form_maps import FreeFormBatch, descend
@@ -95,7 +95,7 @@ def probe(
     first, last = with_stopping(rows, CAPTURES[stage])
     batches = load(captures, first)
     free = FREE_STAGES[stage](model.bench)
-    scale = sum(float(b.errors(torch.zeros_like(b.signal)).variance.sum()) for b in batches)
+    scale = signal_variance(batches)
     # One capture a colour and plane is kept from the gradient and says when to stop.
     fitted, stopping = ([FreeFormBatch(model, b) for b in part] for part in (batches, load(captures, last)))
     found = descend(free, fitted, stopping, scale, ROUND, ROUNDS[stage])

@@ -13,8 +13,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from runtime.excess import joined
-from trainer.captures.batches import Batch, load
+from trainer.captures.batches import Batch, load, signal_variance
 from trainer.captures.capture_set import chosen, opened
 from trainer.effects.definition import Effect
 from trainer.effects.evidence import Evidence
@@ -87,7 +86,7 @@ def screen_batches(batches: list[Batch], model: Model, effects: tuple[Effect, ..
             prepared[opens_iris] = (predictors, points, *nuisance)
         predictors, points, residual, present = prepared[opens_iris]
         noise = sum(float((b.mask * b.noise).sum()) for b in batches)
-        scale = float(joined([b.errors(torch.zeros_like(b.signal)) for b in batches]).variance.sum())
+        scale = signal_variance(batches)
         before = (remaining(residual, present) - noise) / scale
         start = _start(effect, model, predictors, points)
         trial = model.having(start)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import torch
 
-from runtime.excess import PredictionErrors, joined, removed_excess
-from trainer.captures.batches import load
+from runtime.excess import PredictionErrors, removed_excess
+from trainer.captures.batches import load, signal_variance
 from trainer.captures.capture_set import chosen, opened
 from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.verdict import Thresholds
@@ -77,7 +77,7 @@ def _in_doubt(roles: CaptureRoles, model: Model, names: Sequence[str], least: fl
     keys = keys_of(model, [n for n in model.names if not has_many(model.instance(n))])
     _, slopes = stacked(model, keys, predictors, [p.trace(model) for p in predictors])
     away = torch.as_tensor([away_from_absent(model, key) for key in keys], dtype=slopes.dtype)
-    scale = float(joined([b.errors(torch.zeros_like(b.signal)) for b in batches]).variance.sum())
+    scale = signal_variance(batches)
     matters = max(excess_on(model, batches), least)
     doubted = []
     for name in names:

@@ -10,11 +10,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from runtime.lightpath.spline_maps import nodes_over, on_other_nodes
 from runtime.program.progress import Progress, no_progress
-from trainer.captures.batches import Batch
+from trainer.captures.batches import Batch, signal_variance
 from trainer.device import array_of
 from trainer.effects.free_form import grid_of, on_other_curve_nodes
 from trainer.fitting.free_form_maps import FreeFormBatch, descend
@@ -100,7 +99,7 @@ def _descended(
         model = model.having(present)
     assert present.nodes is not None
     parts = [[FreeFormBatch(model, b) for b in batches] for batches in (fitted, stopping)]
-    scale = sum(float(b.errors(torch.zeros_like(b.signal)).variance.sum()) for b in fitted)
+    scale = signal_variance(fitted)
     curve = present.effect.free_form is not None and present.effect.free_form.curve
     iterations, rounds = (CURVE_ITERATIONS, CURVE_ROUNDS) if curve else (ITERATIONS, ROUNDS)
     found = descend(_stage_of(model, present), parts[0], parts[1], scale, iterations, rounds)

@@ -17,9 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from runtime.excess import PredictionErrors, joined
+from runtime.excess import PredictionErrors
 from runtime.program.progress import Progress
-from trainer.captures.batches import Batch
+from trainer.captures.batches import Batch, signal_variance
 from trainer.device import array_of
 from trainer.effects.definition import STAGES
 from trainer.effects.evidence import Evidence
@@ -105,7 +105,7 @@ def _fit(
     predictors = [Predictor(model, b) for b in batches]
     keys = tuple(key for key in keys_of(model, free) if key[:2] not in fixed)
     ranges = _typical_ranges(model, keys)
-    scale = _signal(batches)
+    scale = signal_variance(batches)
     first = min((model.instance(n).effect.stage for n in free), key=STAGES.index, default="sensor")
     points = [p.trace(model) for p in predictors]
     if not model.gain or any(b.channel not in model.gain for b in batches):
@@ -174,7 +174,7 @@ def _fit_many(
         model = with_gain(model, predictors, lights_of(model, predictors, points))
     channels = list(dict.fromkeys(b.channel for b in batches))
     residuals, errors = weighted_residuals(model, predictors, points)
-    scale = _signal(batches)
+    scale = signal_variance(batches)
     for iteration in range(iterations):
         if progress:
             progress(iteration / iterations)
@@ -275,11 +275,6 @@ def _moved(
     logs = dict(zip(channels, step[len(keys) :], strict=False))
     gain = {c: g * float(np.exp(np.clip(logs.get(c, 0.0), -1, 1))) for c, g in model.gain.items()}
     return replace(model, gain=gain)
-
-
-def _signal(batches: Sequence[Batch]) -> float:
-    """Sum of squares of the signal about its mean, counts squared."""
-    return float(joined([b.errors(torch.zeros_like(b.signal)) for b in batches]).variance.sum())
 
 
 def _spread(

@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import torch
-
 from runtime.program.progress import Progress
-from trainer.captures.batches import load
+from trainer.captures.batches import load, signal_variance
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.capture_table import Capture
 from trainer.captures.held_out import with_stopping
@@ -48,7 +46,7 @@ def with_learned_stage(
     model = replace(model, learned={s: maps for s, maps in model.learned.items() if s != stage})
     first, last = with_stopping(rows, CAPTURES)
     batches = load(captures, first)
-    scale = sum(float(b.errors(torch.zeros_like(b.signal)).variance.sum()) for b in batches)
+    scale = signal_variance(batches)
     fitted, stopping = ([FreeFormBatch(model, b) for b in part] for part in (batches, load(captures, last)))
     free = learned_stage(model.bench, stage)
     found = descend(free, fitted, stopping, scale, ITERATIONS, ROUNDS, progress)

@@ -6,8 +6,7 @@ from collections.abc import Callable, Collection, Sequence
 
 import torch
 
-from runtime.excess import joined
-from trainer.captures.batches import Batch
+from trainer.captures.batches import Batch, signal_variance
 from trainer.fitting.gauss_newton import FitResult, fit
 from trainer.fitting.jacobian import keys_of, remaining, stacked
 from trainer.fitting.many_numbers import has_many
@@ -132,7 +131,7 @@ def _with_orders_that_pay(
     residual, slopes = stacked(every, keys, predictors, points)
     new = [key[0] if _is_new(key, every, model) else "" for key in keys]
     new += [""] * (len(slopes) - len(keys))
-    scale = float(joined([b.errors(torch.zeros_like(b.signal)) for b in few]).variance.sum())
+    scale = signal_variance(few)
 
     def left(taken: Sequence[str]) -> float:
         return remaining(residual, slopes[[not one or one in taken for one in new]]) / scale

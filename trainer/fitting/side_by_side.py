@@ -8,9 +8,10 @@ from typing import TypeVar
 
 import torch
 
-SMALL_PX = (
-    640 * 480
-)  # pixels up to which threads that share a picture wait for each other longer than they work
+from trainer.device import one_thread
+
+# Up to so many pixels, threads that share a picture wait for each other longer than they work.
+SMALL_PX = 640 * 480
 
 X = TypeVar("X")
 Y = TypeVar("Y")
@@ -36,10 +37,8 @@ def side_by_side(function: Callable[[X], Y], items: Sequence[X], pixels: int) ->
     def made(item: X) -> Y:
         return function(item)
 
-    torch.set_num_threads(1)
-    pool = ThreadPoolExecutor(min(threads, len(items)))
-    try:
-        return list(pool.map(made, items))
-    finally:
-        pool.shutdown(cancel_futures=True)
-        torch.set_num_threads(threads)
+    with one_thread(), ThreadPoolExecutor(min(threads, len(items))) as pool:
+        try:
+            return list(pool.map(made, items))
+        finally:
+            pool.shutdown(cancel_futures=True)

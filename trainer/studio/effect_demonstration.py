@@ -7,8 +7,7 @@ light path, on a grid that is small enough for a slider: one thread takes 5 to 4
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -21,6 +20,7 @@ from runtime.solver import solve
 from runtime.solver.targets import TEST_PICTURE, read_target
 from trainer.captures.batches import EARLIER
 from trainer.captures.bench_file import Bench, Camera, Channel, Iris, Panel
+from trainer.device import one_thread
 from trainer.effects.definition import Effect, Parameter
 from trainer.effects.own_effect import parameters_of
 from trainer.model.bundle_export import baked_path
@@ -227,7 +227,7 @@ def demonstrate(
     order = effect.orders[0] if order is None else order
     bench = demonstration_bench()
     instance = instance_with(effect, bench, _values(effect, numbers, order), order)
-    with torch.no_grad(), _one_thread():
+    with torch.no_grad(), one_thread():
         scene, stages = _stages(instance)
         before, ideal = _ideal(scene)
         if by_eye and effect.acts_on == "camera":
@@ -342,14 +342,3 @@ def _of_capture(instance: EffectInstance, unit: str, capture: int) -> NDArray[np
     series = (series - series.mean(1, keepdims=True)) / series.std(1, keepdims=True)
     numbers: NDArray[np.float64] = spread * series[:, capture % CAPTURES]
     return numbers
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Small arrays: more threads would wait for each other."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
