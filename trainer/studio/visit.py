@@ -9,6 +9,7 @@ from typing import ClassVar
 import panel as pn
 import param
 from bokeh.document import Document
+from tornado.ioloop import IOLoop
 
 from trainer.studio.colours import figure_theme, line_colours
 from trainer.studio.project import Project
@@ -23,7 +24,8 @@ class Visit(param.Parameterized):
     ----------
     project : Project
     document : Document
-        Of the browser.
+        Of the browser. Only the thread that made the visit touches it, the server's: what another thread adds while
+        the document gathers changes can be lost, and with it all later changes of the same topic.
     """
 
     capture = param.String(default="", doc="The capture that is compared; empty: none yet.")
@@ -34,9 +36,12 @@ class Visit(param.Parameterized):
         self.project, self.document = project, document
         self._hearers: dict[str, list[Callable[[], None]]] = {}
         self._pending: set[str] = set()
+        self._loop = IOLoop.current()
+        self._is_drawn = False
         self._number = project.watch(self._heard)
         document.theme = figure_theme(dark)
         document.on_session_destroyed(lambda _: project.unwatch(self._number))
+        pn.state.onload(self._drawn)
 
     @property
     def colours(self) -> dict[str, str]:
@@ -51,19 +56,44 @@ class Visit(param.Parameterized):
             function()
 
     def _heard(self, topic: str) -> None:
-        """From any thread: act on a topic once the document is free, once however often it is told until then."""
+        """From any thread: act on a topic soon."""
+        self._loop.add_callback(self._plan, topic)
+
+    def _plan(self, topic: str) -> None:
+        """Act on a topic once the document is free, once however often it is told until then.
+
+        Not before the browser has drawn the page: Panel drops changes between the sending of the page and that, since
+        it takes them for a part of the page.
+        """
         if topic in self._pending:
             return
         self._pending.add(topic)
+        if self._is_drawn:
+            self._schedule(topic)
+
+    def _drawn(self) -> None:
+        self._is_drawn = True
+        for topic in self._pending:
+            self._schedule(topic)
+
+    def _schedule(self, topic: str) -> None:
         self.document.add_next_tick_callback(lambda: self._act(topic))
 
     def _act(self, topic: str) -> None:
+        """Call the views, while the document gathers what they change for Bokeh to send.
+
+        Bokeh waits until it is written. What Panel sends by itself can lie in its queue until the next change.
+        """
         self._pending.discard(topic)
-        for function in list(self._hearers.get(topic, ())):
-            try:
-                function()
-            except Exception:
-                _LOG.exception("a view could not show a change of %s", topic)
+        self.document.hold("combine")
+        try:
+            for function in list(self._hearers.get(topic, ())):
+                try:
+                    function()
+                except Exception:
+                    _LOG.exception("a view could not show a change of %s", topic)
+        finally:
+            self.document.unhold()
 
 
 class LiveText(pn.reactive.ReactiveHTML):

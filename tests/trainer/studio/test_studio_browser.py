@@ -388,15 +388,21 @@ def test_a_websocket_of_a_foreign_origin_is_refused(studio: Studio) -> None:
             assert thread.submit(lambda headers=headers: asyncio.run(code(**headers))).result() == 403
 
 
-def test_a_broken_set_is_shown_as_sentences_and_a_click_corrects_it(browser: Any, home: Path) -> None:
-    shutil.copytree(home / "leaking", home / "broken")
-    bench = home / "broken" / "bench.toml"
+def with_the_other_sign(home: Path, name: str) -> Path:
+    """A copy of the capture set whose bench.toml has the phase's sign wrong; returns that file."""
+    shutil.copytree(home / "leaking", home / name)
+    bench = home / name / "bench.toml"
     text = bench.read_text()
     bench.write_text(
         text.replace("phase_sign = 1", "phase_sign = -1")
         if "phase_sign" in text
         else text.replace("[panel]", "[panel]\nphase_sign = -1")
     )
+    return bench
+
+
+def test_a_broken_set_is_shown_as_sentences_and_a_click_corrects_it(browser: Any, home: Path) -> None:
+    bench = with_the_other_sign(home, "broken")
     studio = Studio(home, "broken")
     try:
         page = opened(browser, studio.address)
@@ -411,6 +417,47 @@ def test_a_broken_set_is_shown_as_sentences_and_a_click_corrects_it(browser: Any
         verdict(page, "bench.toml")
         assert "Traceback" not in page.content()
         page.context.close()
+    finally:
+        assert studio.end() in (0, 130)
+
+
+def test_what_changes_before_a_page_is_drawn_is_shown_when_it_is(browser: Any, home: Path) -> None:
+    """The server hears late that the second page has been drawn; until then the first one corrects the captures."""
+    kept: list[tuple[Any, Any]] = []
+    drawn: list[bool] = []
+
+    def between(page_side: Any) -> None:
+        server_side = page_side.connect_to_server()
+
+        def to_server(message: Any) -> None:
+            if drawn or not (kept or '"PATCH-DOC"' in str(message)):
+                server_side.send(message)
+            else:
+                kept.append((server_side, message))
+
+        page_side.on_message(to_server)
+
+    with_the_other_sign(home, "drawn")
+    studio = Studio(home, "drawn")
+    try:
+        first = opened(browser, studio.address)
+        button(first, "Set phase_sign = 1 in bench.toml").wait_for()
+        second = browser.new_context(viewport={"width": 1280, "height": 800}).new_page()
+        second.set_default_timeout(SLOW_MS)
+        second.route_web_socket(lambda _: True, between)
+        second.goto(studio.address)
+        button(second, "Set phase_sign = 1 in bench.toml").wait_for()
+        button(first, "Set phase_sign = 1 in bench.toml").click()
+        playwright.expect(first.get_by_text("nothing is wrong with them")).to_be_visible()
+        idle(first)
+        assert kept
+        drawn.append(True)
+        for server_side, message in kept:
+            server_side.send(message)
+        playwright.expect(second.get_by_text("nothing is wrong with them")).to_be_visible()
+        idle(second)
+        for one in (first, second):
+            one.context.close()
     finally:
         assert studio.end() in (0, 130)
 
