@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from firmware_iface.camera import OakCamera, open_oak
 from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
 from firmware_iface.virtual.oak import OakModel
+from tests.waiting import until
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("depthai") is None, reason="depthai is not installed (extra 'camera')"
@@ -54,13 +55,6 @@ def opened(**options) -> OakCamera:
     """With time limits for a machine that does much else; only what is meant to starve waits for one."""
     limits = {"starved_s": 0.6, "timeout_s": 25.0, "start_s": 40.0}
     return open_oak(ADDRESS, **({"exposure_ms": 1.0, "frames_per_s": 60.0} | limits | options))
-
-
-def until(condition: Callable[[], bool], within_s: float = 25.0) -> None:
-    end = time.monotonic() + within_s
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.01)
 
 
 @pytest.fixture

@@ -28,6 +28,7 @@ from trainer.studio.visit import Visit
 STYLE_FOLDERS = {"look": LOOK, "controls": Path(__file__).with_name("look")}
 STYLES = ("look/page.css", "controls/studio.css")
 FRAME = Path(__file__).with_name("studio.html")
+PULSE_MS = 1000
 SECTIONS = ("Bench", "No name fits", "Gain", "Catalogue")
 
 
@@ -51,7 +52,17 @@ def studio_page(project: Project) -> Any:
     work = pn.Column(sizing_mode="stretch_width", css_classes=["work"])
     frame.add_panel("work", work)  # while it is empty, which is quicker
     _fill(work, project, visit)
+    pn.state.onload(partial(_keep_sending, work))
     return frame
+
+
+def _keep_sending(place: Any) -> None:
+    """Change each second what nobody sees: Panel may leave a change in its queue until the next one."""
+
+    def pulse() -> None:
+        place.tags = [] if place.tags else ["pulse"]
+
+    pn.state.add_periodic_callback(pulse, period=PULSE_MS)
 
 
 def _fill(place: Any, project: Project, visit: Visit) -> None:

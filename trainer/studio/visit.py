@@ -80,20 +80,12 @@ class Visit(param.Parameterized):
         self.document.add_next_tick_callback(lambda: self._act(topic))
 
     def _act(self, topic: str) -> None:
-        """Call the views, while the document gathers what they change for Bokeh to send.
-
-        Bokeh waits until it is written. What Panel sends by itself can lie in its queue until the next change.
-        """
         self._pending.discard(topic)
-        self.document.hold("combine")
-        try:
-            for function in list(self._hearers.get(topic, ())):
-                try:
-                    function()
-                except Exception:
-                    _LOG.exception("a view could not show a change of %s", topic)
-        finally:
-            self.document.unhold()
+        for function in list(self._hearers.get(topic, ())):
+            try:
+                function()
+            except Exception:
+                _LOG.exception("a view could not show a change of %s", topic)
 
 
 class LiveText(pn.reactive.ReactiveHTML):

@@ -6,11 +6,16 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import smbus2
+from hypothesis import strategies as st
 
 from firmware_iface.lasers import VIRTUAL_CHANNELS, Lasers
 from firmware_iface.virtual.i2c import LaserBoard, attach, detach
 
 Emission = Callable[[float, dict[str, float]], None]
+
+WINDOW_S, TICK_S = 0.100, 0.001  # of the safety controller: without a heartbeat, and between looks
+NAMES = [c.name for c in VIRTUAL_CHANNELS]
+LASER = st.sampled_from([0, 1, 2])
 
 
 class Bench:

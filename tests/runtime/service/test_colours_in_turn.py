@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -23,6 +23,7 @@ from runtime.solver import shown
 from tests.campaigns.headset import connected, hardware, picture, served, write_configuration
 from tests.campaigns.lane import Lane
 from tests.runtime.benches import converted, ideal_path
+from tests.waiting import until
 
 pytestmark = pytest.mark.usefixtures("only_service")
 
@@ -39,13 +40,6 @@ def headset(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Headset]:
     with hardware(file.parent) as remote, served(file), connected(file) as client:
         until(lambda: {client.status().panel, client.status().camera} == {PartState.FRESH})
         yield Headset(file, remote, client)
-
-
-def until(condition: Callable[[], object], within_s: float = 20.0) -> None:
-    end = time.monotonic() + within_s
-    while not condition():
-        assert time.monotonic() < end, "it did not happen in time"
-        time.sleep(0.01)
 
 
 def colours(client: Client, *brightness: float) -> np.ndarray:

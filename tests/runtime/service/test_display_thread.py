@@ -12,6 +12,7 @@ from firmware_iface.errors import DeviceError, DeviceGoneError
 from runtime.lightpath.overdrive import NEAREST, REACHED, overdrive_tables
 from runtime.service.display_thread import DisplayClock, DisplayPattern, DisplayThread
 from runtime.service.slow_panel import SlowPanel
+from tests.waiting import until
 
 PERIOD_NS = 5_000_000
 STALE_NS = 100_000_000
@@ -79,13 +80,6 @@ def running() -> Iterator[tuple[Panel, DisplayThread, Events]]:
 def ready(job: int, in_ns: int, value: int | None = None, final: bool = True) -> DisplayPattern:
     gray = np.full((1, 2, 2), job if value is None else value, np.uint8)
     return DisplayPattern(job, time.monotonic_ns() + in_ns, gray, 0, 30.0, final)
-
-
-def until(condition, within_s: float = 5.0) -> None:
-    end = time.monotonic() + within_s
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.002)
 
 
 def test_patterns_are_shown_in_order_and_not_before_their_time(running) -> None:

@@ -13,6 +13,7 @@ from firmware_iface.errors import DeviceError, InputError
 from firmware_iface.lasers.eye_safety import SIZES_MRAD
 from runtime.service.laser_heartbeat import LaserHeartbeat
 from runtime.service.protocol import LaserState
+from tests.waiting import until
 
 SHARES = tuple(0.02 + 0.001 * (k + 1) for k in range(len(SIZES_MRAD)))
 
@@ -113,13 +114,6 @@ def bench() -> Iterator[Bench]:
     bench.lasers.start()
     yield bench
     bench.lasers.stop()
-
-
-def until(condition, within_s: float = 5.0) -> None:
-    end = time.monotonic() + within_s
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.002)
 
 
 def test_nothing_is_armed_without_clear_and_what_was_cleared_is_armed_once(bench: Bench) -> None:

@@ -28,6 +28,7 @@ from runtime.service.protocol import Code, LaserState, PartState, Shown
 from runtime.service.socket_link import MessageLink, PeerCredentials
 from runtime.service.supervisor import Supervisor
 from tests.campaigns.headset import ENVIRONMENT, connected, hardware, picture, served, write_configuration
+from tests.waiting import until
 
 pytestmark = pytest.mark.usefixtures("only_service")
 
@@ -51,13 +52,6 @@ def client(headset: Headset) -> Iterator[Client]:
         until(lambda: {client.status().panel, client.status().camera} == {PartState.FRESH})
         yield client
         client.dark()
-
-
-def until(condition: Callable[[], object], within_s: float = 15.0) -> None:
-    end = time.monotonic() + within_s
-    while not condition():
-        assert time.monotonic() < end, "it did not happen in time"
-        time.sleep(0.01)
 
 
 def within_five_attempts(once: Callable[[], None]) -> None:

@@ -1,15 +1,11 @@
-"""The studio without a browser: steps of a model, corrections, effect files from probes, work in processes, access."""
+"""The studio without a browser: steps of a model, corrections, effect files from probes, access."""
 
 from __future__ import annotations
 
-import os
 import resource
 import shutil
-import signal
 import socket
-import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -23,6 +19,7 @@ pytest.importorskip("panel", reason="the studio needs the extra 'studio'")
 from firmware_iface.errors import InputError
 from runtime.excess import RemovedExcess
 from tests.trainer.hidden import with_few_effects
+from tests.waiting import until
 from trainer.captures.camera_numbers import numbers_text
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.check_set import check_captures
@@ -35,9 +32,9 @@ from trainer.model.model_file import read_model, write_model
 from trainer.model.model_stages import ideal_irradiance
 from trainer.report.ladder import ladder_rows, with_network
 from trainer.report.palettes import DIFFERENCE, palette
-from trainer.studio import gain_tasks, guess_benches, jobs
+from trainer.studio import gain_tasks, guess_benches
 from trainer.studio.findings_fixes import fix_of
-from trainer.studio.jobs import CANCELLED, ENDED, WorkerProcess, picture_worker, sentence_of
+from trainer.studio.jobs import WorkerProcess, picture_worker
 from trainer.studio.learned_network import network_of
 from trainer.studio.model_steps import ModelSteps
 from trainer.studio.probe_template import write_effect_of_probe
@@ -66,17 +63,6 @@ def project(tmp_path: Path, pictures: WorkerProcess, monkeypatch: pytest.MonkeyP
     one = Project(tmp_path, worker=pictures)
     yield one
     one.close()
-
-
-def until(condition: Callable[[], Any], seconds: float = 60) -> Any:
-    """The condition's value as soon as it is true."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        found = condition()
-        if found:
-            return found
-        time.sleep(0.05)
-    raise AssertionError(f"not so after {seconds} s")
 
 
 # Steps of a model
@@ -234,100 +220,6 @@ def test_an_effect_file_is_filled_with_what_the_probe_shows(stage: str, tmp_path
         assert '"period": 12' in text
     (effect,) = load_effects(path)
     assert effect.name == f"odd_{stage}" and effect.stage == stage
-
-
-# Work in processes
-
-
-def _echo(say: Any, word: str) -> str:
-    say("progress", (0.5, "half"))
-    return word
-
-
-def _sleep(say: Any) -> None:
-    say("pid", os.getpid())
-    time.sleep(60)
-
-
-def _fails(say: Any, kind: str) -> None:
-    if kind == "input":
-        raise InputError("this is wrong: change that")
-    if kind == "full":
-        raise OSError(28, "No space left on device")
-    if kind == "memory":
-        raise MemoryError
-    raise ValueError("surprise")
-
-
-class Heard:
-    """What a worker has said."""
-
-    def __init__(self) -> None:
-        self.words: list[tuple[str, Any]] = []
-        self.ended = threading.Event()
-
-    def __call__(self, kind: str, value: Any) -> None:
-        self.words.append((kind, value))
-        if kind in ("done", "failed", "cancelled"):
-            self.ended.set()
-
-
-@pytest.fixture(scope="module")
-def worker() -> Iterator[WorkerProcess]:
-    one = WorkerProcess("test")
-    one.start()
-    yield one
-    one.close()
-
-
-def test_a_worker_does_tasks_and_says_how_far_it_is(worker: WorkerProcess) -> None:
-    heard = Heard()
-    worker.submit(_echo, ("word",), heard)
-    assert heard.ended.wait(60)
-    assert heard.words == [("progress", (0.5, "half")), ("done", "word")]
-
-
-@pytest.mark.parametrize(
-    ("kind", "said"),
-    [
-        ("input", "change that"),
-        ("full", "disk is full"),
-        ("memory", "not enough memory"),
-        ("", "did not work"),
-    ],
-)
-def test_what_goes_wrong_is_one_sentence(worker: WorkerProcess, kind: str, said: str) -> None:
-    heard = Heard()
-    worker.submit(_fails, (kind,), heard)
-    assert heard.ended.wait(60)
-    ((how, sentence),) = heard.words
-    assert how == "failed" and said in sentence and "Traceback" not in sentence and "\n" not in sentence
-
-
-def test_a_task_is_cancelled_and_a_killed_worker_is_replaced(worker: WorkerProcess) -> None:
-    heard = Heard()
-    worker.submit(_sleep, (), heard)
-    until(lambda: heard.words)
-    assert worker.busy
-    with pytest.raises(InputError, match="under way"):
-        worker.submit(_echo, ("no",), Heard())
-    assert worker.cancel()
-    assert heard.words[-1] == ("cancelled", CANCELLED)
-    assert not worker.cancel()
-    heard = Heard()
-    worker.submit(_sleep, (), heard)
-    pid = until(lambda: next((v for k, v in heard.words if k == "pid"), None))
-    os.kill(pid, signal.SIGKILL)
-    assert heard.ended.wait(30)
-    assert heard.words[-1] == ("failed", ENDED)
-    heard = Heard()
-    worker.submit(_echo, ("again",), heard)
-    assert heard.ended.wait(60) and heard.words[-1] == ("done", "again")
-
-
-def test_errors_of_files_name_the_file() -> None:
-    assert "x.png cannot be used" in sentence_of(FileNotFoundError(2, "No such file", "x.png"))
-    assert jobs.sentence_of(OSError(28, "No space left")).startswith("The disk is full")
 
 
 # The project
