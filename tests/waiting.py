@@ -9,7 +9,7 @@ from typing import TypeVar
 T = TypeVar("T")
 
 
-def until(condition: Callable[[], T], within_s: float = 25.0) -> T:
+def until(condition: Callable[[], T], within_s: float = 5.0) -> T:
     """The condition's value as soon as it is true; it fails where that takes longer."""
     end = time.monotonic() + within_s
     while not (found := condition()):

@@ -99,7 +99,7 @@ def test_a_dying_camera_process_costs_one_longer_capture(
     dead = camera.pid
     assert dead is not None
     os.kill(dead, number)
-    until(lambda: camera.status()["restarts"] > 0)
+    until(lambda: camera.status()["restarts"] > 0, 25)
     assert camera.status()["last_loss"] == f"its process was ended by signal {int(number)}"
     scene.level = 77
     np.testing.assert_array_equal(camera.capture(), scene(2.0, 1.0))
@@ -111,7 +111,7 @@ def test_a_camera_process_that_hangs_is_replaced(oak: OakModel, scene: Scene) ->
     try:
         assert camera.pid is not None
         os.kill(camera.pid, signal.SIGSTOP)
-        until(lambda: camera.status()["restarts"] > 0)
+        until(lambda: camera.status()["restarts"] > 0, 25)
         assert camera.status()["last_loss"] == "its process hung"
         np.testing.assert_array_equal(camera.capture(), scene(1.0, 1.0))
     finally:
@@ -124,7 +124,7 @@ def test_a_malformed_packet_that_silences_the_stream_is_noticed(
 ) -> None:
     """The library goes on as if nothing were wrong; our watchdog sees that no frames come."""
     oak.faults.arm(kind)
-    until(lambda: camera.status()["restarts"] > 0)
+    until(lambda: camera.status()["restarts"] > 0, 25)
     assert camera.status()["last_loss"] in ("frames stayed out", "the link was lost")
     np.testing.assert_array_equal(camera.capture(), scene(1.0, 1.0))
 
@@ -159,7 +159,7 @@ def test_unplugged_the_capture_fails_with_the_reason_and_replugged_it_works(
         with pytest.raises(DeviceError, match=r"no picture within 1 s \(.*\); it is being looked for"):
             camera.capture()
         oak.faults.clear()
-        until(lambda: shows(camera, scene(1.0, 1.0)))
+        until(lambda: shows(camera, scene(1.0, 1.0)), 25)
     finally:
         camera.close()
 
@@ -185,7 +185,7 @@ def test_the_camera_process_does_not_outlive_a_killed_parent(oak: OakModel) -> N
     os.kill(pid, 0)
     parent.kill()
     parent.wait()
-    until(lambda: not alive(pid))
+    until(lambda: not alive(pid), 25)
 
 
 def alive(pid: int) -> bool:

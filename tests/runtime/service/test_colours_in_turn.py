@@ -38,7 +38,7 @@ class Headset(NamedTuple):
 def headset(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Headset]:
     file = write_configuration(tmp_path_factory.mktemp("headset"), colours=True)
     with hardware(file.parent) as remote, served(file), connected(file) as client:
-        until(lambda: {client.status().panel, client.status().camera} == {PartState.FRESH})
+        until(lambda: {client.status().panel, client.status().camera} == {PartState.FRESH}, 20)
         yield Headset(file, remote, client)
 
 
@@ -90,7 +90,7 @@ def test_a_picture_has_three_channels_and_every_field_its_own_light(headset: Hea
     assert len({o.pattern_crc for o in outcomes}) <= 10 and all(o.psnr_db > 10 for o in outcomes)
     lasers = {mask for _, mask in headset.remote.lit()}
     assert lasers == {1, 2, 4}, "each field has one laser's light"
-    until(lambda: show(client, white) and seen(headset, white).mean() > 3)
+    until(lambda: show(client, white) and seen(headset, white).mean() > 3, 20)
 
 
 def test_a_colour_that_a_picture_lacks_is_dark_and_the_others_are_lit(headset: Headset) -> None:
@@ -120,9 +120,9 @@ def test_light_is_in_proportion_to_a_colours_brightness(headset: Headset) -> Non
 def test_a_refinement_says_that_it_is_of_one_colour(headset: Headset) -> None:
     client = headset.client
     client.dark()
-    until(lambda: refined(client))
+    until(lambda: refined(client), 20)
     show(client, colours(client, 1.0, 1.0, 1.0))
-    until(lambda: list(client.outcomes()) is not None and client.refined is not None)
+    until(lambda: list(client.outcomes()) is not None and client.refined is not None, 20)
     assert client.refined is not None and "several are shown in turn" in client.refined.text
 
 

@@ -49,7 +49,7 @@ def headset(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Headset]:
 @pytest.fixture
 def client(headset: Headset) -> Iterator[Client]:
     with connected(headset.file) as client:
-        until(lambda: {client.status().panel, client.status().camera} == {PartState.FRESH})
+        until(lambda: {client.status().panel, client.status().camera} == {PartState.FRESH}, 15)
         yield client
         client.dark()
 
@@ -99,7 +99,7 @@ def test_every_frame_is_shown_and_what_the_panel_displays_is_what_was_solved(
     # the best of them: how far a solve comes by its deadline is up to what else the machine does
     assert max(o.psnr_db for o in shown) > 10
     made = {o.pattern_crc for o in shown}
-    until(lambda: made <= headset.remote.whole())
+    until(lambda: made <= headset.remote.whole(), 15)
 
 
 def test_light_needs_clear_and_arm_and_a_fresh_picture(headset: Headset, client: Client) -> None:
@@ -136,7 +136,7 @@ def test_an_open_interlock_is_dark_and_latches(headset: Headset, client: Client)
     opened = headset.remote.set_to("interlock", False)
     assert emitted_uw(headset.remote) == 0
     assert all(at < opened + 0.02 for at, power in headset.remote.light(opened) if power)
-    until(lambda: client.status().lasers == LaserState.FAULT)
+    until(lambda: client.status().lasers == LaserState.FAULT, 15)
     with pytest.raises(RefusedError, match="interlock"):
         client.clear()
     headset.remote.set_to("interlock", True)
@@ -153,9 +153,9 @@ def test_an_unplugged_panel_is_dark_and_works_again_without_a_restart(
     until(lambda: emitted_uw(headset.remote) == 0, 3)
     lost = show(client, 3)
     assert lost and all(isinstance(o, LostFrame) and o.code == Code.PANEL for o in lost)
-    until(lambda: client.status().panel == PartState.LOST)
+    until(lambda: client.status().panel == PartState.LOST, 15)
     headset.remote.repair("panel")
-    until(lambda: client.status().panel == PartState.FRESH)
+    until(lambda: client.status().panel == PartState.FRESH, 15)
     light_up(client, headset.remote)
 
 
@@ -164,7 +164,7 @@ def test_a_killed_process_is_dark_and_is_started_again(headset: Headset, client:
     light_up(client, headset.remote)
     os.kill(child(client, name), signal.SIGKILL)
     until(lambda: emitted_uw(headset.remote) == 0, 3)
-    until(lambda: getattr(client.status(), name) == PartState.FRESH)
+    until(lambda: getattr(client.status(), name) == PartState.FRESH, 15)
     light_up(client, headset.remote)
 
 
@@ -330,7 +330,9 @@ def test_frames_are_lit_by_all_lasers_when_the_light_of_each_pattern_is_predicte
     power = "power = { red = 1.0, green = 1.0, blue = 1.0 }\nmrad_per_pixel = 5.0"
     file.write_text(file.read_text().replace("power = { green = 0.5 }", power))
     with hardware(tmp_path) as remote, served(file), connected(file) as client:
-        until(lambda: client.status().panel == PartState.FRESH and client.status().camera == PartState.FRESH)
+        until(
+            lambda: client.status().panel == PartState.FRESH and client.status().camera == PartState.FRESH, 15
+        )
 
         def once() -> None:
             light_up(client, remote)
@@ -342,7 +344,7 @@ def test_frames_are_lit_by_all_lasers_when_the_light_of_each_pattern_is_predicte
 def test_missing_hardware_is_one_fault_a_part_and_the_log_says_what_is_missing(tmp_path: Path) -> None:
     file = write_configuration(tmp_path)
     with served(file) as process, connected(file) as client:
-        until(lambda: client.status().faults >= 3)
+        until(lambda: client.status().faults >= 3, 15)
         time.sleep(1.0)  # some fifty attempts for the panel, twenty for the lasers
         assert client.status().faults == 3
         process.send_signal(signal.SIGTERM)
@@ -417,7 +419,8 @@ def test_sigterm_switches_the_lasers_off_and_ends_the_service(tmp_path: Path) ->
                 until(
                     lambda: (
                         client.status().panel == PartState.FRESH and client.status().camera == PartState.FRESH
-                    )
+                    ),
+                    15,
                 )
                 light_up(client, remote)
                 client.show(picture(client))
@@ -433,7 +436,10 @@ def test_a_service_that_is_killed_is_dark_by_the_dead_man_and_can_be_started_aga
     with hardware(tmp_path) as remote:
         with served(file) as process, connected(file) as client:
             until(
-                lambda: client.status().panel == PartState.FRESH and client.status().camera == PartState.FRESH
+                lambda: (
+                    client.status().panel == PartState.FRESH and client.status().camera == PartState.FRESH
+                ),
+                15,
             )
             light_up(client, remote)
             killed = time.monotonic()
@@ -443,7 +449,10 @@ def test_a_service_that_is_killed_is_dark_by_the_dead_man_and_can_be_started_aga
             assert max(at for at, _ in remote.light(killed)) < killed + 0.15
         with served(file), connected(file) as client:
             until(
-                lambda: client.status().panel == PartState.FRESH and client.status().camera == PartState.FRESH
+                lambda: (
+                    client.status().panel == PartState.FRESH and client.status().camera == PartState.FRESH
+                ),
+                15,
             )
             light_up(client, remote)
 

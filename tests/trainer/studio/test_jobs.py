@@ -85,7 +85,7 @@ def test_what_goes_wrong_is_one_sentence(worker: WorkerProcess, kind: str, said:
 def test_a_task_is_cancelled_and_a_killed_worker_is_replaced(worker: WorkerProcess) -> None:
     heard = Heard()
     worker.submit(_sleep, (), heard)
-    until(lambda: heard.words)
+    until(lambda: heard.words, 60)
     assert worker.busy
     with pytest.raises(InputError, match="under way"):
         worker.submit(_echo, ("no",), Heard())
@@ -94,7 +94,7 @@ def test_a_task_is_cancelled_and_a_killed_worker_is_replaced(worker: WorkerProce
     assert not worker.cancel()
     heard = Heard()
     worker.submit(_sleep, (), heard)
-    pid = until(lambda: next((v for k, v in heard.words if k == "pid"), None))
+    pid = until(lambda: next((v for k, v in heard.words if k == "pid"), None), 60)
     os.kill(pid, signal.SIGKILL)
     assert heard.ended.wait(30)
     assert heard.words[-1] == ("failed", ENDED)

@@ -229,19 +229,19 @@ def test_a_project_predicts_adds_undoes_and_sees_the_command_line(
     project: Project, captures: CaptureSet
 ) -> None:
     project.open_set(captures.folder)
-    until(lambda: project.set.errors is not None and project.set.problems is not None)
+    until(lambda: project.set.errors is not None and project.set.problems is not None, 60)
     assert project.set.errors is not None and project.set.errors.errors.excess > 0.05
     assert project.set.problems == [] or all(p.severity == "warning" for p in project.set.problems or ())
     path = project.set.model_path
     assert path is not None and not path.exists()
     project.add("zero_order")
     assert project.work is not None and project.work.name == "Add zero_order"
-    until(lambda: project.set.model is not None and project.set.model.names == ("zero_order",))
-    until(lambda: project.results.diagnosis is not None)
+    until(lambda: project.set.model is not None and project.set.model.names == ("zero_order",), 60)
+    until(lambda: project.results.diagnosis is not None, 60)
     assert project.set.model is not None
     assert path.is_file()
     assert project.results.diagnosis is not None and project.results.diagnosis.verdict == "complete"
-    until(lambda: project.set.errors)
+    until(lambda: project.set.errors, 60)
     assert project.set.errors.errors.excess < 1e-3
     assert [r["label"] for r in ladder_rows(project.set.model.history)] == ["ideal model", "+ zero order"]
     project.undo()
@@ -251,7 +251,7 @@ def test_a_project_predicts_adds_undoes_and_sees_the_command_line(
     project.redo()
     assert project.set.model.names == ("zero_order",)
     write_model(path, read_model(path, catalogue()).without("zero_order"))
-    until(lambda: "another program" in project.notice[1])
+    until(lambda: "another program" in project.notice[1], 60)
     assert project.set.model.names == ()
 
 
@@ -261,9 +261,9 @@ def test_a_broken_set_is_a_sentence(project: Project, captures: CaptureSet, tmp_
     (folder / "bench.toml").write_text("[panel\n")
     project.open_set(folder)
     assert project.set.captures is None and "bench.toml" in project.set.fault
-    until(lambda: project.set.problems)
+    until(lambda: project.set.problems, 60)
     (folder / "bench.toml").write_text((captures.folder / "bench.toml").read_text())
-    until(lambda: project.set.captures is not None)
+    until(lambda: project.set.captures is not None, 60)
     with pytest.raises(InputError, match="is not a folder"):
         project.open_set(tmp_path / "nowhere")
 
@@ -272,25 +272,25 @@ def test_a_saved_effect_file_takes_part_at_once(
     project: Project, captures: CaptureSet, tmp_path: Path
 ) -> None:
     project.open_set(captures.folder)
-    until(lambda: project.set.errors)
+    until(lambda: project.set.errors, 60)
     path = write_effect_of_probe("my_stripe", "panel", None, (72, 96), tmp_path, ())
     project.add_effect_file(path)
-    until(lambda: any(r.effect.name == "my_stripe" for r in project.results.ranking))
+    until(lambda: any(r.effect.name == "my_stripe" for r in project.results.ranking), 60)
     assert "my_stripe" in project.results.previews
     path.write_text(path.read_text() + "\nthis is not Python\n")
-    until(lambda: project.effects.fault)
+    until(lambda: project.effects.fault, 60)
     assert str(path) in project.effects.fault and "line" in project.effects.fault
 
 
 def test_a_full_disk_is_a_sentence_and_the_model_stays(project: Project, captures: CaptureSet) -> None:
     """A limit on the size of files stands for the full disk."""
     project.open_set(captures.folder)
-    until(lambda: project.set.errors)
+    until(lambda: project.set.errors, 60)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
     try:
         project.add("zero_order")
-        until(lambda: project.work is None and project.notice[1])
+        until(lambda: project.work is None and project.notice[1], 60)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     severity, sentence = project.notice
@@ -298,7 +298,7 @@ def test_a_full_disk_is_a_sentence_and_the_model_stays(project: Project, capture
     assert project.set.model is not None and project.set.model.names == ()
     assert project.set.model_path is not None and not project.set.model_path.exists()
     project.add("zero_order")
-    until(lambda: project.set.model is not None and project.set.model.names == ("zero_order",))
+    until(lambda: project.set.model is not None and project.set.model.names == ("zero_order",), 60)
 
 
 def test_a_network_that_is_a_gain_takes_part_and_goes_into_the_bundle(
@@ -307,14 +307,14 @@ def test_a_network_that_is_a_gain_takes_part_and_goes_into_the_bundle(
     uneven = {"log_amplitude": [0.3, 0.2, -0.4, 0.0, -0.4]}
     captures = captures_with(tmp_path / "uneven", catalogue()["illumination"], uneven, patterns=6)
     project.open_set(captures.folder)
-    before = until(lambda: project.set.errors).errors.excess
+    before = until(lambda: project.set.errors, 60).errors.excess
     project.train_network(20)
     until(lambda: project.work is None and project.notice[1], 200)
     network = project.set.network
     assert network is not None, project.notice
     assert network.after < network.before == pytest.approx(before, rel=0.02)
     assert "takes part" in project.notice[1]
-    after = until(lambda: project.set.errors).errors.excess
+    after = until(lambda: project.set.errors, 60).errors.excess
     assert after == pytest.approx(network.after, rel=0.02)
     project.export(tmp_path / "bundle")
     until(lambda: "The bundle is" in project.notice[1], 120)
