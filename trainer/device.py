@@ -1,21 +1,18 @@
 """Where the light path computes: on the processor, or on a GPU.
 
 torch puts a new tensor on its default device, so `computing_on` around a piece of work decides for all of it: captures
-and models become tensors there, and what follows from them stays. Three things need more than that and are here: the
-way back to NumPy (`array_of`), results that are kept for later (`kept_by_device`), and work on the processor in the
-middle of the rest (`computing_on("cpu")`). In a backward pass torch does not know its default device: what runs there,
-in `runtime.lightpath`, makes new arrays on the device of those that it is given.
+and models become tensors there, and what follows from them stays. Three things need more than that: the way back to
+NumPy (`array_of`), work on the processor in the middle of the rest (`computing_on("cpu")`), and results that are kept
+for later (`trainer.kept_results`). In a backward pass torch does not know its default device: what runs there, in
+`runtime.lightpath`, makes new arrays on the device of those that it is given.
 """
 
 from __future__ import annotations
 
 import os
-import threading
-from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import lru_cache, wraps
-from typing import Any, TypeVar, cast
+from typing import Any
 
 import numpy as np
 
@@ -25,8 +22,6 @@ from runtime.program.interrupt import ctrl_c_waits
 with ctrl_c_waits():  # in the middle of it, Ctrl-C is lost, or ends the process without a word
     import torch
     from torch import Tensor
-
-F = TypeVar("F", bound=Callable[..., Any])
 
 
 @contextmanager
@@ -86,52 +81,3 @@ def _whole_single_precision() -> Iterator[None]:
 def array_of(tensor: Tensor) -> np.ndarray:
     """A tensor's values in the host's memory, without its derivatives; on the processor it is the same memory."""
     return np.asarray(tensor.detach().cpu().numpy())
-
-
-def kept_by_device(most: int) -> Callable[[F], F]:
-    """`lru_cache` for functions that make tensors: at most so many results are kept, each for its device."""
-
-    def kept(function: F) -> F:
-        @lru_cache(maxsize=most)
-        def made(device: torch.device, *args: Hashable) -> Any:
-            return function(*args)
-
-        @wraps(function)
-        def here(*args: Hashable) -> Any:
-            return made(torch.get_default_device(), *args)
-
-        return cast(F, here)
-
-    return kept
-
-
-def kept_for_same(most: int) -> Callable[[F], F]:
-    """Keep the last results of a function that makes tensors from objects that never change.
-
-    The arguments are compared by identity, as objects that hold arrays have no quick equality. The result is kept for
-    its device; with derivatives nothing is kept, as that would keep what the backward pass needs.
-    """
-
-    def kept(function: F) -> F:
-        known: OrderedDict[tuple[Any, ...], tuple[Any, tuple[Any, ...]]] = OrderedDict()
-        lock = threading.Lock()
-
-        @wraps(function)
-        def here(*args: Any) -> Any:
-            if torch.is_grad_enabled():
-                return function(*args)
-            key = (torch.get_default_device(), *map(id, args))
-            with lock:
-                if key in known:
-                    known.move_to_end(key)
-                    return known[key][0]
-            result = function(*args)
-            with lock:
-                known[key] = result, args  # the arguments live on, so that no other object gets their ids
-                while len(known) > most:
-                    known.popitem(last=False)
-            return result
-
-        return cast(F, here)
-
-    return kept

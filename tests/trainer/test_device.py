@@ -27,7 +27,7 @@ from trainer.captures.open_bench import nominal_bench
 from trainer.cli import main
 from trainer.cycle.evaluation import run_evaluation
 from trainer.cycle.evaluation_bench import EvaluationSizes
-from trainer.device import array_of, computing_on, kept_by_device
+from trainer.device import array_of, computing_on
 from trainer.diagnosis.explanation import Explanation, explain
 from trainer.effects.effect_catalogue import catalogue
 from trainer.effects.testing import slopes, small_bench
@@ -38,6 +38,7 @@ from trainer.fitting.gauss_newton import fit
 from trainer.fitting.learned_field import learn_field
 from trainer.fitting.pool import open_pool
 from trainer.fitting.predictor import Predictor
+from trainer.kept_results import kept_by_device
 from trainer.model.model import Model, absent, instance_with
 from trainer.prediction.free_stages import FREE_STAGES
 

@@ -18,7 +18,10 @@ GIB = 2**30
 
 @pytest.fixture(scope="module")
 def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Random patterns, and pictures of random speckle: what is in them does not matter for memory."""
+    """Random patterns, and pictures of random speckle.
+
+    They fit no pattern at any distance, so that `check` and the commands that check first search all distances.
+    """
     folder = tmp_path_factory.mktemp("large") / "captures"
     bench = replace(small_bench(1080, 1920), distance_mm=100.0)
     rng = np.random.default_rng(0)
@@ -32,8 +35,10 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", ["check", "compare", "add zero_order"])
-def test_sixty_large_captures_need_less_than_six_gib(command: str, large: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("command", "exit_code"), [("check", 1), ("compare", 0), ("add zero_order", 0)])
+def test_sixty_large_captures_need_less_than_six_gib(
+    command: str, exit_code: int, large: Path, tmp_path: Path
+) -> None:
     words = [*command.split(), str(large), "--json"]
     if words[0] == "add":
         words += ["--out", str(tmp_path / "model.toml")]
@@ -45,5 +50,5 @@ def test_sixty_large_captures_need_less_than_six_gib(command: str, large: Path, 
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=3000)
     code, kilobytes = map(int, done.stderr.splitlines()[-1].split())
     print(f"{command}: {kilobytes * 1024 / GIB:.2f} GiB")
-    assert code == 0, done.stderr
+    assert code == exit_code, done.stderr
     assert kilobytes * 1024 < 6 * GIB

@@ -15,6 +15,7 @@ import numpy as np
 from firmware_iface.errors import InputError
 from trainer.captures.bench_file import Bench
 from trainer.captures.conventions import Predict, Sample, central_part, flattened, tile_correlations
+from trainer.kept_results import forgotten_afterwards
 
 NEAREST, FARTHEST = 0.2, 5.0  # distances that are searched, as shares of the stated one
 MOST_STEPS = 120
@@ -63,14 +64,16 @@ def best_distance(bench: Bench, samples: Sequence[Sample], predict: Predict) -> 
         return None
 
     def score(distance: float, among: int = len(scores)) -> DistanceFit:
-        return DistanceFit(distance, float(np.mean([one(distance) for one in scores[:among]])))
+        with forgotten_afterwards():
+            return DistanceFit(distance, float(np.mean([one(distance) for one in scores[:among]])))
 
     best = max((score(stated + step * unit) for step in (0.0, *NEAR)), key=_correlation)
     if best.correlation < GOOD:
         low, high = NEAREST * abs(stated), FARTHEST * abs(stated)
         count = int(min(MOST_STEPS, np.ceil((high - low) / (STEP * unit)))) + 1
+        # The farthest, which need most memory, first: what they leave has room for the others.
         far = sorted(
-            (score(d, 1) for d in np.copysign(np.linspace(low, high, count), stated)), key=_correlation
+            (score(d, 1) for d in np.copysign(np.linspace(high, low, count), stated)), key=_correlation
         )
         best = max((best, *(score(one.distance_mm) for one in far[-2:])), key=_correlation)
     step = STEP / 2

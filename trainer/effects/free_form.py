@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from runtime.lightpath.spline_maps import node_weights, weights_at
-from trainer.device import array_of, kept_by_device
+from trainer.device import array_of
+from trainer.kept_results import kept_by_device
 from trainer.prediction.free_stages import PUPIL_EXTENT
 from trainer.prediction.stages import Pupil
 

@@ -8,7 +8,7 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from trainer.device import kept_by_device
+from trainer.kept_results import kept_by_device
 
 
 def zernike_indices(order: int, without_defocus: bool = False) -> list[tuple[int, int]]:

@@ -12,9 +12,9 @@ import torch
 
 from trainer.captures.bench_file import Bench
 from trainer.captures.capture_table import Moment
-from trainer.device import kept_for_same
 from trainer.effects.definition import STAGES
 from trainer.effects.own_effect import applied
+from trainer.kept_results import kept_for_same
 from trainer.model.model import EffectInstance, Model
 from trainer.prediction.free_stages import with_learned
 from trainer.prediction.predict import bare_irradiance

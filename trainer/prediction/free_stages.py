@@ -17,7 +17,8 @@ from torch import Tensor
 from runtime.lightpath.legendre import legendre_count, legendre_curve, legendre_surface
 from runtime.lightpath.light_path import mode_irradiance, panel_phase, panel_spectrum, states
 from trainer.captures.bench_file import Bench
-from trainer.device import array_of, kept_by_device
+from trainer.device import array_of
+from trainer.kept_results import kept_by_device
 from trainer.prediction.panel_field import UNITS, resized, with_field
 from trainer.prediction.predict import light_path
 from trainer.prediction.scene import Scene, Stages

@@ -26,7 +26,8 @@ from runtime.lightpath.grid import FINE
 from runtime.lightpath.light_path import LightPath, mode_irradiance, panel_phase, panel_spectrum, states
 from runtime.lightpath.modulation import Modulation
 from runtime.lightpath.propagation import far_field_matrix
-from trainer.device import array_of, kept_by_device, kept_for_same
+from trainer.device import array_of
+from trainer.kept_results import kept_by_device, kept_for_same
 from trainer.prediction.capture_motion import blurred_spectrum, displaced_spectrum
 from trainer.prediction.panel_gradient import has_panel_gradient, image_with_panel_gradient
 from trainer.prediction.pupil_modes import pupil_modes

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from runtime.lightpath.propagation import band_limit, transfer_function
-from trainer.device import kept_by_device, kept_for_same
+from trainer.kept_results import kept_by_device, kept_for_same
 from trainer.prediction.scene import Scene, bare_stages
 from trainer.prediction.stages import Pupil
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from runtime.lightpath.grid import Grid, band_frequencies, grid_for, image_frequencies
 from runtime.lightpath.propagation import Aperture, check_sampling
 from trainer.captures.bench_file import Bench
-from trainer.device import kept_by_device
+from trainer.kept_results import kept_by_device
 from trainer.prediction.stages import Drive, Panel, Pupil, Sensor
 
 
@@ -126,9 +126,8 @@ def bare_stages(scene: Scene) -> Stages:
         bench.panel.phase_sign * 2 * math.pi * level,
     )
     side = torch.full((2,), math.sqrt(bench.panel.fill_factor), dtype=dtype)
-    source = torch.ones((height, width), dtype=dtype).to(
-        torch.complex64 if dtype == torch.float32 else torch.complex128
-    )
+    # One value in memory, as many scenes are kept.
+    source = torch.ones((), dtype=dtype.to_complex()).expand(height, width)
     panel = Panel(
         scene.channel, scene.wavelength, reference, bench.panel.pitch, panel_y, panel_x, source, None, side
     )
