@@ -17,9 +17,9 @@ from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.definition import Effect
 from trainer.fitting.free_form_effects import refined, with_free_form
 from trainer.fitting.gains import with_gains
-from trainer.fitting.gauss_newton import with_measured_values
+from trainer.fitting.gauss_newton import FitResult, fit, with_measured_values
 from trainer.fitting.predictor import evaluate_captures
-from trainer.fitting.refit import fit_from, least_for_order, raise_orders, settled
+from trainer.fitting.refit import fit_from, least_for_order, raise_orders
 from trainer.model.history import recorded
 from trainer.model.model import EffectInstance, Model
 from trainer.model.parameters import json_values
@@ -93,26 +93,36 @@ def add(
 
 
 def add_from(roles: CaptureRoles, model: Model, start: EffectInstance) -> Model:
-    """The model with an effect fitted from a start, its order raised, and everything present refitted together."""
+    """The model with an effect fitted from a start, everything present refitted together, and orders raised."""
     batches = load(roles.captures, roles.fitted)
-    name = start.effect.name
     fitted = fit_from(model, start, batches)
-    fitted = raise_orders(fitted, [name], batches, least_for_order)
-    model = settled(fitted.model, batches).model if len(fitted.model.names) > 1 else fitted.model
+    if len(fitted.model.names) > 1:
+        fitted = fit(fitted.model, fitted.model.names, batches)
+    return with_orders_raised(roles, fitted)
+
+
+def all_refitted(
+    folder: Path, ids: tuple[str, ...], base: Model, fitted: EffectInstance
+) -> tuple[FitResult, PredictionErrors]:
+    """A model with an effect that was fitted to it alone, all fitted together, and its held-out errors.
+
+    A task for any process.
+    """
+    captures = opened(folder)
+    roles = capture_roles(replace(captures, captures=tuple(chosen(captures, ids))))
+    model = base.having(fitted)
+    found = fit(model, model.names, load(roles.captures, roles.fitted))
+    return found, evaluate_captures(roles.captures, roles.held_out, found.model)
+
+
+def with_orders_raised(roles: CaptureRoles, fitted: FitResult) -> Model:
+    """A fitted model with its effects' orders raised as far as that helps, and numbers by pixel from all captures."""
+    batches = load(roles.captures, roles.fitted)
+    model = raise_orders(fitted, fitted.model.names, batches, least_for_order).model
     by_pixel = [p.effect.name for p in model.present if any(q.per_pixel for q in p.effect.parameters)]
     if by_pixel:  # a number for each pixel asks for all pictures that there are
         model = with_measured_values(model, by_pixel, load(roles.captures, split(roles.captures).fitted))
     return model
-
-
-def with_everything_refitted(
-    folder: Path, ids: tuple[str, ...], base: Model, start: EffectInstance
-) -> tuple[Model, PredictionErrors]:
-    """`add_from` on captures of a folder, and the model's held-out errors: a task for any process."""
-    captures = opened(folder)
-    roles = capture_roles(replace(captures, captures=tuple(chosen(captures, ids))))
-    model = add_from(roles, base, start)
-    return model, evaluate_captures(roles.captures, roles.held_out, model)
 
 
 def gone_on(

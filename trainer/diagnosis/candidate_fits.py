@@ -124,11 +124,18 @@ def try_again(
 
 
 def try_together(
-    folder: Path, ids: tuple[str, ...], held_ids: tuple[str, ...], model: Model, name: str
+    folder: Path, ids: tuple[str, ...], held_ids: tuple[str, ...], model: Model, name: str, raising: bool
 ) -> CandidateFit:
-    """Fit all effects of a model together, and judge it on held-out captures as an explanation by effect `name`."""
+    """Fit all effects of a model together, and judge it on held-out captures as an explanation by effect `name`.
+
+    Parameters
+    ----------
+    raising : bool
+        Raise orders as far as that helps.
+    """
     captures = opened(folder)
-    fitted = settled(model, load(captures, chosen(captures, ids)))
+    batches = load(captures, chosen(captures, ids))
+    fitted = settled(model, batches) if raising else fit(model, model.names, batches)
     return _judged(name, fitted.model, captures, held_ids)
 
 

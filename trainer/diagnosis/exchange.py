@@ -9,7 +9,7 @@ from collections.abc import Mapping
 
 from runtime.excess import PredictionErrors, removed_excess
 from trainer.captures.held_out import CaptureRoles
-from trainer.diagnosis.addition import with_everything_refitted
+from trainer.diagnosis.addition import all_refitted, with_orders_raised
 from trainer.diagnosis.candidate_fits import try_together_on_few
 from trainer.diagnosis.ranking import telling_captures
 from trainer.fitting.pool import Pool
@@ -59,10 +59,14 @@ def exchanged(
     )
     pairs = [pair for pair, excess in zip(pairs, on_few, strict=True) if excess < CLEARLY * left]
     tasks = [(roles.folder, roles.ids, model.without(old), fitted) for old, _, fitted in pairs]
-    found = list(zip(pairs, pool.map_here_if_one(with_everything_refitted, tasks), strict=True))
+    found = list(zip(pairs, pool.map_here_if_one(all_refitted, tasks), strict=True))
     if not found:
         return None
-    (old, new, _), (other, after) = min(found, key=lambda one: one[1][1].excess)
+    (old, new, _), (together, after) = min(found, key=lambda one: one[1][1].excess)
+    if after.excess > CLEARLY * errors.excess:  # before orders are raised, which is most of the work
+        return None
+    other = with_orders_raised(roles, together)
+    after = evaluate_captures(roles.captures, roles.held_out, other)
     if after.excess > CLEARLY * errors.excess or removed_excess(errors, after).interval()[0] <= 0:
         return None
     return old, new, other, after

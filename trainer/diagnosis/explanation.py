@@ -11,7 +11,7 @@ from runtime.excess import PredictionErrors, removed_excess
 from runtime.program.progress import Progress, no_progress, part_of
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import CaptureRoles, capture_roles
-from trainer.diagnosis.addition import gone_on, with_everything_refitted, with_maps_again
+from trainer.diagnosis.addition import all_refitted, gone_on, with_maps_again, with_orders_raised
 from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors, screen_candidates
 from trainer.diagnosis.exchange import exchanged
 from trainer.diagnosis.learned_rest import LearnedRest, learn_rest
@@ -265,15 +265,16 @@ def _added(roles: CaptureRoles, found: Diagnosis, pool: Pool) -> tuple[RankedEff
     """The effect to add, the model with it, everything refitted, and that model's held-out errors.
 
     A candidate is ranked while present effects stay as they are, and these may have taken up a part of the right one.
-    So its closest rival is fitted together with them, too.
+    So its closest rival is fitted together with them, too, before the orders of the better one are raised.
     """
     rival = _rival(found) if found.model.present else None
     ones = [one for one in (found.ranking[0], rival) if one is not None]
     tasks = [(roles.folder, roles.ids, one.base, one.model.instance(one.effect.name)) for one in ones]
-    fitted = pool.map_here_if_one(with_everything_refitted, tasks)
-    if len(ones) > 1 and removed_excess(fitted[0][1], fitted[1][1]).interval()[0] > 0:
-        return ones[1], *fitted[1]
-    return ones[0], *fitted[0]
+    fitted = pool.map_here_if_one(all_refitted, tasks)
+    better = len(ones) > 1 and removed_excess(fitted[0][1], fitted[1][1]).interval()[0] > 0
+    one, (together, _) = (ones[1], fitted[1]) if better else (ones[0], fitted[0])
+    model = with_orders_raised(roles, together)
+    return one, model, evaluate_captures(roles.captures, roles.held_out, model)
 
 
 def _rival(found: Diagnosis) -> RankedEffect | None:

@@ -10,6 +10,7 @@ from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.candidate_fits import CandidateFit
 from trainer.diagnosis.ranking import (
     RankedEffect,
+    fit_with_present,
     raise_orders,
     rank,
     try_all,
@@ -118,6 +119,11 @@ def _first_fits(
     fits = try_near(roles, model, first, [], thresholds.excess, pool, report, 0.3, 0.4)
     if _settled(fits, before, thresholds, ideal_excess):
         return fits
+    if model.present and order[0].after < SETTLES * order[0].before:
+        # Present effects may have taken up a part of one that explains the rest: the screen lets them move.
+        together = fit_with_present(roles, model, fits, thresholds.excess, pool)
+        if _settled(together, before, thresholds, ideal_excess):
+            return together
     rest = [s for s in wanted if s not in first]
     return fits + try_near(roles, model, rest, fits, thresholds.excess, pool, report, 0.4, 0.6)
 

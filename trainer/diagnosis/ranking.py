@@ -10,7 +10,14 @@ from runtime.excess import PredictionErrors, RemovedExcess, removed_excess
 from runtime.program.progress import Progress
 from trainer.captures.capture_table import Capture
 from trainer.captures.held_out import CaptureRoles
-from trainer.diagnosis.candidate_fits import CandidateFit, try_effect, try_further, try_on_few, try_together
+from trainer.diagnosis.candidate_fits import (
+    CandidateFit,
+    try_effect,
+    try_further,
+    try_on_few,
+    try_together,
+    try_together_on_few,
+)
 from trainer.diagnosis.screen import ScreenResult
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.definition import Effect
@@ -207,6 +214,33 @@ def raise_orders(
     return [better.get(f.effect, f) for f in fits]
 
 
+def fit_with_present(
+    roles: CaptureRoles, model: Model, fits: Sequence[CandidateFit], least: float, pool: Pool
+) -> list[CandidateFit]:
+    """Fit candidates once more, each together with the effects that are present, at the orders that they have.
+
+    To few captures first, and to all those that come near the best there.
+
+    Parameters
+    ----------
+    model : Model
+        Without the candidates.
+    least : float
+        Excess that makes no difference.
+    """
+    ids = tuple(c.capture for c in roles.fitted)
+    held = tuple(c.capture for c in roles.held_out)
+    if len(fits) > 1:
+        few = tuple(c.capture for c in telling_captures(roles, model))
+        left = pool.map(
+            try_together_on_few, [(roles.folder, few, model, f.model.instance(f.effect)) for f in fits]
+        )
+        fits = [f for f, there in zip(fits, left, strict=True) if there <= NEAR * min(left) + least]
+    return pool.map_here_if_one(
+        try_together, [(roles.folder, ids, held, f.model, f.effect, False) for f in fits]
+    )
+
+
 def try_together_with_present(
     roles: CaptureRoles, model: Model, fits: Sequence[CandidateFit], pool: Pool
 ) -> tuple[PredictionErrors, list[CandidateFit]]:
@@ -223,8 +257,8 @@ def try_together_with_present(
     ids = tuple(c.capture for c in roles.fitted)
     held = tuple(c.capture for c in roles.held_out)
     closest = sorted(fits, key=lambda f: f.held_out.excess)[:FITTED_TOGETHER]
-    tasks = [(roles.folder, ids, held, model, "")]
-    tasks += [(roles.folder, ids, held, f.model, f.effect) for f in closest]
+    tasks = [(roles.folder, ids, held, model, "", True)]
+    tasks += [(roles.folder, ids, held, f.model, f.effect, True) for f in closest]
     without, *together = pool.map(try_together, tasks)
     return without.held_out, together
 

@@ -37,7 +37,15 @@ def pattern_search(
 
     The edge of an iris is one: its derivative sees one frequency sample, and the next one is unrelated.
     """
-    best, least = start, start_cost(model, predictors, points, start)
+    known: dict[bytes, float] = {}  # steps lead back, and end at the ends of a range
+
+    def cost_of(there: EffectInstance) -> float:
+        place = b"".join(values.tobytes() for values in there.values.values())
+        if place not in known:
+            known[place] = start_cost(model, predictors, points, there)
+        return known[place]
+
+    best, least = start, cost_of(start)
     for factor in (6.0, 3.0, 1.5, 0.75, 0.35, 0.15):
         improved = True
         while improved:
@@ -46,7 +54,7 @@ def pattern_search(
                 for sign in (-1, 1):
                     step = sign * factor * best.effect.parameter(key[1]).scale
                     trial = stepped(model.having(best), key, step).instance(best.effect.name)
-                    cost = start_cost(model, predictors, points, trial)
+                    cost = cost_of(trial)
                     if cost < 0.9999 * least:
                         best, least, improved = trial, cost, True
     return best
