@@ -67,19 +67,37 @@ def try_effect(
 
 
 def try_on_few(
-    folder: Path, ids: tuple[str, ...], model: Model, start: EffectInstance
-) -> tuple[Model, float]:
-    """Fit one effect, with present ones as they are, to a few captures.
+    folder: Path,
+    few: tuple[str, ...],
+    ids: tuple[str, ...],
+    held_ids: tuple[str, ...],
+    model: Model,
+    start: EffectInstance,
+    enough: float,
+) -> tuple[Model, float, CandidateFit | None]:
+    """Fit one effect, with present ones as they are, to a few captures; where it explains these, to all.
+
+    Parameters
+    ----------
+    few : tuple of str
+        Captures to fit first.
+    ids, held_ids : tuple of str
+        Captures to fit then, and captures to judge by.
+    enough : float
+        Excess of the few captures from which on the fit goes on to all.
 
     Returns
     -------
-    (Model, float)
-        The fitted model, and its excess on these same captures: what it cannot explain of them, it cannot explain of
-        all.
+    (Model, float, CandidateFit or None)
+        The model fitted to few captures, and its excess on these same captures: what it cannot explain of them, it
+        cannot explain of all. Then the fit to all captures, where it leaves no more than `enough` of the few.
     """
     captures = opened(folder)
-    fitted = fit_from(model, start, load(captures, chosen(captures, ids)), iterations=8)
-    return fitted.model, fitted.errors.excess
+    fitted = fit_from(model, start, load(captures, chosen(captures, few)), iterations=8)
+    further = None
+    if fitted.errors.excess <= enough:
+        further = try_further(folder, ids, held_ids, fitted.model, start.effect.name, False)
+    return fitted.model, fitted.errors.excess, further
 
 
 def try_together_on_few(folder: Path, ids: tuple[str, ...], model: Model, start: EffectInstance) -> float:
@@ -124,19 +142,22 @@ def try_again(
 
 
 def try_together(
-    folder: Path, ids: tuple[str, ...], held_ids: tuple[str, ...], model: Model, name: str, raising: bool
+    folder: Path, ids: tuple[str, ...], held_ids: tuple[str, ...], model: Model, name: str
 ) -> CandidateFit:
-    """Fit all effects of a model together, and judge it on held-out captures as an explanation by effect `name`.
+    """Fit all effects of a model together, and judge it on held-out captures as an explanation by effect `name`."""
+    captures = opened(folder)
+    fitted = settled(model, load(captures, chosen(captures, ids)))
+    return _judged(name, fitted.model, captures, held_ids)
 
-    Parameters
-    ----------
-    raising : bool
-        Raise orders as far as that helps.
-    """
+
+def try_with_present(
+    folder: Path, ids: tuple[str, ...], held_ids: tuple[str, ...], model: Model, start: EffectInstance
+) -> CandidateFit:
+    """Fit one effect to a model, then all of its effects together at the orders that they have, and judge it."""
     captures = opened(folder)
     batches = load(captures, chosen(captures, ids))
-    fitted = settled(model, batches) if raising else fit(model, model.names, batches)
-    return _judged(name, fitted.model, captures, held_ids)
+    started = fit_from(model, start, batches, iterations=8).model
+    return _judged(start.effect.name, fit(started, started.names, batches).model, captures, held_ids)
 
 
 def _judged(name: str, model: Model, captures: CaptureSet, held_ids: tuple[str, ...]) -> CandidateFit:

@@ -14,8 +14,10 @@ from trainer.captures.held_out import CaptureRoles, capture_roles
 from trainer.diagnosis.addition import all_refitted, gone_on, with_maps_again, with_orders_raised
 from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors, screen_candidates
 from trainer.diagnosis.exchange import exchanged
+from trainer.diagnosis.fitted_ranking import expects_the_rest
 from trainer.diagnosis.learned_rest import LearnedRest, learn_rest
 from trainer.diagnosis.ranking import RankedEffect
+from trainer.diagnosis.screen import ScreenResult
 from trainer.diagnosis.together import explain_together, is_far
 from trainer.diagnosis.unnecessary import without_one
 from trainer.diagnosis.verdict import Thresholds, below_the_noise
@@ -178,6 +180,25 @@ def explain(
             if save:
                 save(model)
 
+    def with_exchanges(
+        model: Model, errors: PredictionErrors, report: Progress
+    ) -> tuple[Model, PredictionErrors, list[ScreenResult]]:
+        """The model with effects exchanged for their rivals, each a step, and the screen of what it lacks.
+
+        While one more effect is expected to explain the rest, there is no reason to doubt those that are present.
+        """
+        while True:
+            screened = screen_candidates(roles, model, known, pool, report)
+            better = None if expects_the_rest(screened) else exchanged(roles, model, errors, rivals, pool)
+            if better is None:
+                return model, errors, screened
+            old, new, model, errors = better
+            del rivals[old]
+            model = recorded(model, new, errors, old)
+            steps.append(ExplanationStep(new, errors, removed=old))
+            if save:
+                save(model)
+
     screened = together = None
     if is_far(roles, model, errors):
         screened = screen_candidates(roles, model, known, pool, report)
@@ -198,6 +219,8 @@ def explain(
         done = len(steps) - 1
         report_share = part_of(report, 1 - 0.6**done, 1 - 0.6**done * 0.6)
         diagnosing = part_of(report_share, 0, 0.9)
+        if rivals and not diagnoses[-1].thresholds.complete(errors.excess, ideal.excess):
+            model, errors, screened = with_exchanges(model, errors, diagnosing)
         found = diagnose(captures, model, known, pool, thresholds, diagnosing, ideal, False, screened)
         screened = None
         diagnoses.append(found)
@@ -231,16 +254,6 @@ def explain(
             save(model)
         newest = best.effect.name
         model, errors = without_unnecessary(model, errors, [n for n in model.names if n != newest])
-        while (
-            not found.thresholds.complete(errors.excess, ideal.excess)
-            and (better := exchanged(roles, model, errors, rivals, pool)) is not None
-        ):
-            old, new, model, errors = better
-            del rivals[old]
-            model = recorded(model, new, errors, old)
-            steps.append(ExplanationStep(new, errors, removed=old))
-            if save:
-                save(model)
         rivals[newest] = {
             r.effect.name: r.model.instance(r.effect.name)
             for r in found.ranking
@@ -272,9 +285,11 @@ def _added(roles: CaptureRoles, found: Diagnosis, pool: Pool) -> tuple[RankedEff
     tasks = [(roles.folder, roles.ids, one.base, one.model.instance(one.effect.name)) for one in ones]
     fitted = pool.map_here_if_one(all_refitted, tasks)
     better = len(ones) > 1 and removed_excess(fitted[0][1], fitted[1][1]).interval()[0] > 0
-    one, (together, _) = (ones[1], fitted[1]) if better else (ones[0], fitted[0])
+    one, (together, errors) = (ones[1], fitted[1]) if better else (ones[0], fitted[0])
     model = with_orders_raised(roles, together)
-    return one, model, evaluate_captures(roles.captures, roles.held_out, model)
+    if model is not together.model:
+        errors = evaluate_captures(roles.captures, roles.held_out, model)
+    return one, model, errors
 
 
 def _rival(found: Diagnosis) -> RankedEffect | None:

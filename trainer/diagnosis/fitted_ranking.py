@@ -9,6 +9,7 @@ from runtime.program.progress import Progress
 from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.candidate_fits import CandidateFit
 from trainer.diagnosis.ranking import (
+    NEAR,
     RankedEffect,
     fit_with_present,
     raise_orders,
@@ -115,17 +116,22 @@ def _first_fits(
         return try_all(roles, model, wanted[:2], pool, report, 0.3, 0.6)
     if thorough:
         return try_all(roles, model, wanted, pool, report, 0.3, 0.6)
-    first = [s for s in promising if s.removed_excess > RIVALS * order[0].removed_excess]
-    fits = try_near(roles, model, first, [], thresholds.excess, pool, report, 0.3, 0.4)
+    if model.present and expects_the_rest(order):
+        # Present effects may have taken up a part of the one that explains the rest: the screen lets them move.
+        first = [s for s in promising if s.after < NEAR * order[0].after + thresholds.excess]
+        fits = fit_with_present(roles, model, first, thresholds.excess, pool)
+    else:
+        first = [s for s in promising if s.removed_excess > RIVALS * order[0].removed_excess]
+        fits = try_near(roles, model, first, [], thresholds.excess, pool, report, 0.3, 0.4)
     if _settled(fits, before, thresholds, ideal_excess):
         return fits
-    if model.present and order[0].after < SETTLES * order[0].before:
-        # Present effects may have taken up a part of one that explains the rest: the screen lets them move.
-        together = fit_with_present(roles, model, fits, thresholds.excess, pool)
-        if _settled(together, before, thresholds, ideal_excess):
-            return together
     rest = [s for s in wanted if s not in first]
     return fits + try_near(roles, model, rest, fits, thresholds.excess, pool, report, 0.4, 0.6)
+
+
+def expects_the_rest(screened: Sequence[ScreenResult]) -> bool:
+    """Whether the screen expects one effect, with the present ones free, to leave next to nothing."""
+    return any(s.after < SETTLES * s.before for s in screened)
 
 
 def _settled(

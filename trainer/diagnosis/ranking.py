@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,7 @@ from trainer.diagnosis.candidate_fits import (
     try_on_few,
     try_together,
     try_together_on_few,
+    try_with_present,
 )
 from trainer.diagnosis.screen import ScreenResult
 from trainer.diagnosis.verdict import Thresholds
@@ -150,19 +151,33 @@ def try_near(
     telling = telling_captures(roles, model)
     few = tuple(c.capture for c in telling)
     screened = sorted(screened, key=lambda s: not s.start.effect.rugged)
-    tasks = [(roles.folder, few, model, s.start) for s in screened]
-    share = (end - start) / max(1, len(tasks))
-    fits = pool.map(try_on_few, tasks, lambda n: report(start + n * share, "fitting candidates"))
+    ids, held = (tuple(c.capture for c in rows) for rows in (roles.fitted, roles.held_out))
     before, *compared = (
         evaluate_captures(roles.captures, telling, one).excess for one in (model, *(f.model for f in others))
     )
-    left = min(compared + [excess for _, excess in fits])
-    again = [
-        (fitted, s.effect)
-        for (fitted, excess), s in zip(fits, screened, strict=True)
-        if left > LITTLE * before or excess <= _near(left, before, least, len(s.start.effect.orders) > 1)
-    ]
-    return try_further_all(roles, again, False, pool)
+    surely_near = min(least, before / 2)  # whatever others leave
+    tasks = [(roles.folder, few, ids, held, model, s.start, surely_near) for s in screened]
+    share = (end - start) / max(1, len(tasks))
+    fits = pool.map(try_on_few, tasks, lambda n: report(start + n * share, "fitting candidates"))
+    left = min(compared + [excess for _, excess, _ in fits])
+
+    def near(raising: bool) -> list[str]:
+        return [
+            s.effect
+            for (_, excess, _), s in zip(fits, screened, strict=True)
+            if left > LITTLE * before
+            or excess <= _near(left, before, least, raising and len(s.start.effect.orders) > 1)
+        ]
+
+    def to_all(names: Collection[str]) -> list[CandidateFit]:
+        chosen = [(fit, s) for fit, s in zip(fits, screened, strict=True) if s.effect in names]
+        rest = [(fitted, s.effect) for (fitted, _, further), s in chosen if further is None]
+        return [further for (*_, further), _ in chosen if further] + try_further_all(roles, rest, False, pool)
+
+    found = to_all(near(raising=left > surely_near))
+    if left <= surely_near < min(f.held_out.excess for f in (*others, *found)):
+        found += to_all(set(near(raising=True)) - {f.effect for f in found})
+    return found
 
 
 def telling_captures(roles: CaptureRoles, model: Model) -> list[Capture]:
@@ -215,29 +230,26 @@ def raise_orders(
 
 
 def fit_with_present(
-    roles: CaptureRoles, model: Model, fits: Sequence[CandidateFit], least: float, pool: Pool
+    roles: CaptureRoles, model: Model, screened: Sequence[ScreenResult], least: float, pool: Pool
 ) -> list[CandidateFit]:
-    """Fit candidates once more, each together with the effects that are present, at the orders that they have.
+    """Fit candidates at their lowest order, each together with the effects that are present.
 
-    To few captures first, and to all those that come near the best there.
+    Several are fitted to few captures first, and those that come near the best there to all.
 
     Parameters
     ----------
-    model : Model
-        Without the candidates.
     least : float
         Excess that makes no difference.
     """
     ids = tuple(c.capture for c in roles.fitted)
     held = tuple(c.capture for c in roles.held_out)
-    if len(fits) > 1:
+    if len(screened) > 1:
         few = tuple(c.capture for c in telling_captures(roles, model))
-        left = pool.map(
-            try_together_on_few, [(roles.folder, few, model, f.model.instance(f.effect)) for f in fits]
-        )
-        fits = [f for f, there in zip(fits, left, strict=True) if there <= NEAR * min(left) + least]
+        left = pool.map(try_together_on_few, [(roles.folder, few, model, s.start) for s in screened])
+        most = NEAR * min(left) + least
+        screened = [s for s, there in zip(screened, left, strict=True) if there <= most]
     return pool.map_here_if_one(
-        try_together, [(roles.folder, ids, held, f.model, f.effect, False) for f in fits]
+        try_with_present, [(roles.folder, ids, held, model, s.start) for s in screened]
     )
 
 
@@ -257,8 +269,8 @@ def try_together_with_present(
     ids = tuple(c.capture for c in roles.fitted)
     held = tuple(c.capture for c in roles.held_out)
     closest = sorted(fits, key=lambda f: f.held_out.excess)[:FITTED_TOGETHER]
-    tasks = [(roles.folder, ids, held, model, "", True)]
-    tasks += [(roles.folder, ids, held, f.model, f.effect, True) for f in closest]
+    tasks = [(roles.folder, ids, held, model, "")]
+    tasks += [(roles.folder, ids, held, f.model, f.effect) for f in closest]
     without, *together = pool.map(try_together, tasks)
     return without.held_out, together
 

@@ -1,0 +1,43 @@
+"""Which candidate ranks first where present effects have taken up a part of the one that is missing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.trainer.hidden import bench_file
+from trainer.captures.acquire import acquire_from
+from trainer.captures.capture_set import read_captures
+from trainer.captures.held_out import capture_roles
+from trainer.diagnosis.addition import add_from
+from trainer.diagnosis.candidate_fits import try_effect
+from trainer.diagnosis.diagnosis import diagnose
+from trainer.effects.effect_catalogue import catalogue
+from trainer.fitting.gains import with_gains
+from trainer.fitting.pool import open_pool
+from trainer.model.model import Model, absent
+
+HIDDEN = ("phase_response", "illumination", "zero_order")
+
+
+def test_the_one_that_explains_the_rest_with_present_effects_free_ranks_first(tmp_path: Path) -> None:
+    acquire_from(
+        str(bench_file(tmp_path, *(f'kind = "{name}"' for name in HIDDEN))),
+        tmp_path / "captures",
+        patterns=6,
+    )
+    captures = read_captures(tmp_path / "captures")
+    roles = capture_roles(captures)
+    known = {name: catalogue()[name] for name in (*HIDDEN, "amplitude_modulation")}
+    model = with_gains(captures, Model(captures.bench), roles.fitted)
+    for name in HIDDEN[:2]:
+        model = add_from(roles, model, absent(known[name], captures.bench))
+    fitted, held = (tuple(c.capture for c in rows) for rows in (roles.fitted, roles.held_out))
+    alone = {
+        name: try_effect(captures.folder, fitted, held, model, absent(known[name], captures.bench), True)
+        for name in ("amplitude_modulation", "zero_order")
+    }
+    assert alone["amplitude_modulation"].held_out.excess < 0.5 * alone["zero_order"].held_out.excess
+    with open_pool(1) as pool:
+        found = diagnose(captures, model, known, pool, thorough=False)
+    assert found.best is not None and found.best.effect.name == "zero_order"
+    assert found.best.held_out.excess < 0.02 * found.held_out.excess
