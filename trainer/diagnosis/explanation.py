@@ -221,6 +221,7 @@ def explain(
         diagnosing = part_of(report_share, 0, 0.9)
         if rivals and not diagnoses[-1].thresholds.complete(errors.excess, ideal.excess):
             model, errors, screened = with_exchanges(model, errors, diagnosing)
+            diagnosing = part_of(diagnosing, 0.3, 1)  # from where a screen ends
         found = diagnose(captures, model, known, pool, thresholds, diagnosing, ideal, False, screened)
         screened = None
         diagnoses.append(found)
