@@ -42,3 +42,15 @@ def part_of(progress: Progress, begin: float, end: float, name: str = "") -> Pro
         progress(begin + (end - begin) * done, said)
 
     return part
+
+
+def forward_only(progress: Progress) -> Progress:
+    """A callback that never goes back: work that came to nothing, and whose like begins again, was work, too."""
+    farthest = 0.0
+
+    def told(done: float, what: str = "") -> None:
+        nonlocal farthest
+        farthest = max(farthest, done)
+        progress(farthest, what)
+
+    return told

@@ -33,7 +33,7 @@ from runtime.program.options import (
     one_of,
 )
 from runtime.program.program import Program
-from runtime.program.progress import part_of
+from runtime.program.progress import forward_only, part_of
 from runtime.program.screen import Screen
 from trainer import cli as trainer_cli
 
@@ -334,3 +334,11 @@ def test_a_part_of_the_work_says_its_share_of_the_whole() -> None:
     part(0)
     part(0.5, "half of it")
     assert said == [(pytest.approx(0.6), "the rest"), (pytest.approx(0.8), "the rest: half of it")]
+
+
+def test_progress_does_not_go_back_where_work_begins_again() -> None:
+    said: list[tuple[float, str]] = []
+    told = forward_only(lambda done, what="": said.append((done, what)))
+    for done, what in ((0.1, "a"), (0.3, "a"), (0.0, "b"), (0.2, "b"), (0.4, "b")):
+        told(done, what)
+    assert said == [(0.1, "a"), (0.3, "a"), (0.3, "b"), (0.3, "b"), (0.4, "b")]

@@ -72,22 +72,6 @@ def test_an_order_is_raised_as_far_as_the_captures_ask_and_no_farther(tmp_path: 
     assert best.model.present[0].values["log_gain"] == pytest.approx(terms, abs=3e-3)
 
 
-def test_a_fit_that_cannot_be_worth_it_ends_after_one_step(tmp_path: Path) -> None:
-    effect = KNOWN["distance"]
-    captures = captures_with(tmp_path, effect, {"offset": 0.3}, patterns=3)
-    batches = batches_of(captures)
-    far = Model(captures.bench).having(absent(effect, captures.bench))
-    whole = fit(far, ["distance"], batches).errors.excess
-    step = fit(far, ["distance"], batches, iterations=1).errors.excess
-    assert step > 1.5 * max(whole, 1e-4)  # one step is not enough
-    ideal = fit(Model(captures.bench), [], batches).errors.excess
-    removed = ideal - step
-    assert fit(far, ["distance"], batches, worth=1.9 * removed).errors.excess == pytest.approx(
-        whole, abs=1e-6
-    )
-    assert fit(far, ["distance"], batches, worth=2.1 * removed).errors.excess == step
-
-
 def test_orders_of_two_effects_are_raised_together(tmp_path: Path) -> None:
     effect = KNOWN["vignetting"]
     terms = np.zeros(legendre_count(4))

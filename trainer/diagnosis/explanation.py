@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from runtime.excess import PredictionErrors, removed_excess
-from runtime.program.progress import Progress, no_progress, part_of
+from runtime.program.progress import Progress, forward_only, no_progress, part_of
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import CaptureRoles, capture_roles
 from trainer.diagnosis.addition import all_refitted, gone_on, with_maps_again, with_orders_raised
@@ -150,7 +150,7 @@ def explain(
         Learn what nothing named explains, at the stages that the probes name.
     """
     thresholds = thresholds or Thresholds()
-    report = progress or no_progress
+    report = forward_only(progress or no_progress)
     roles = capture_roles(captures)
     model = with_gains(captures, model, roles.fitted)
     errors = evaluate_captures(captures, roles.held_out, model)
@@ -221,7 +221,6 @@ def explain(
         diagnosing = part_of(report_share, 0, 0.9)
         if rivals and not diagnoses[-1].thresholds.complete(errors.excess, ideal.excess):
             model, errors, screened = with_exchanges(model, errors, diagnosing)
-            diagnosing = part_of(diagnosing, 0.3, 1)  # from where a screen ends
         found = diagnose(captures, model, known, pool, thresholds, diagnosing, ideal, False, screened)
         screened = None
         diagnoses.append(found)

@@ -65,7 +65,6 @@ def fit(
     progress: Progress | None = None,
     hold: float = 0.0,
     fixed: Collection[tuple[str, str]] = (),
-    worth: float = 0.0,
 ) -> FitResult:
     """Fit the named effects of a model, and the gains, to batches.
 
@@ -85,14 +84,12 @@ def fit(
         well, those nearest to "absent" are found. For tables of derivatives only, as `fixed` is.
     fixed : collection of (str, str)
         Effects and those of their parameters that keep their values.
-    worth : float
-        Excess that the fit must remove to be of use: it ends where its first step removes less than half of that.
     """
     with torch.no_grad():
         many = tuple(n for n in free if has_many(model.instance(n)))
         if many:
             return _fit_many(model, tuple(free), many, batches, iterations, tolerance, progress)
-        return _fit(model, tuple(free), batches, iterations, tolerance, progress, hold, fixed, worth)
+        return _fit(model, tuple(free), batches, iterations, tolerance, progress, hold, fixed)
 
 
 def _fit(
@@ -104,7 +101,6 @@ def _fit(
     progress: Progress | None,
     hold: float,
     fixed: Collection[tuple[str, str]],
-    worth: float,
 ) -> FitResult:
     predictors = [Predictor(model, b) for b in batches]
     keys = tuple(key for key in keys_of(model, free) if key[:2] not in fixed)
@@ -145,8 +141,6 @@ def _fit(
         elif fresh:
             break
         removed_excess = before - errors.excess
-        if iteration == 0 and removed_excess < worth / 2:
-            break
         if fresh and removed_excess < max(tolerance * abs(errors.excess), 2e-6):
             break
         # Secants are costly: they are used again while a step still removes more than half of what is left.

@@ -89,7 +89,7 @@ def raise_orders(
         trial = _with_orders_that_pay(fitted.model, names, rising, batches, LEAST_EXPECTED * needed)
         if trial is None:
             return fitted
-        better = fit(trial, names, batches, iterations=8, hold=hold, fixed=fixed, worth=needed)
+        better = fit(trial, names, batches, iterations=8, hold=hold, fixed=fixed)
         if fitted.errors.excess - better.errors.excess < needed:
             return fitted
         fitted = better
