@@ -10,7 +10,7 @@ import ctypes
 import errno
 import os
 import tempfile
-from typing import Any
+from typing import IO, Any
 
 from firmware_iface.virtual.i2c.bus import Message, MessageBus, failure
 from firmware_iface.virtual.i2c.packet_error_code import pec
@@ -20,25 +20,30 @@ FUNCTIONS = 0x00000001 | 0x0EFF0008
 
 _nodes: dict[tuple[int, int], MessageBus] = {}  # (device, inode) of an open node: its bus
 _opened: dict[tuple[int, int, int], list[int]] = {}  # (fd, device, inode): [address, PEC on]
-_paths: dict[str, tuple[int, int]] = {}
+_files: dict[
+    str, IO[bytes]
+] = {}  # path of a node: its file, which no folder lists, so that none is left behind
 
 
 def attach(bus: MessageBus) -> str:
-    """A path that smbus2.SMBus can open, with `bus` behind it. `detach` removes it."""
+    """A path that smbus2.SMBus can open in this process, with `bus` behind it. `detach` removes it."""
     _patch()
-    fd, path = tempfile.mkstemp(prefix="i2c-")
-    status = os.fstat(fd)
-    os.close(fd)
-    _paths[path] = (status.st_dev, status.st_ino)
-    _nodes[_paths[path]] = bus
+    file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115 `detach` closes it
+    path = f"/dev/fd/{file.fileno()}"
+    _files[path] = file
+    _nodes[_inode(file)] = bus
     return path
 
 
 def detach(path: str) -> None:
     """Remove a node; transfers on files that are still open then fail with ENODEV."""
-    inode = _paths.pop(path)
-    _nodes[inode] = _MissingBus()
-    os.unlink(path)
+    with _files.pop(path) as file:
+        _nodes[_inode(file)] = _MissingBus()
+
+
+def _inode(file: IO[bytes]) -> tuple[int, int]:
+    status = os.fstat(file.fileno())
+    return status.st_dev, status.st_ino
 
 
 class _MissingBus:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
+import tempfile
+from pathlib import Path
 
 import pytest
 import smbus2
@@ -109,6 +111,17 @@ def test_a_removed_node_answers_nothing(bench: Bench) -> None:
         with pytest.raises(OSError) as raised:
             bus.read_byte_data(0x20, 0)
         assert raised.value.errno == errno.ENODEV
+
+
+def test_a_node_leaves_no_file_behind_a_process_that_is_killed(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    node = attach(bench.board.bus)
+    with smbus2.SMBus(node) as bus:
+        assert bus.read_byte_data(0x20, 0) == bench.bus.read_byte_data(0x20, 0)
+    assert list(tmp_path.iterdir()) == []  # which is all that a killed process leaves
+    detach(node)
 
 
 def write(bench: Bench, address: int, *data: int) -> None:
