@@ -122,3 +122,18 @@ def test_a_value_that_changes_nothing_has_no_error_instead_of_none_at_all(tmp_pa
     said = json_values(found, captures.bench)
     assert plain(said)["shift_y_px"]["error"] is None
     assert "±" not in describe(found, captures.bench)
+
+
+def test_a_value_that_changes_nothing_holds_no_other_up(tmp_path: Path) -> None:
+    # The drift of a laser's power is measured: its spread matters only where it is zero. A step by its derivative,
+    # which is rounding alone, would go anywhere, and no other number would move where that is zero.
+    moved, drift = 'kind = "distance"\noffset_mm = 0.1', 'kind = "laser_drift"'
+    acquire_from(str(bench_file(tmp_path, moved, drift)), tmp_path / "captures", patterns=3)
+    captures = read_captures(tmp_path / "captures")
+    drifting = Model(captures.bench).having(
+        instance_with(KNOWN["laser_drift"], captures.bench, {"spread": 0.5})
+    )
+    for offset in (0.06, 0.08, 0.12, 0.14):
+        start = instance_with(KNOWN["distance"], captures.bench, {"offset": offset})
+        found = fit(drifting.having(start), ["distance", "laser_drift"], batches_of(captures)).model
+        assert float(found.instance("distance").values["offset"]) == pytest.approx(0.1, abs=0.005)

@@ -31,7 +31,6 @@ from trainer.fitting.predictor import Predictor, lights_of
 from trainer.model.model import Model, Values
 
 HOLD = 0.01  # `hold` of fits far from the truth
-NO_CHANGE = 1e-5  # of the signal's rms: where a number's scale changes less, captures do not determine it
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,7 @@ def fit(
 
     Stops after `iterations`, or when a step lowers the excess by less than `tolerance` of it and less than 2e-6.
     Errors of values are standard errors from the residuals themselves (a sandwich estimate), so misfit widens them; NaN
-    where the captures do not determine a value.
+    where the captures do not determine a value: such a value stays as it is.
 
     Parameters
     ----------
@@ -151,7 +150,7 @@ def _fit(
     model = with_measured_values(model, free, batches)
     inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
     covariance = inverse @ scatter @ inverse
-    spread = _spread(model, keys, covariance, normal, scale)
+    spread = _spread(keys, covariance, normal)
     return FitResult(_with_errors(model, keys, spread), errors, covariance, keys)
 
 
@@ -174,7 +173,6 @@ def _fit_many(
         model = with_gain(model, predictors, lights_of(model, predictors, points))
     channels = list(dict.fromkeys(b.channel for b in batches))
     residuals, errors = weighted_residuals(model, predictors, points)
-    scale = signal_variance(batches)
     for iteration in range(iterations):
         if progress:
             progress(iteration / iterations)
@@ -211,7 +209,7 @@ def _fit_many(
     whole[np.ix_(places, places)] = covariance
     inner = np.arange(len(keys), len(every))
     whole[inner, inner] = spread_of_many**2
-    spread = np.concatenate([_spread(model, keys, covariance, normal, scale), spread_of_many])
+    spread = np.concatenate([_spread(keys, covariance, normal), spread_of_many])
     return FitResult(_with_errors(model, every, spread), errors, whole, every)
 
 
@@ -277,18 +275,11 @@ def _moved(
     return replace(model, gain=gain)
 
 
-def _spread(
-    model: Model,
-    keys: tuple[tuple[str, str, int], ...],
-    covariance: np.ndarray,
-    normal: np.ndarray,
-    signal: float,
-) -> np.ndarray:
+def _spread(keys: tuple[tuple[str, str, int], ...], covariance: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Standard errors of the numbers; NaN for one that the captures do not determine, as it changes nothing in them."""
-    scales = np.array([model.instance(e).effect.parameter(p).scale for e, p, _ in keys])
     count = len(keys)
     spread = np.sqrt(np.maximum(np.diag(covariance)[:count], 0))
-    return np.where(np.diag(normal)[:count] * scales**2 > NO_CHANGE**2 * signal, spread, np.nan)
+    return np.where(np.diag(normal)[:count] > 0, spread, np.nan)
 
 
 def _with_errors(model: Model, keys: tuple[tuple[str, str, int], ...], spread: np.ndarray) -> Model:

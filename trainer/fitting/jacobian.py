@@ -15,6 +15,7 @@ from trainer.fitting.side_by_side import side_by_side
 from trainer.model.model import Model
 from trainer.prediction.predict import Trace
 
+NO_CHANGE = 1e-5  # of the prediction: what a number's scale must change for captures to determine it
 STEP = 0.1  # of a parameter's scale: large against single precision's rounding, small against curvature
 
 
@@ -72,20 +73,25 @@ def columns(
     -------
     tensor [B, h, w], counts
     list of tensors [B, h, w]
-        Change a unit of each parameter, then of the logarithm of the gain.
+        Change a unit of each parameter, then of the logarithm of the gain. Zero for a number that changes nothing here,
+        where the difference would be rounding alone.
     """
     light = predictor.light(model, point)
     base = predictor.counts(model, light)
+    least = NO_CHANGE * float(torch.linalg.vector_norm(base))
 
-    def slope(key: tuple[str, str, int]) -> Tensor:
-        step = column_step(model, key)
-        stage = model.instance(key[0]).effect.stage
-        moved = predictor.predict(stepped(model, key, step), stage, point)
-        return (moved - base) / step
+    def slope(moved: Tensor, step: float, scale: float) -> Tensor:
+        found = (moved - base) / step
+        return found if scale * float(torch.linalg.vector_norm(found)) > least else torch.zeros_like(found)
 
-    result = side_by_side(slope, keys, base[0].numel())
+    def of_number(key: tuple[str, str, int]) -> Tensor:
+        step, effect = column_step(model, key), model.instance(key[0]).effect
+        moved = predictor.predict(stepped(model, key, step), effect.stage, point)
+        return slope(moved, step, effect.parameter(key[1]).scale)
+
+    result = side_by_side(of_number, keys, base[0].numel())
     louder = replace(model, gain={c: g * 1.01 for c, g in model.gain.items()})
-    result.append((predictor.counts(louder, light) - base) / 0.01)
+    result.append(slope(predictor.counts(louder, light), 0.01, 1.0))
     return base, result
 
 
