@@ -8,7 +8,7 @@ from typing import Any
 
 from firmware_iface.configured_devices import laser_channels
 from firmware_iface.lasers.channels import MA_PER_V, PHOTODIODE_FULL_V, LaserChannel
-from firmware_iface.lasers.lasers import TOLERANCE
+from firmware_iface.lasers.photodiode_watch import TOLERANCE
 
 SAME_COLOUR_NM = 15.0  # wavelengths that differ by less may be of one laser
 

@@ -29,9 +29,8 @@ from firmware_iface.lasers.channels import LaserChannel
 from firmware_iface.lasers.eye_safety import GatedLight
 from firmware_iface.lasers.i2c_transfers import open_bus
 from firmware_iface.lasers.laser_board import LaserBoard
-from firmware_iface.lasers.mcp4728 import VOLTS_PER_CODE
 from firmware_iface.lasers.pattern_power import LightBudget
-from firmware_iface.lasers.recent_codes import RecentCodes
+from firmware_iface.lasers.photodiode_watch import PhotodiodeWatch
 from firmware_iface.lasers.safety_controller import Command, Input, State
 
 if TYPE_CHECKING:
@@ -39,17 +38,6 @@ if TYPE_CHECKING:
 
 BEAT_S, SOONEST_BEAT_S = 0.025, 0.006
 RAMP_S, RAMP_STEPS = 0.100, 20  # a rise of 5 ms a step is twice as slow as the safety controller's limiter
-TOLERANCE, FLOOR_V = 0.2, 0.02  # of the photodiode's voltage
-
-MISSING = {
-    Input.KEY: "turn the key on",
-    Input.INTERLOCK: "close the interlock",
-    Input.HEARTBEAT: "send the heartbeat at least every 50 ms",
-    Input.DARK: "the DAC is not dark; switch the board off and on",
-    Input.COOL: "let the lasers cool down",
-    Input.QUIET: "the photodiodes see too much light",
-    Input.CEILINGS: "the ceilings are not written; open the lasers again",
-}
 
 
 class LatchedError(DeviceError):
@@ -100,15 +88,15 @@ class Lasers:
         self._unlit: frozenset[str] = frozenset()
         self.board = LaserBoard(bus)
         self._fractions = [0.0] * len(channels)
-        self._codes = RecentCodes(len(channels), 0.0 if gated is None else gated.frame_s)
-        self._token = 0
-        self._beat_at = self._changed_at = self._selected_at = -math.inf
-        self._selected, self._ramping = 0, False
-        self._closed = False
+        self._watch = PhotodiodeWatch(
+            self.board.converter, channels, clock, held_s=0.0 if gated is None else gated.frame_s
+        )
+        self._token, self._beat_at = 0, -math.inf
+        self._ramping = self._closed = False
         with self._dark_on_failure():
             self.board.set_up(self._lasers)
             self._token = self.board.controller.token()
-            self._select(0)
+            self._watch.select(0)
         _open.add(self)
 
     # --- the headset's interface
@@ -152,7 +140,7 @@ class Lasers:
                 raise DeviceError(
                     "the DAC did not go dark on command, so the lasers were switched off otherwise."
                 )
-        self._changed_at = self._clock()
+        self._watch.changed()
 
     # --- arming and staying alive
 
@@ -170,7 +158,7 @@ class Lasers:
             self.board.controller.command(Command.CLEAR)
             held = self.board.controller.state() is State.FAULT
             needed = Input.INTERLOCK | Input.DARK | Input.COOL | Input.QUIET
-            missing = self._missing(needed) if held else ""
+            missing = self.board.controller.missing_text(needed) if held else ""
         if held:
             raise DeviceError(f"the fault cannot be cleared: {missing}.")
 
@@ -192,7 +180,8 @@ class Lasers:
                 self.board.controller.command(Command.ARM_FIRST)
                 self.board.controller.command(Command.ARM_SECOND)
                 state = self.board.controller.state()
-            latched, missing = self._latched(), self._missing(Input(0x7F))
+            latched = self.board.controller.faults_text()
+            missing = self.board.controller.missing_text(Input(0x7F))
         if state is State.FAULT:
             raise DeviceError(f"a fault is latched ({latched}); find its cause, then clear() and arm().")
         if state is State.OFF:
@@ -220,7 +209,7 @@ class Lasers:
             self._raise_latched()
             self._check_photodiode()
             if not self._ramping:
-                self._select((self._selected + 1) % len(self._lasers))
+                self._watch.select_next()
 
     def ramp(self, channel: str, fraction: float) -> Iterator[None]:
         """`set_power`, a step at a time: yields between steps, which should be 5 ms apart.
@@ -235,7 +224,7 @@ class Lasers:
         ):
             raise InputError(f"power {fraction!r} of laser '{channel}' is not a fraction; give 0 to 1.")
         self._budget.check(self._powers() | {channel: float(fraction)})
-        start, end = self._codes.now[k], self._lasers[k].code(fraction)
+        start, end = self._watch.code(k), self._lasers[k].code(fraction)
         if end <= start:
             with self._dark_on_failure():
                 self._put(k, end)
@@ -244,7 +233,7 @@ class Lasers:
         with self._dark_on_failure():
             self._raise_latched()
             armed = self.board.controller.state() in (State.ARMED, State.EMIT)
-            self._select(k)
+            self._watch.select(k)
         if not armed:
             raise DeviceError("the lasers are not armed; arm() them first.")
         self._fractions[k] = float(fraction)
@@ -332,35 +321,15 @@ class Lasers:
 
     def _check_photodiode(self) -> None:
         """Compare the selected photodiode with its expected voltage, once the light has settled."""
-        if self._clock() - max(self._changed_at, self._selected_at) < RAMP_S / RAMP_STEPS - 1e-6:
-            return
-        k = self._selected
-        if self.channels[k] in self._unlit:
-            return
-        measured_v = self.board.converter.volts()
-        lowest_v, highest_v = (
-            self._lasers[k].photodiode_v(c * VOLTS_PER_CODE) for c in self._codes.bounds(k, self._clock())
-        )
-        lowest_allowed_v = (1 - TOLERANCE) * lowest_v - FLOOR_V
-        if lowest_allowed_v <= measured_v <= (1 + TOLERANCE) * highest_v + FLOOR_V:
-            return
-        self._raise_latched()
-        raise DeviceError(
-            f"laser '{self.channels[k]}' should make {highest_v:.3f} V at its photodiode and makes "
-            f"{measured_v:.3f} V, so the lasers were switched off; check the photodiode, "
-            "the calibration, and that the set point of the laser's controller is 0."
-        )
+        wrong = self._watch.deviation(self._unlit)
+        if wrong:
+            self._raise_latched()
+            raise DeviceError(wrong)
 
     def _raise_latched(self) -> None:
         if self.board.controller.state() is State.FAULT:
-            raise LatchedError(f"the safety controller has switched the lasers off: {self._latched()}.")
-
-    def _latched(self) -> str:
-        return ", ".join(f.name.lower() for f in self.board.controller.faults() if f.name)
-
-    def _missing(self, needed: Input) -> str:
-        inputs = self.board.controller.inputs()
-        return "; ".join(MISSING[i] for i in needed if not inputs & i) or "it gives no reason; try again"
+            latched = self.board.controller.faults_text()
+            raise LatchedError(f"the safety controller has switched the lasers off: {latched}.")
 
     # --- single actions
 
@@ -377,13 +346,9 @@ class Lasers:
         self._beat_at = self._clock()
 
     def _put(self, k: int, code: int) -> None:
-        self._codes.put(k, code, self._clock())
+        self._watch.expect(k, code)
         self.board.dac.set_code(k, code)
-        self._changed_at = self._clock()
-
-    def _select(self, k: int) -> None:
-        self.board.converter.select(k)
-        self._selected, self._selected_at = k, self._clock()
+        self._watch.changed()
 
     @contextmanager
     def _dark_on_failure(self) -> Iterator[None]:
@@ -412,9 +377,7 @@ class Lasers:
 
     def _forget(self) -> None:
         self._fractions = [0.0] * len(self._lasers)
-        for k in range(len(self._lasers)):
-            self._codes.put(k, 0, self._clock())
-        self._changed_at = self._clock()
+        self._watch.expect_darkness()
 
     def close(self) -> None:
         """Dark, disarmed, every enable off; the bus is closed. May be called again."""

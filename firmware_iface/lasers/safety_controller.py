@@ -37,6 +37,17 @@ class Input(IntFlag):
     KEY, INTERLOCK, HEARTBEAT, DARK, COOL, QUIET, CEILINGS = 1, 2, 4, 8, 16, 32, 64
 
 
+TO_DO = {
+    Input.KEY: "turn the key on",
+    Input.INTERLOCK: "close the interlock",
+    Input.HEARTBEAT: "send the heartbeat at least every 50 ms",
+    Input.DARK: "the DAC is not dark; switch the board off and on",
+    Input.COOL: "let the lasers cool down",
+    Input.QUIET: "the photodiodes see too much light",
+    Input.CEILINGS: "the ceilings are not written; open the lasers again",
+}  # where a condition does not hold
+
+
 class Command(IntEnum):
     """Commands, register COMMAND."""
 
@@ -102,6 +113,15 @@ class SafetyController:
     def inputs(self) -> Input:
         """The conditions that hold now."""
         return Input(self._read(INPUTS, 1))
+
+    def faults_text(self) -> str:
+        """The names of its latched faults."""
+        return ", ".join(f.name.lower() for f in self.faults() if f.name)
+
+    def missing_text(self, needed: Input) -> str:
+        """What to do about those of the needed conditions that do not hold now."""
+        inputs = self.inputs()
+        return "; ".join(TO_DO[i] for i in needed if not inputs & i) or "it gives no reason; try again"
 
     def command(self, command: Command) -> None:
         """Send a command; the controller ignores what its conditions forbid."""
