@@ -12,6 +12,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
+
 from firmware_iface.errors import InputError
 
 FULL = 1.0  # power where none is given: the most that the safety controller allows
@@ -55,12 +57,53 @@ class Devices:
             self.lasers.set_power(channel, self.power.get(channel, FULL))
 
 
+class CameraInLight:
+    """A camera whose pictures are of lasers that no fault has switched off: of darkness, nothing can be learned.
+
+    Parameters
+    ----------
+    camera : Camera
+        All else is as it does it.
+    lasers : GuardedLasers
+        Their guard knows of a fault within 25 ms, so it may be the next picture that is refused.
+    """
+
+    __slots__ = ("_camera", "_lasers")
+
+    def __init__(self, camera: Any, lasers: Any) -> None:
+        self._camera, self._lasers = camera, lasers
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._camera, name)
+
+    @property
+    def exposure_ms(self) -> float:
+        """As the camera's."""
+        return float(self._camera.exposure_ms)
+
+    @exposure_ms.setter
+    def exposure_ms(self, value: float) -> None:
+        self._camera.exposure_ms = value
+
+    def capture(self) -> np.ndarray:
+        """A picture, uint16 counts [h, w].
+
+        Raises
+        ------
+        DeviceError
+            Where the lasers have been switched off by a fault; it says which.
+        """
+        counts: np.ndarray = self._camera.capture()
+        self._lasers.heartbeat()
+        return counts
+
+
 @contextmanager
 def open_devices(spec: str, seed: int = 0, fields: int = 1, pulses: int = 1) -> Iterator[Devices]:
     """The devices of `virtual:NAME`, of a virtual bench's TOML file, or of a service's configuration; dark at the end.
 
     With a configuration, the lasers are armed, in a guard process that switches them off when this process ends in any
-    way.
+    way, and a picture that is taken after a fault of the lasers raises DeviceError.
 
     Parameters
     ----------
@@ -125,7 +168,7 @@ def open_tables(tables: Mapping[str, Any], fields: int = 1, pulses: int = 1) -> 
         lasers.arm()
         stack.enter_context(lasers.beating())
         stack.callback(lasers.off)
-        yield Devices(panel, lasers, camera, laser_power(tables["lasers"]))
+        yield Devices(panel, lasers, CameraInLight(camera, lasers), laser_power(tables["lasers"]))
 
 
 @contextmanager
