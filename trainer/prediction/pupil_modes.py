@@ -40,7 +40,7 @@ def _modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
     if pupil.lines is None:
         offsets, weights = torch.zeros(1, dtype=scene.dtype), torch.ones(1, dtype=scene.dtype)
     else:
-        offsets, weights = pupil.lines
+        offsets, weights = _lit(*pupil.lines)
     opening = iris_opening(scene, pupil)
     if pupil.transmission is not None:
         opening = opening * pupil.transmission
@@ -54,6 +54,14 @@ def _modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
             mode = mode * torch.polar(torch.ones_like(angle), angle)
         modes.append(mode)
     return torch.stack(modes), weights
+
+
+def _lit(offsets: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Lines of the laser without those that have no light: a picture of each costs as much as any."""
+    if weights.requires_grad:
+        return offsets, weights
+    lit = weights != 0
+    return (offsets[lit], weights[lit]) if bool(lit.any()) else (offsets, weights)
 
 
 def _free_space(scene: Scene, pupil: Pupil, offset: Tensor) -> Tensor:
