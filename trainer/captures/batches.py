@@ -16,7 +16,7 @@ from runtime.excess import PredictionErrors, prediction_errors
 from runtime.lightpath.grid import MARGIN
 from trainer.captures.bench_file import Bench
 from trainer.captures.capture_set import CaptureSet
-from trainer.captures.capture_table import Capture, Moment
+from trainer.captures.capture_table import Capture, Moment, ids_of
 from trainer.captures.held_out import scenes
 from trainer.captures.smoothing import smoothed
 from trainer.device import array_of
@@ -177,7 +177,7 @@ def load_batch(captures: CaptureSet, chosen: list[Capture], dtype: torch.dtype =
     return Batch(
         chosen[0].channel,
         chosen[0].plane_mm,
-        tuple(c.capture for c in chosen),
+        ids_of(chosen),
         torch.as_tensor(np.stack(grays)),
         torch.as_tensor(np.stack(signals), dtype=dtype),
         torch.as_tensor(np.stack(weights), dtype=dtype),

@@ -6,6 +6,7 @@ import csv
 import io
 import math
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
@@ -76,6 +77,11 @@ class Capture:
     def rows(self) -> tuple[Capture, ...]:
         """The rows of captures.csv that this is: itself, or a bracket's frames, the shortest exposure first."""
         return self.frames or (self,)
+
+
+def ids_of(captures: Iterable[Capture]) -> tuple[str, ...]:
+    """Ids of captures, in their order: what a task for another process is given in their place."""
+    return tuple(c.capture for c in captures)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from trainer.captures.capture_set import CaptureSet
-from trainer.captures.capture_table import Capture
+from trainer.captures.capture_table import Capture, ids_of
 from trainer.captures.signal_present import with_signal
 
 FIT_PIXELS = 4 * 240 * 320  # about four small pictures hold a few dozen parameters to far below the noise
@@ -169,7 +169,7 @@ class CaptureRoles:
     @property
     def ids(self) -> tuple[str, ...]:
         """Ids of all captures of the set, which may be a part of those in its folder."""
-        return tuple(c.capture for c in self.captures.captures)
+        return ids_of(self.captures.captures)
 
 
 def capture_roles(captures: CaptureSet) -> CaptureRoles:

@@ -13,6 +13,7 @@ from runtime.program.progress import Progress, no_progress
 from trainer.captures.bench_file import Camera
 from trainer.captures.camera_numbers import camera_of_residual
 from trainer.captures.capture_set import CaptureSet
+from trainer.captures.capture_table import ids_of
 from trainer.captures.held_out import CaptureRoles, capture_roles, scenes
 from trainer.diagnosis.bench_facts import EqualFact, EqualFacts, camera_facts, equal_facts
 from trainer.diagnosis.fitted_ranking import fitted_ranking
@@ -305,7 +306,7 @@ def screen_all(
     """Screen every effect, shared out among the pool's workers."""
     # More shares than workers, so that none waits long for the last; each costs the slopes of all that is present.
     shares = min(SHARES * pool.workers if pool.workers > 1 else 1, len(effects)) or 1
-    ids = tuple(c.capture for c in roles.screened)
+    ids = ids_of(roles.screened)
     tasks = [(roles.folder, ids, model, tuple(effects[k::shares])) for k in range(shares)]
     report(0.05, f"screening {len(effects)} effects")
     results = pool.map(
@@ -318,8 +319,7 @@ def probe_all(
     roles: CaptureRoles, model: Model, before: PredictionErrors, pool: Pool, report: Progress
 ) -> list[ProbeResult]:
     """Fit each stage's free-form probe alone."""
-    ids = tuple(c.capture for c in roles.probed)
-    held = tuple(c.capture for c in roles.held_out)
+    ids, held = ids_of(roles.probed), ids_of(roles.held_out)
     tasks = [(roles.folder, ids, held, model, stage) for stage in STAGES]
     report(0.7, "probing the stages")
     found = pool.map(probe, tasks, lambda n: report(0.7 + 0.25 * n / len(tasks), "probing the stages"))

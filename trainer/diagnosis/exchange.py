@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from runtime.excess import PredictionErrors, removed_excess
+from trainer.captures.capture_table import ids_of
 from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.addition import all_refitted, with_orders_raised
 from trainer.diagnosis.candidate_fits import try_together_on_few
@@ -53,7 +54,7 @@ def exchanged(
     # What a model cannot explain of few captures, with its numbers free to suit these alone, it cannot explain of all.
     few = telling_captures(roles, model)
     left = evaluate_captures(roles.captures, few, model).excess
-    ids = tuple(c.capture for c in few)
+    ids = ids_of(few)
     on_few = pool.map_here_if_one(
         try_together_on_few, [(roles.folder, ids, model.without(old), fitted) for old, _, fitted in pairs]
     )

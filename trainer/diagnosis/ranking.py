@@ -8,7 +8,7 @@ from typing import Any
 
 from runtime.excess import PredictionErrors, RemovedExcess, removed_excess
 from runtime.program.progress import Progress
-from trainer.captures.capture_table import Capture
+from trainer.captures.capture_table import Capture, ids_of
 from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.candidate_fits import (
     CandidateFit,
@@ -104,8 +104,7 @@ def try_all(
     start, end : float
         Shares of the diagnosis at which these fits begin and end.
     """
-    ids = tuple(c.capture for c in roles.fitted)
-    held = tuple(c.capture for c in roles.held_out)
+    ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
     # The longest first, so that no process is left with one of them at the end.
     screened = sorted(screened, key=lambda s: not s.start.effect.rugged)
 
@@ -149,9 +148,9 @@ def try_near(
     if len(screened) + len(others) < 2:
         return try_all(roles, model, screened, pool, report, start, end)
     telling = telling_captures(roles, model)
-    few = tuple(c.capture for c in telling)
+    few = ids_of(telling)
     screened = sorted(screened, key=lambda s: not s.start.effect.rugged)
-    ids, held = (tuple(c.capture for c in rows) for rows in (roles.fitted, roles.held_out))
+    ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
     before, *compared = (
         evaluate_captures(roles.captures, telling, one).excess for one in (model, *(f.model for f in others))
     )
@@ -201,8 +200,7 @@ def try_further_all(
     roles: CaptureRoles, fitted: Sequence[tuple[Model, str]], raising: bool, pool: Pool
 ) -> list[CandidateFit]:
     """Go on with fits of one effect in each model, and raise its order as far as that helps if that is asked for."""
-    ids = tuple(c.capture for c in roles.fitted)
-    held = tuple(c.capture for c in roles.held_out)
+    ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
     return pool.map(try_further, [(roles.folder, ids, held, model, name, raising) for model, name in fitted])
 
 
@@ -241,10 +239,9 @@ def fit_with_present(
     least : float
         Excess that makes no difference.
     """
-    ids = tuple(c.capture for c in roles.fitted)
-    held = tuple(c.capture for c in roles.held_out)
+    ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
     if len(screened) > 1:
-        few = tuple(c.capture for c in telling_captures(roles, model))
+        few = ids_of(telling_captures(roles, model))
         left = pool.map(try_together_on_few, [(roles.folder, few, model, s.start) for s in screened])
         most = NEAR * min(left) + least
         screened = [s for s, there in zip(screened, left, strict=True) if there <= most]
@@ -266,8 +263,7 @@ def try_together_with_present(
         Held-out errors of the present effects alone, all fitted together.
     list of CandidateFit
     """
-    ids = tuple(c.capture for c in roles.fitted)
-    held = tuple(c.capture for c in roles.held_out)
+    ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
     closest = sorted(fits, key=lambda f: f.held_out.excess)[:FITTED_TOGETHER]
     tasks = [(roles.folder, ids, held, model, "")]
     tasks += [(roles.folder, ids, held, f.model, f.effect) for f in closest]

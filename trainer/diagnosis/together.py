@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from runtime.excess import PredictionErrors, removed_excess
 from runtime.program.progress import Progress, no_progress, part_of
 from trainer.captures.batches import load
+from trainer.captures.capture_table import ids_of
 from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.addition import gone_on
 from trainer.diagnosis.candidate_fits import try_again
@@ -124,8 +125,7 @@ def _from_another_start(
     What an effect took up while the others were far from right may keep all of them from where they belong: the leak
     of a panel that is bent, say, what the panel's wavefront still lacked.
     """
-    ids = tuple(c.capture for c in roles.fitted)
-    held = tuple(c.capture for c in roles.held_out)
+    ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
     names = [p.effect.name for p in model.present if p.nodes is None]
     found = pool.map(try_again, [(roles.folder, ids, held, model, name) for name in names])
     best = min((f for f in found if f is not None), key=lambda f: f.held_out.excess, default=None)

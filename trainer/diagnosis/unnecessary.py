@@ -10,6 +10,7 @@ import torch
 from runtime.excess import PredictionErrors, removed_excess
 from trainer.captures.batches import load, signal_variance
 from trainer.captures.capture_set import chosen, opened
+from trainer.captures.capture_table import ids_of
 from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.verdict import Thresholds
 from trainer.fitting.gauss_newton import HOLD, fit
@@ -53,7 +54,7 @@ def without_one(
     (str, Model, PredictionErrors) or None
         What was left out, and the model without it, refitted.
     """
-    ids, held = (tuple(c.capture for c in rows) for rows in (roles.fitted, roles.held_out))
+    ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
     least = thresholds.least(ideal_excess)
     names = _in_doubt(roles, model, names, least) if names else []
     raising = thorough and not thresholds.complete(errors.excess, ideal_excess)

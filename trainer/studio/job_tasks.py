@@ -17,6 +17,7 @@ from runtime.program.progress import Progress
 from trainer.captures.batches import load
 from trainer.captures.block_means import blocks
 from trainer.captures.capture_set import CaptureSet, chosen, opened
+from trainer.captures.capture_table import ids_of
 from trainer.captures.check_set import check_captures
 from trainer.captures.held_out import capture_roles
 from trainer.captures.problems import Problem
@@ -180,8 +181,7 @@ def try_own(
         one = find_effect(known, name)
         batches = load(captures, roles.screened)
         start = screen_batches(batches, model, (one,))[0].start
-        ids = tuple(c.capture for c in roles.fitted)
-        held = tuple(c.capture for c in roles.held_out)
+        ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
         fits.append(try_effect(folder, ids, held, model, start, True))
     ranking = rank(before, fits, known, Thresholds(), ideal.excess, len(known))
     return ranking, previews(captures, model, ranking)

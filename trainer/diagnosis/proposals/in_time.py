@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from trainer.captures.capture_table import Capture
+from trainer.captures.capture_table import Capture, ids_of
 from trainer.captures.held_out import CaptureRoles, split
 from trainer.diagnosis.proposals.drifting_maps import FREE, drifting_maps, strengths_of
 from trainer.diagnosis.proposals.gray_shape import smooth_in_gray
@@ -45,7 +45,7 @@ def candidates_in_time(
     steady : sequence of Candidate
         Shapes that the probes show, those that promise most first.
     """
-    ids = tuple(c.capture for c in read_captures_in_time(roles))
+    ids = ids_of(read_captures_in_time(roles))
     if len(ids) < LEAST_CAPTURES:
         return []
     maps = pool.map(drifting_maps, [(roles.folder, ids, model, stage) for stage in STAGES])

@@ -13,6 +13,7 @@ from firmware_iface.errors import InputError
 from runtime.excess import PredictionErrors, RemovedExcess, removed_excess
 from runtime.program.progress import Progress, no_progress, part_of
 from trainer.captures.batches import load
+from trainer.captures.capture_table import ids_of
 from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.candidate_fits import CandidateFit, try_effect
 from trainer.diagnosis.probes import ProbeResult, probe
@@ -198,11 +199,11 @@ class RoundWork:
 
     @property
     def _held(self) -> tuple[str, ...]:
-        return tuple(c.capture for c in self.roles.held_out)
+        return ids_of(self.roles.held_out)
 
     @property
     def _probed(self) -> tuple[str, ...]:
-        return tuple(c.capture for c in self.roles.probed)
+        return ids_of(self.roles.probed)
 
     def _best(self, before: PredictionErrors, fits: Fits) -> str | None:
         """The name of the fit to accept: of those that the captures cannot tell apart, the one of fewest numbers."""
@@ -226,7 +227,7 @@ class RoundWork:
         self, model: Model, candidates: Sequence[Candidate], report: Progress, name: str = ""
     ) -> Fits:
         """Candidates as effects in the model, by name; those whose file does not load or fit are left out."""
-        few, more = (tuple(c.capture for c in rows) for rows in (self.roles.fitted, self.roles.probed))
+        few, more = ids_of(self.roles.fitted), ids_of(self.roles.probed)
         named: dict[str, Candidate] = {}
         tasks = []
         for candidate in candidates:
