@@ -311,7 +311,7 @@ def test_evaluate_prints_its_keys(tmp_path: Path, capsys: pytest.CaptureFixture[
 @pytest.mark.slow
 def test_every_method_of_evaluate_runs(tmp_path: Path) -> None:
     found = run_evaluation(
-        str(bench_file(tmp_path, "zero_order")), sizes=EvaluationSizes(2, 20, 20), workers=1
+        str(bench_file(tmp_path, "zero_order")), sizes=EvaluationSizes(2, 20, 60), workers=1
     )
     assert [row["method"] for row in found["prediction"]] == list(PREDICTION)
     assert [row["method"] for row in found["display"]] == list(DISPLAY)
