@@ -180,7 +180,7 @@ class Lasers:
                 self.board.controller.command(Command.ARM_FIRST)
                 self.board.controller.command(Command.ARM_SECOND)
                 state = self.board.controller.state()
-            latched = self.board.controller.faults_text()
+            latched = ", ".join(self.board.controller.fault_names())
             missing = self.board.controller.missing_text(Input(0x7F))
         if state is State.FAULT:
             raise DeviceError(f"a fault is latched ({latched}); find its cause, then clear() and arm().")
@@ -311,7 +311,7 @@ class Lasers:
             used = self._budget.exposure(fractions)
             return {
                 "state": self.board.controller.state().name.lower(),
-                "faults": [f.name.lower() for f in self.board.controller.faults() if f.name],
+                "faults": self.board.controller.fault_names(),
                 "holds": {i.name.lower(): bool(inputs & i) for i in Input if i.name},
                 "power": fractions,
                 "celsius": round(self.board.thermometer.celsius(), 2),
@@ -328,7 +328,7 @@ class Lasers:
 
     def _raise_latched(self) -> None:
         if self.board.controller.state() is State.FAULT:
-            latched = self.board.controller.faults_text()
+            latched = ", ".join(self.board.controller.fault_names())
             raise LatchedError(f"the safety controller has switched the lasers off: {latched}.")
 
     # --- single actions

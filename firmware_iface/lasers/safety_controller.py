@@ -114,9 +114,9 @@ class SafetyController:
         """The conditions that hold now."""
         return Input(self._read(INPUTS, 1))
 
-    def faults_text(self) -> str:
+    def fault_names(self) -> list[str]:
         """The names of its latched faults."""
-        return ", ".join(f.name.lower() for f in self.faults() if f.name)
+        return [f.name.lower() for f in self.faults() if f.name]
 
     def missing_text(self, needed: Input) -> str:
         """What to do about those of the needed conditions that do not hold now."""

@@ -12,9 +12,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import numpy as np
-
 from firmware_iface.errors import InputError
+from runtime.headset.followed_camera import FollowedCamera
 
 FULL = 1.0  # power where none is given: the most that the safety controller allows
 FRAMES_HZ = 60.0  # of an emulated panel
@@ -55,47 +54,6 @@ class Devices:
         self.lasers.off()
         for channel in channels:
             self.lasers.set_power(channel, self.power.get(channel, FULL))
-
-
-class CameraInLight:
-    """A camera whose pictures are of lasers that no fault has switched off: of darkness, nothing can be learned.
-
-    Parameters
-    ----------
-    camera : Camera
-        All else is as it does it.
-    lasers : GuardedLasers
-        Their guard knows of a fault within 25 ms, so it may be the next picture that is refused.
-    """
-
-    __slots__ = ("_camera", "_lasers")
-
-    def __init__(self, camera: Any, lasers: Any) -> None:
-        self._camera, self._lasers = camera, lasers
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._camera, name)
-
-    @property
-    def exposure_ms(self) -> float:
-        """As the camera's."""
-        return float(self._camera.exposure_ms)
-
-    @exposure_ms.setter
-    def exposure_ms(self, value: float) -> None:
-        self._camera.exposure_ms = value
-
-    def capture(self) -> np.ndarray:
-        """A picture, uint16 counts [h, w].
-
-        Raises
-        ------
-        DeviceError
-            Where the lasers have been switched off by a fault; it says which.
-        """
-        counts: np.ndarray = self._camera.capture()
-        self._lasers.heartbeat()
-        return counts
 
 
 @contextmanager
@@ -168,7 +126,9 @@ def open_tables(tables: Mapping[str, Any], fields: int = 1, pulses: int = 1) -> 
         lasers.arm()
         stack.enter_context(lasers.beating())
         stack.callback(lasers.off)
-        yield Devices(panel, lasers, CameraInLight(camera, lasers), laser_power(tables["lasers"]))
+        # Of lasers that a fault has put out, nothing can be learned; their guard knows of one within 25 ms.
+        lit = FollowedCamera(camera, lambda _: lasers.heartbeat())
+        yield Devices(panel, lasers, lit, laser_power(tables["lasers"]))
 
 
 @contextmanager

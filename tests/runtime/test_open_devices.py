@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from firmware_iface.errors import DeviceError
-from runtime.headset.open_devices import CameraInLight, open_devices
+from runtime.headset.followed_camera import FollowedCamera
+from runtime.headset.open_devices import open_devices
 from tests.campaigns.headset import SHAPE, hardware, write_configuration
 
 pytestmark = pytest.mark.usefixtures("only_service")
@@ -31,11 +32,8 @@ def test_the_camera_is_otherwise_the_one_that_was_opened() -> None:
     class Camera:
         bit_depth, exposure_ms = 10, 5.0
 
-    class Lasers:
-        pass
-
     camera = Camera()
-    lit = CameraInLight(camera, Lasers())
+    lit = FollowedCamera(camera, lambda counts: None)
     lit.exposure_ms = 7
     assert (lit.bit_depth, lit.exposure_ms, camera.exposure_ms) == (10, 7, 7)
     assert getattr(lit, "longest_exposure_ms", 3) == 3

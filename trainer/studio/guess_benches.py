@@ -14,6 +14,7 @@ from firmware_iface.errors import InputError
 from firmware_iface.virtual import CATALOGUE_KINDS, BenchDescription, VirtualHeadset, make_defect
 from firmware_iface.virtual.bench_description import ChannelDescription
 from runtime.bundle.whole_files import whole_file
+from runtime.headset.followed_camera import FollowedCamera
 from trainer.captures.acquire import acquire_captures
 from trainer.captures.block_means import blocks
 from trainer.captures.open_bench import nominal_bench
@@ -96,38 +97,16 @@ def capture_guess(say: Say, kind: str, number: int, folder: Path) -> Path:
 
 @dataclass
 class _WatchedHeadset:
-    """A headset whose pictures somebody watches."""
+    """A headset whose pictures somebody watches, smaller than they are."""
 
     headset: VirtualHeadset
     watch: Callable[[np.ndarray], None]
 
     def __post_init__(self) -> None:
-        self.camera = _WatchedCamera(self.headset.camera, self.watch)
+        self.camera = FollowedCamera(self.headset.camera, self._tell)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.headset, name)
 
-
-class _WatchedCamera:
-    """A camera whose pictures somebody watches, smaller than they are."""
-
-    def __init__(self, camera: Any, watch: Callable[[np.ndarray], None]) -> None:
-        self._camera, self._watch = camera, watch
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._camera, name)
-
-    @property
-    def exposure_ms(self) -> float:
-        """Exposure time, ms."""
-        return float(self._camera.exposure_ms)
-
-    @exposure_ms.setter
-    def exposure_ms(self, value: float) -> None:
-        self._camera.exposure_ms = value
-
-    def capture(self) -> np.ndarray:
-        """One picture, uint16 [h, w]."""
-        counts = np.asarray(self._camera.capture())
-        self._watch(blocks(counts.astype(np.float32), max(1, -(-max(counts.shape) // SHOWN_PX))))
-        return counts
+    def _tell(self, counts: np.ndarray) -> None:
+        self.watch(blocks(counts.astype(np.float32), max(1, -(-max(counts.shape) // SHOWN_PX))))
