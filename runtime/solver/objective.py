@@ -20,6 +20,9 @@ Array = Any
 # Share of the panel's band up to which irradiance is computed once a pixel. Up to a half that is exact; at 0.7, of
 # 540 x 960 pixels and after 20 iterations, it gives 37.7 dB where the fine grid gives 37.8 for four times the work.
 OPEN = 0.75
+# Of the irradiance that the first pattern gives. Light that goes elsewhere leaves a descent more freedom, so without a
+# limit it ends in the dark: 120 x 160 pixels keep 85 % after 100 iterations, 68 % after 300 and 28 % after 1000.
+KEPT = 0.5
 
 
 class Objective:
@@ -49,6 +52,8 @@ class Objective:
     ----------
     rounding : SoftLevels or None
         What a panel of few levels makes of a phase.
+    most_scale : list of float
+        The limit of each colour's scale, on amplitude: see `keep_light`. Not applied to light after D.
     """
 
     def __init__(
@@ -87,6 +92,10 @@ class Objective:
         self.floor: list[float] = []
         self.looks = 0
         self.scale = [1.0] * len(stacks)
+        self.most_scale = [math.inf] * len(stacks)
+        self.least = [0.0] * len(stacks)  # irradiance of the brightest pixel
+        self.brightest = [1.0] * len(stacks)  # that is asked for
+        self.contrast = [1.0] * len(stacks)  # the same over the mean of all pixels
         self.asked, self.lit = ([1.0] * len(stacks) for _ in range(2))
         self.loss, self.squared_error, self.peak = math.inf, math.inf, 1.0
 
@@ -104,6 +113,9 @@ class Objective:
                     wanted += FLOOR
                     xp.sqrt(wanted, out=wanted)
             self.asked[c] = self._mean(xp.asarray(targets[c]))
+            self.brightest[c] = float(np.max(targets[c]))
+            self.contrast[c] = self.brightest[c] / mean
+        self._limit()
         self.floor = []
         top = float(self.wanted.max())
         self.peak = top if self.approximator is None and not bare else math.sqrt(top)
@@ -132,12 +144,27 @@ class Objective:
         for c in range(len(self.stacks)):
             planes = range(self.wanted.shape[1])
             sums = [self._measure(c, k) for k in planes]
-            self.scale[c] = self.penalty.scale(tuple(map(sum, zip(*sums, strict=True))))
+            self.scale[c] = self.penalty.scale(tuple(map(sum, zip(*sums, strict=True))), self.most_scale[c])
             for k in planes:
                 part = self._slope(c, k)
                 loss, squares = loss + part[0], squares + part[1]
         self.loss, self.squared_error = loss / self.pixels, squares / self.pixels
         return self.loss
+
+    def keep_light(self) -> None:
+        """From now on, ask of the brightest pixel for at least a share `KEPT` of what it got at the last look.
+
+        Or of the panel's own irradiance, where it got more; also for other pictures.
+        """
+        for c, given in enumerate(self.given):
+            self.least[c] = KEPT * min(self.power[c], given * self.brightest[c])
+        self._limit()
+
+    def _limit(self) -> None:
+        self.most_scale = [
+            math.sqrt(contrast / least) if least else math.inf
+            for contrast, least in zip(self.contrast, self.least, strict=True)
+        ]
 
     def gradient(self, phase: Array, out: Array) -> None:
         """Gradient of the loss's sum over pixels over the patterns' phases of the last `look`, written to `out`."""

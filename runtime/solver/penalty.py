@@ -1,6 +1,7 @@
 """Penalties: how far light is from a target, and the slope of that, with the scale in closed form.
 
-The light is compared up to one scale c, which is eliminated: for each pattern it has its best value. A penalty
+The light is compared up to one scale c, which is eliminated: for each pattern it has its best value, up to a limit, as
+a pattern that loses its light would be nearer to any picture. A penalty
 works on strips, in place. `measure` prepares `light` and returns the sums from which `scale` finds c; `slope`
 then turns it into the loss's gradient over light and returns (loss, squared error of amplitude).
 
@@ -33,9 +34,9 @@ class Amplitude:
         return _dots(xp, light, wanted, weight)
 
     @staticmethod
-    def scale(sums: Sums) -> float:
-        """c, from the summed results of `measure`."""
-        return sums[0] / max(sums[1], 1e-30)
+    def scale(sums: Sums, most: float) -> float:
+        """c, from the summed results of `measure`, up to `most`, a factor on amplitude."""
+        return min(sums[0] / max(sums[1], 1e-30), most)
 
     def slope(self, root: Array, wanted: Array, weight: Array | None, scale: float, error: Array) -> Sums:
         """`root`, from `measure`, becomes dLoss / dI; `error` is room."""
@@ -99,6 +100,10 @@ class Irradiance(Amplitude):
     def measure(self, light: Array, wanted: Array, weight: Array | None, floor: float) -> Sums:
         """`light` stays; `wanted` is the target itself."""
         return _dots(self.xp, light, wanted, weight)
+
+    @staticmethod
+    def scale(sums: Sums, most: float) -> float:
+        return Amplitude.scale(sums, most**2)
 
     def slope(self, light: Array, wanted: Array, weight: Array | None, scale: float, error: Array) -> Sums:
         xp = self.xp

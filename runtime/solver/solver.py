@@ -150,6 +150,7 @@ class Solver:
         self.follows = False  # whether `best` is of the picture in `before`
         self.best = self.phases[0]
         self.given: tuple[float, ...] = ()  # of `best`
+        self.cold = False  # whether phases[0] is a start from the targets alone
         self.begin, self.step, self.finish = Pace(), Pace(), Pace()
 
     def solve(
@@ -190,6 +191,7 @@ class Solver:
         targets, begun = self._begun(target, iterations, deadline_ms)
         phase = self.phases[0]
         optics_targets = self._aim(targets)
+        self.cold = start is None
         if start is None:
             self.first.cold(optics_targets, phase)
         else:
@@ -231,8 +233,10 @@ class Solver:
             self.first.warm(
                 self.best, motion, parts, optics_targets, self.phases[0], room, self._is_still(targets)
             )
+            self.cold = False
         else:
             self.first.cold(optics_targets, self.phases[0], soon=True)
+            self.cold = True
         return self._improve(targets, begun, iterations, deadline_ms, None)
 
     def rehearse(self, target: np.ndarray | None = None) -> Solution:
@@ -246,6 +250,7 @@ class Solver:
             self.begin, self.step, self.finish = Pace(), Pace(), Pace()
             begun = time.perf_counter()
             self.first.cold(self._aim(targets), self.phases[0])
+            self.cold = True
             solution = self._improve(targets, begun, 3, None, None)
         self.before, self.best[...], self.follows = before, best, follows
         self.first.fits = False
@@ -334,6 +339,8 @@ class Solver:
         self.given = self.objective.given
         clock = time.perf_counter()
         if not history:
+            if self.cold:
+                self.objective.keep_light()
             history.append(self.objective.psnr_db)
             self.begin.took(1e3 * (clock - begun))
         while True:

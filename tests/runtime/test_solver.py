@@ -10,7 +10,7 @@ import pytest
 
 from firmware_iface.errors import InputError
 from runtime.lightpath.light_path import LightPath, irradiance, panel_phase, pixel_irradiance
-from runtime.solver import DriveRange, Quality, quality, quality_of, solve
+from runtime.solver import DriveRange, Quality, Solver, quality, quality_of, solve
 from tests.runtime.benches import converted, ideal_path, padded_irradiance, random_path, scene
 
 SHAPE, DISTANCE = (96, 128), 0.015
@@ -132,6 +132,30 @@ def test_the_gray_level_is_the_one_whose_phase_is_nearest_on_the_circle(
     assert (chosen <= nearest + step).all()
     if turns <= 1:  # beyond a turn there are two candidates, and the one in reach without a turn is taken
         assert np.mean(chosen <= nearest + 1e-9) > 0.95
+
+
+@pytest.mark.parametrize("penalty", ["amplitude", "irradiance", "l1"])
+def test_a_long_descent_does_not_end_in_the_dark(penalty: str) -> None:
+    """Light beside the iris leaves more freedom: without a limit the picture keeps a tenth of its light."""
+    shape = (24, 32)
+    path, target = ideal_path(shape, 6e-3, 0.7, np.float32), scene(shape)
+    first, last = (solve(path, target, n, penalty=penalty) for n in (0, 1000))
+    assert _light(path, last.gray) > 0.45 * _light(path, first.gray)
+    assert last.quality.psnr_db > first.quality.psnr_db + 9
+
+
+def test_a_picture_that_stays_does_not_end_in_the_dark() -> None:
+    """Each frame goes on from the pattern of the one before."""
+    shape = (24, 32)
+    path, target = ideal_path(shape, 6e-3, 0.7, np.float32), scene(shape)
+    solver = Solver(path)
+    first, *_, last = (_light(path, solver.frame(target, 10).gray) for _ in range(100))
+    assert last > 0.45 * first
+
+
+def _light(path: LightPath, gray: np.ndarray) -> float:
+    """Mean irradiance of a pattern on the picture."""
+    return float(pixel_irradiance(path, irradiance(path, panel_phase(path, gray))).mean())
 
 
 def test_a_start_may_be_given_and_progress_is_reported(ideal: LightPath) -> None:

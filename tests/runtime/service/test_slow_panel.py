@@ -64,7 +64,10 @@ def seen(folder: Path, share: float) -> Seen:
 
     def captured(number: int) -> float:
         found: list[float] = []
+        tried = 0
         while len(found) < number:
+            tried += 1
+            assert tried < 20 * number, f"{len(found)} of {tried} captures have light"
             frame()
             light = lane.client.capture().astype(float) - BLACK
             state = lane.client.status().lasers
