@@ -5,8 +5,8 @@ kind = "board"                or "dlpc900", TI's phase light modulator, or "mirr
                               "MODULE:FUNCTION", a function of yours that opens one (firmware_iface.own_device)
 bus = "virtual:SOCKET"        emulated hardware (firmware_iface.virtual.served); without it, the host's USB
 serial = "HL0001"             where several are attached
-refresh_hz = 60.0             of the panel itself; with fields, of a field
-fields = 3                    board, dlpc900: patterns in turn, a field each, with lasers gated to them: 3 for three
+refresh_hz = 60.0             of the panel itself; with fields, of a field: 180 for three on a display of 60 Hz
+fields = 3                    not mirrored: patterns in turn, a field each, with lasers gated to them: 3 for three
                               colours, 6 for two patterns of each; without it, one colour and one pattern (version 1 of
                               the board's protocol)
 modulator = "p47"             dlpc900: or "p67"
@@ -51,7 +51,6 @@ from firmware_iface.toml_tables import parameter, read_table
 
 Table = Mapping[str, Any]
 
-WITH_FIELDS = ("board", "dlpc900")
 MOST_LASERS = 3  # of a board: no more colours are shown in turn
 KINDS = {"panel": ("board", "dlpc900", "mirrored"), "camera": ("oak", "virtual")}
 
@@ -110,7 +109,7 @@ def open_panel(table: Table, gated: GatedLight | None = None) -> Any:
     settings = _panel_table(table)
     period_us = round(1e6 / settings.refresh_hz)
     if settings.kind not in KINDS["panel"]:
-        return open_own(settings.kind, "panel")
+        return _budgeted(_with_fields(open_own(settings.kind, "panel"), settings, period_us), gated)
     if settings.kind == "mirrored":
         return open_mirrored(max(0, settings.display), (settings.height, settings.width))
     if settings.kind == "dlpc900":
@@ -141,6 +140,20 @@ def open_panel(table: Table, gated: GatedLight | None = None) -> Any:
         ),
         gated,
     )
+
+
+def _with_fields(panel: Any, settings: PanelTable, field_us: int) -> Any:
+    """A panel of the lab's own, if it shows frames of as many fields as [panel] says, each as long as it says."""
+    if settings.fields == 1:
+        return panel
+    found = f"{panel.fields} of {panel.field_us} µs" if isinstance(panel, FieldPanel) else "one"
+    if found != f"{settings.fields} of {field_us} µs":
+        panel.close()
+        raise InputError(
+            f"[panel] has {settings.fields} fields of {field_us} µs, and what '{settings.kind}' opens shows {found}; "
+            "give that function's result as many, or change fields and refresh_hz"
+        )
+    return panel
 
 
 def _budgeted(panel: Any, gated: GatedLight | None) -> Any:
@@ -257,10 +270,9 @@ def check_tables(tables: Mapping[str, Table]) -> None:
 def _panel_table(table: Table) -> PanelTable:
     settings = read_table(PanelTable, table, "[panel]")
     check_kind(settings.kind, "panel", KINDS["panel"])
-    if settings.fields > 1 and settings.kind not in WITH_FIELDS:
+    if settings.fields > 1 and settings.kind == "mirrored":
         raise InputError(
-            f"a panel of kind '{settings.kind}' in [panel] shows one colour; leave fields out, or use one of "
-            f"{', '.join(WITH_FIELDS)}"
+            "a panel of kind 'mirrored' in [panel] shows one colour; leave fields out, or use board or dlpc900"
         )
     return settings
 

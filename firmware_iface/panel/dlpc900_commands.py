@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from firmware_iface.errors import DeviceError, InputError
+from firmware_iface.panel.fields import Field
 from firmware_iface.usb_link import UsbLink
 
 OUT, IN, PACKET = 0x01, 0x81, 64
@@ -22,6 +23,7 @@ RECEIVER, SOURCE, LED_ENABLES = 0x1A01, 0x1A00, 0x1A07
 DISPLAY_MODE, PATTERN, PATTERN_LUT, PATTERN_ENTRY = 0x1A1B, 0x1A24, 0x1A31, 0x1A34
 IMAGE_BEGIN, IMAGE_DATA = (0x1A2A, 0x1A2C), (0x1A2B, 0x1A2D)  # primary and secondary controller
 STOP, START = 0, 2
+RUNNING = 0x02  # of the main status
 BY_SEQUENCER = 0x08  # LED enables follow the colour bits of the pattern table, and nothing else
 EVERY_COLOUR = 0b111  # bit 0 red, 1 green, 2 blue
 SHORTEST_US = 105  # exposure of a one-bit pattern
@@ -62,9 +64,13 @@ class PatternLine:
     colours: int = EVERY_COLOUR
     trigger: bool = True
 
-    def as_bytes(self, position: int) -> bytes:
-        """The 12 bytes of the table's line for the image's bit at `position`, which is also the line's number."""
-        options = self.colours << 4 | 1  # one bit deep; cleared afterwards; does not wait for a trigger
+    def as_bytes(self, position: int, waits: bool = False) -> bytes:
+        """The 12 bytes of the table's line for the image's bit at `position`, which is also the line's number.
+
+        Where it waits for a trigger, which is the display's next frame in video-pattern mode, the pattern stays until
+        then; otherwise it is cleared after its exposure.
+        """
+        options = self.colours << 4 | (0x80 if waits else 1)  # one bit deep
         return (
             struct.pack("<H", position)
             + self.exposure_us.to_bytes(3, "little")
@@ -73,6 +79,28 @@ class PatternLine:
             + bytes([not self.trigger])  # 1 disables trigger output 2
             + struct.pack("<H", position << 11)
         )
+
+
+def lines_of(fields: Sequence[Field], field_us: int, name: str) -> list[PatternLine]:
+    """The pattern table of a frame of fields: each is exposed as long as its light lasts, and dark for the rest.
+
+    The mirrors move within microseconds, so the light begins with the field, whatever its delay. Trigger output 2 fires
+    with the first field alone, for a camera.
+
+    Raises
+    ------
+    InputError
+        For a laser without an LED enable.
+    """
+    lines = []
+    for number, field in enumerate(fields):
+        if field.lasers > EVERY_COLOUR:
+            raise InputError(f"{name} has LED enables for lasers 0 to 2; field {number} asks for others.")
+        lit = bool(field.lasers) and field.width_us >= SHORTEST_US
+        exposure_us = field.width_us if lit else SHORTEST_US
+        dark_us = field_us - exposure_us
+        lines.append(PatternLine(exposure_us, dark_us, field.lasers if lit else 0, trigger=number == 0))
+    return lines
 
 
 class Dlpc900Control:
@@ -87,6 +115,11 @@ class Dlpc900Control:
         Exposure of each pattern.
     colours : bool
         Whether the LED enables, and with them the lasers, follow the colours of the pattern table.
+
+    Attributes
+    ----------
+    lines : tuple of PatternLine
+        The pattern table that is shown; empty while patterns are stopped.
     """
 
     def __init__(
@@ -101,6 +134,8 @@ class Dlpc900Control:
         self.name = link.name
         self._link = link
         self._receiver, self.exposure_us, self._colours = receiver, exposure_us, colours
+        self.lines: tuple[PatternLine, ...] = ()
+        self._defined: tuple[PatternLine, ...] = ()
         self._sequence = 0
         self._incomplete = False  # whether the last command broke off
         link.opened.append(self._set_up)
@@ -125,7 +160,7 @@ class Dlpc900Control:
         """Go into one of MODES; patterns are stopped first, as the controller demands."""
         if mode not in MODES:
             raise InputError(f"{self.name} has no mode '{mode}'; use one of {', '.join(MODES)}.")
-        self.command(PATTERN, bytes([STOP]))
+        self.stop()
         self.command(DISPLAY_MODE, bytes([MODES.index(mode)]))
         end = time.monotonic() + 2
         while self._byte(DISPLAY_MODE) != MODES.index(mode):
@@ -134,10 +169,31 @@ class Dlpc900Control:
             time.sleep(0.05)
 
     def define(self, lines: Sequence[PatternLine]) -> None:
-        """Fill the pattern table: line k shows bit k of image 0; all in turn and without end."""
+        """Fill the pattern table, while patterns are stopped: line k shows bit k of image 0; all in turn, without end.
+
+        Of a picture on the display link, all are shown in turn once, from the begin of each of its frames on.
+        """
+        by_display = self._receiver != "off"
         for position, line in enumerate(lines):
-            self.command(PATTERN_ENTRY, line.as_bytes(position))
+            self.command(PATTERN_ENTRY, line.as_bytes(position, by_display and position == 0))
         self.command(PATTERN_LUT, struct.pack("<HI", len(lines), 0))
+        self._defined = tuple(lines)
+
+    def stop(self) -> None:
+        """Stop the patterns: no LED enable is active."""
+        self.lines = ()
+        self.command(PATTERN, bytes([STOP]))
+
+    def start(self) -> None:
+        """Show the patterns of the table."""
+        self.command(PATTERN, bytes([START]))
+        self.lines = self._defined
+
+    def check_running(self) -> None:
+        """Raise DeviceError where it does not show its patterns."""
+        if not self._byte(MAIN_STATUS) & RUNNING:
+            self.lines = ()
+            raise DeviceError(f"{self.name} does not run its patterns; show the frame again.")
 
     def status(self) -> dict[str, Any]:
         hardware, system, main = map(self._byte, (HARDWARE_STATUS, SYSTEM_STATUS, MAIN_STATUS))
@@ -149,7 +205,7 @@ class Dlpc900Control:
             "mode": MODES[mode] if mode < len(MODES) else f"mode {mode}",
             "power": POWERS[power] if power < len(POWERS) else f"power {power}",
             "parked": bool(main & 1),
-            "running": bool(main & 2),
+            "running": bool(main & RUNNING),
             "frozen": bool(main & 4),
             "video_locked": bool(main & 8),
             "faults": faults,
@@ -159,7 +215,7 @@ class Dlpc900Control:
     def close(self) -> None:
         if self._link.is_open:
             with suppress(DeviceError):  # an unplugged controller shows nothing
-                self.command(PATTERN, bytes([STOP]))
+                self.stop()
                 self.set_power("standby")
         self._link.close()
 
@@ -179,8 +235,8 @@ class Dlpc900Control:
                 raise DeviceError(f"{self.name} detects no picture on {self._receiver}; check that cable.")
             time.sleep(0.05)
         self.set_mode("video-pattern")
-        self.define([PatternLine(self.exposure_us)])
-        self.command(PATTERN, bytes([START]))
+        self.define([PatternLine(self.exposure_us, colours=0 if self._colours else EVERY_COLOUR)])
+        self.start()
 
     def _byte(self, code: int) -> int:
         answer = self.command(code, read=True)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import mmap
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +28,6 @@ class MirroredDisplay:
         (H, W), the panel's pixels, drawn at the screen's top left.
     settle_s : float, s
         From the start of a frame on the link until the panel has followed.
-    draw : callable
-        From gray levels [H, W] to the screen's pixels, uint8 array [rows, columns]; by default the same.
     devices, settings : Path
         Folders where the kernel shows frame buffers.
 
@@ -47,7 +44,6 @@ class MirroredDisplay:
         number: int,
         shape: tuple[int, int],
         settle_s: float = 0.05,
-        draw: Callable[[Gray], Gray] = np.asarray,
         devices: Path = Path("/dev"),
         settings: Path = Path("/sys/class/graphics"),
     ) -> None:
@@ -55,8 +51,6 @@ class MirroredDisplay:
         self.name = f"the display fb{number}"
         self._settings = settings / f"fb{number}"
         self._settle_s = settle_s
-        self._draw = draw
-        self._screen: tuple[int, ...] = draw(np.zeros(shape, np.uint8)).shape
         self._sent = 0
         self._shown_s = 0.0
         self._read_settings()
@@ -73,11 +67,11 @@ class MirroredDisplay:
 
     def send(self, gray: Gray) -> int:
         """Draw into the half that is not shown, then pan to it."""
-        height, width = self._screen
+        height, width = self.shape
         half = (self._sent + 1) % 2
         memory = np.frombuffer(self._mapped, np.uint8).reshape(2 * self._rows, self._stride)
         screen = memory[half * self._rows : half * self._rows + height, : width * self._bytes]
-        screen.reshape(height, width, self._bytes)[:, :, :3] = self._draw(gray)[..., None]
+        screen.reshape(height, width, self._bytes)[:, :, :3] = gray[..., None]
         self._set("pan", f"0,{half * self._rows}")
         self._sent += 1
         self._shown_s = time.monotonic() + self._settle_s
@@ -109,7 +103,7 @@ class MirroredDisplay:
         self._bytes = int(self._get("bits_per_pixel")) // 8
         self._stride = int(self._get("stride"))
         self._rows = rows // 2
-        height, width = self._screen
+        height, width = self.shape
         if self._bytes not in (1, 3, 4):
             raise InputError(
                 f"{self.name} has {8 * self._bytes} bits a pixel, too few for 256 gray levels; "

@@ -6,6 +6,7 @@ mirror, which bits hold it, and where these lie.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,9 +73,17 @@ def states(gray: Gray) -> NDArray[np.uint8]:
 
 def bit_plane(gray: Gray, modulator: Modulator) -> NDArray[np.uint8]:
     """The memory's bits, 0 or 1, [2 H, 2 W], that show gray levels [H, W]."""
-    memory = np.array(MEMORY, np.uint8)[states(gray)]
-    layout = np.array(modulator.electrodes, np.uint8)
-    height, width = gray.shape
-    bits = memory[:, None, :, None] >> layout[None, :, None, :] & 1
-    plane = bits.reshape(2 * height, 2 * width)
+    return bit_planes([gray], modulator)
+
+
+def bit_planes(grays: Sequence[Gray], modulator: Modulator) -> NDArray[np.uint8]:
+    """The memory's bits of up to eight patterns [H, W], those of pattern k as bit k, uint8 [2 H, 2 W]."""
+    memory = np.array(MEMORY, np.uint8)[states(np.arange(256, dtype=np.uint8))]
+    corners = memory[:, None] >> np.array(modulator.electrodes, np.uint8).ravel() & 1
+    four = corners.view(np.uint32)[:, 0]  # a byte each, so that all are looked up at once
+    height, width = grays[0].shape
+    together = np.zeros((height, width), np.uint32)
+    for k, gray in enumerate(grays):
+        together |= np.take(four << np.uint32(k), gray)
+    plane = together.view(np.uint8).reshape(height, width, 2, 2).swapaxes(1, 2).reshape(2 * height, 2 * width)
     return np.ascontiguousarray(plane[:, ::-1] if modulator.mirrored else plane)

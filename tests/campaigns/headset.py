@@ -104,7 +104,7 @@ def write_configuration(
     slow_share : float
         Of the phase before that the panel keeps for a period, as the bundle says; the bench's panel is not slow.
     display : bool
-        Whether the panel mirrors a screen, of 1080 x 1920 pixels, in place of the emulated board.
+        Whether the panel is at a display link, with 1080 x 1920 pixels, in place of the emulated board.
     """
     small = shape == SHAPE
     distance_mm = DISTANCE_MM * shape[0] / SHAPE[0]
@@ -127,7 +127,7 @@ def write_configuration(
     fields = len(shown) * patterns
     panel = "refresh_hz = 1000.0\n" if small else f"refresh_hz = {60 * fields}\ntimeout_ms = 500\n"
     if display:
-        panel = 'kind = "tests.campaigns.screen:screen"\n' + panel
+        panel = f'kind = "tests.campaigns.screen:{"colours" if colours else "screen"}"\n' + panel
     else:
         panel = f'bus = "virtual:{folder}/hardware.sock"\n' + panel
     file.write_text(

@@ -6,7 +6,8 @@ panel, the mean time of each stage, light in a wrong field, and the memory of ea
     python -m tests.campaigns.soak --size 1080x1920 --colours --refresh-hz 2 --solve-ms 400 --seconds 150
 
 is a headset of full size that shows three colours in turn. Its camera gives one picture again and again. With
-`--display` in place of `--size` and `--colours`, its panel mirrors a screen of that size, in one colour.
+`--display` in place of `--size`, frames go to a panel of that size over a display link: without `--colours` it mirrors
+a screen.
 
     python -m tests.campaigns.soak --size 1080x1920 --refine --refresh-hz 2 --solve-ms 400 --seconds 150
 
@@ -95,7 +96,7 @@ def soak(
     refined : bool
         Whether all frames are of one picture that is refined again and again, with a network that was never trained.
     display : bool
-        Whether the panel mirrors a screen, which is not looked at: of torn frames and lit fields nothing is known then.
+        Whether frames go over a display link, which is not looked at: of torn frames and lit fields nothing is known.
     """
     solve_ms = solve_ms or min(3.0, 300 / refresh_hz)
     stale_ms = max(STALE_MS, 2 * solve_ms, 2000 / refresh_hz)  # lit until the next pattern is there
@@ -235,15 +236,13 @@ def main() -> int:
         action="store_true",
         help="refine one picture all the while (one colour, needs the trainer)",
     )
-    parser.add_argument("--display", action="store_true", help="a panel of 1080x1920 that mirrors a screen")
+    parser.add_argument("--display", action="store_true", help="a panel of 1080x1920 at a display link")
     parser.add_argument("--solve-ms", type=float, help="time for a picture's patterns")
     parser.add_argument("--seconds", type=float, help="end after so long")
     parser.add_argument(
         "--json", action="store_true", help="print one JSON object on stdout and nothing else"
     )
     args = parser.parse_args()
-    if args.display and args.colours:
-        parser.error("a panel that mirrors a screen shows one colour: leave --colours out")
     found = soak(
         args.frames,
         args.refresh_hz,

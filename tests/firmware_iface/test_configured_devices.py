@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from firmware_iface.configured_devices import check_tables, open_camera, open_panel
+from firmware_iface.configured_devices import check_tables, gated_light, open_camera, open_panel
 from firmware_iface.errors import DeviceError, InputError
+from firmware_iface.panel.fields import Field
 
 
 @pytest.mark.parametrize(
@@ -78,3 +81,46 @@ def test_a_function_of_the_labs_own_opens_its_panel_and_camera(
     ):
         with pytest.raises(error, match=message):
             open_panel({"kind": kind})
+
+
+def test_a_panel_of_the_labs_own_shows_as_many_fields_as_are_budgeted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the lasers' power is budgeted for is what the panel does, and its frames are held to it."""
+    (tmp_path / "field_lab.py").write_text(
+        """
+from firmware_iface.panel import FieldPanel
+
+closed = []
+
+class Frames:
+    shape, most_fields, every_laser, field_us = (3, 5), 8, 7, 5556
+    def send_fields(self, fields): return len(fields)
+    def wait(self, sequence): pass
+    def close(self): closed.append(self)
+
+class Plain(Frames):
+    def show(self, gray): pass
+    def status(self): return {}
+
+def three(): return FieldPanel(Frames(), Frames(), 3)
+def one(): return Plain()
+"""
+    )
+    monkeypatch.chdir(tmp_path)
+    table = {"kind": "field_lab:three", "fields": 3, "refresh_hz": 180.0}
+    budget = gated_light(table, 1)
+    assert budget is not None and budget.frame_s == pytest.approx(3 * 5556e-6)
+    panel = open_panel(table, budget)
+    gray = np.zeros((3, 5), np.uint8)
+    panel.show_fields([Field(gray, 1 << k, 1000, 2778) for k in range(3)])
+    with pytest.raises(InputError, match="up to 2900 µs in each, and is budgeted for 1 of 2778"):
+        panel.show_fields([Field(gray, 1 << k, 1000, 2900) for k in range(3)])
+    for wrong, found in (
+        ({"fields": 6}, "6 fields of 5556 µs, and what 'field_lab:three' opens shows 3 of 5556"),
+        ({"refresh_hz": 60.0}, "3 fields of 16667 µs, .* shows 3 of 5556"),
+        ({"kind": "field_lab:one"}, "shows one"),
+    ):
+        with pytest.raises(InputError, match=found):
+            open_panel(table | wrong)
+    assert len(sys.modules["field_lab"].closed) == 5, "none stays open"

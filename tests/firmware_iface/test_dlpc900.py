@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
 from firmware_iface.panel import Panel, open_dlpc900, run_length_encoding
 from firmware_iface.panel import phase_light_modulator as plm
-from firmware_iface.panel.dlpc900 import PatternUpload
 from firmware_iface.panel.dlpc900_commands import Dlpc900Control, parse_answer
+from firmware_iface.panel.dlpc900_upload import PatternUpload
 from firmware_iface.panel.fields import Field, FieldPanel, colours_in_turn
 from firmware_iface.panel.phase_light_modulator import P47, P67, Modulator
 from firmware_iface.virtual.usb import Dlpc900Model, VirtualUsb
@@ -295,7 +295,7 @@ def test_each_colour_is_enabled_in_its_own_field_alone() -> None:
         assert entry.exposure_us + entry.dark_us == 5000 and entry.trigger_2 == (k == 0)
     panel.close()
     assert [model.leds(k) for k in range(3)] == [0, 0, 0]
-    with pytest.raises(InputError, match="display link"):
-        open_dlpc900(1, backend=VirtualUsb(model), fields=3)
+    with pytest.raises(InputError, match="25 fields .* 24 at most"):
+        open_dlpc900(backend=VirtualUsb(model), fields=25)
     with pytest.raises(InputError, match="lasers 0 to 2"):
         panel.show_fields([Field(grays[0], 8, 0, 1000)])

@@ -37,7 +37,11 @@ _HEIGHT |= {11: 0.3274, 10: 0.361, 9: 0.4204, 8: 0.5046, 15: 0.5916, 14: 0.673, 
 
 @dataclass(frozen=True)
 class PatternEntry:
-    """One line of the pattern table; `colours` are the LED enables that are active during its exposure."""
+    """One line of the pattern table.
+
+    `colours` are the LED enables that are active during its exposure; `waits`: for a trigger, which is the next frame
+    of the video in video-pattern mode.
+    """
 
     exposure_us: int
     bits: int
@@ -46,6 +50,7 @@ class PatternEntry:
     colours: int = 0b111
     dark_us: int = 0
     trigger_2: bool = True
+    waits: bool = False
 
 
 class Dlpc900Model(UsbModel):
@@ -78,6 +83,8 @@ class Dlpc900Model(UsbModel):
     entries : dict of int to PatternEntry
     images : dict of (int, int) to uint32 array
         By image and controller, as loaded.
+    video_frame_us : int, µs
+        Of the video. A table that takes longer is aborted at the next frame, and status bit 6 says so.
     commands : int
         How many were received.
     """
@@ -93,6 +100,7 @@ class Dlpc900Model(UsbModel):
         self.memory_shape = memory_shape
         self.shape = memory_shape[0] // 2, memory_shape[1] // 2
         self.video: Callable[[], NDArray[np.uint32]] | None = None
+        self.video_frame_us = 16667
         self._electrodes, self._mirrored, self._controllers = electrodes, mirrored, controllers
         super().__init__(
             device_descriptor(0x0451, 0xC900),
@@ -192,7 +200,7 @@ class Dlpc900Model(UsbModel):
             0x0206: b"\x02DLPC900 model\0",
             0x1100: bytes(6),
             0x1A07: bytes([self.led_enables]),
-            0x1A0A: b"\x01",
+            0x1A0A: bytes([1 | (64 if self._aborted() else 0)]),
             0x1A0B: b"\x01",
             0x1A0C: bytes([main]),
             0x1A1B: bytes([self.mode]),
@@ -200,6 +208,11 @@ class Dlpc900Model(UsbModel):
         if code not in known:
             raise CommandError(3)
         return known[code]
+
+    def _aborted(self) -> bool:
+        """Whether the patterns last longer than a frame of the video that they are in."""
+        shown = [self.entries[k] for k in range(self._table[0])] if self.running and self.mode == 2 else []
+        return sum(entry.exposure_us + entry.dark_us for entry in shown) > self.video_frame_us
 
     def _do(self, code: int, data: bytes) -> bytes:
         match code:
@@ -249,6 +262,7 @@ class Dlpc900Model(UsbModel):
             options >> 4 & 7,
             dark_us,
             not data[9] & 1,
+            bool(options >> 7),
         )
 
     def _load(self, side: int, data: bytes) -> None:
