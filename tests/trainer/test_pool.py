@@ -8,8 +8,10 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ import pytest
 import torch
 
 from firmware_iface.errors import InputError
+from tests.waiting import until
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.cli import main
 from trainer.diagnosis.diagnosis import Diagnosis, diagnose
@@ -150,6 +153,24 @@ if __name__ == "__main__":
     except KeyboardInterrupt:
         sys.exit(130)
 """
+
+
+def test_lost_processes_say_nothing_of_tasks_that_were_cancelled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As after Ctrl-C, when tasks are cancelled and processes are ended: only one message is for the user."""
+    unhandled: list[threading.ExceptHookArgs] = []
+    monkeypatch.setattr(threading, "excepthook", unhandled.append)
+    with pytest.raises(InputError, match="has ended"), open_pool(2) as two:
+        tasks = [two.submit(time.sleep, (60,)) for _ in range(8)]
+        until(lambda: sum(task.running() for task in tasks) >= 2, 30)
+        assert sum(task.cancel() for task in tasks) >= 4
+        for process in list(two.executor._processes.values()):
+            process.terminate()
+        try:
+            two.result(next(task for task in tasks if not task.cancelled()))
+        except BrokenExecutor as error:
+            two.executor._executor_manager_thread.join(30)
+            raise InputError(pool.LOST) from error
+    assert not unhandled
 
 
 @pytest.mark.parametrize(

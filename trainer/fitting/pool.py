@@ -16,11 +16,12 @@ from concurrent.futures import (
     CancelledError,
     Executor,
     Future,
+    InvalidStateError,
     ProcessPoolExecutor,
     ThreadPoolExecutor,
     as_completed,
 )
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
 from multiprocessing import forkserver, resource_tracker
@@ -256,7 +257,16 @@ class _Processes(ProcessPoolExecutor):
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
         """The future of a call; starts a process where one is missing."""
         with _without_ctrl_c():
-            return super().submit(fn, *args, **kwargs)
+            future = super().submit(fn, *args, **kwargs)
+        fail = future.set_exception
+
+        def failed(error: BaseException | None) -> None:
+            # Where processes are lost, Python's own thread tells all tasks, and ends in a traceback at a cancelled one.
+            with suppress(InvalidStateError):
+                fail(error)
+
+        future.set_exception = failed  # type: ignore[method-assign, assignment]
+        return future
 
 
 @contextmanager

@@ -111,7 +111,8 @@ def test_the_next_picture_of_a_video_starts_from_the_patterns_before(tmp_path: P
     file = write_configuration(tmp_path, patterns=2)
     solver, made = solved(file, linear()[None])
     (again,) = solver.patterns(linear()[None], time.monotonic_ns())
-    assert again.psnr_db == pytest.approx(made[-1].psnr_db, abs=0.5)
+    # a fast machine comes nearer than 90 dB, where single precision and the floor in the dark decide
+    assert min(again.psnr_db, 60) == pytest.approx(min(made[-1].psnr_db, 60), abs=0.5)
     moved = np.roll(linear(), 1, axis=1)[None]
     (first,) = solver.patterns(moved, time.monotonic_ns())
     cold = open_solver(read_configuration(file))
