@@ -76,6 +76,7 @@ class FirstPhases:
             self.noise = noise.astype(stacks[0][0].response.dtype)
         self.amplitude = np.zeros(self.shape, stacks[0][0].response.dtype)
         self.made = objective.backend.xp.zeros(objective.shape, stacks[0][0].response.dtype)
+        self.moved = objective.backend.xp.zeros_like(self.made[0])
         self.fits, self.aligned = False, True
 
     def cold(self, targets: np.ndarray, phases: Array, soon: bool = False) -> None:
@@ -135,9 +136,10 @@ class FirstPhases:
         """Fill `phases` with those of the frame before, moved as its content has moved.
 
         A pattern is a start, double phase, and what the descent has found since. Double phase stands on a chequerboard.
-        Moved by an even number of pixels it stays on it: then what was found moves to the new frame's start. Along the
-        edges it stays in its place, as it compensates for the panel's end. Moved by an odd number, or where the edges
-        do not count, the pattern itself moves, with its chequerboard, except along the edges.
+        Moved by an even number of pixels it stays on it: then what was found moves to the new frame's start. Where that
+        is dark its phase means nothing and changes from frame to frame, so there the pattern itself moves. Along the
+        edges what was found stays in its place, as it compensates for the panel's end. Moved by an odd number, or where
+        the edges do not count, the pattern itself moves, with its chequerboard, except along the edges.
 
         Patterns on different chequerboards do not go together. So parts that move by themselves follow only by even
         numbers and begin anew otherwise, and where the whole is off the chequerboard, all begins anew.
@@ -166,17 +168,19 @@ class FirstPhases:
         self.made *= -1
         self.made += before  # what the descent has found since the start
         for n, (phase, fresh, found) in enumerate(zip(phases, room, self.made, strict=True)):
-            drive, edges = self.drives[n // self.frames], self.starts[n // self.frames].edges
+            drive, start = self.drives[n // self.frames], self.starts[n // self.frames]
+            edges = start.edges
             adds = self.fits and not drive.bounded  # the sum may lie out of a bounded panel's range
             if parts and not (adds and even and self.aligned):
                 phase[...] = fresh
                 continue
+            shifted(before[n], motion, phase)
+            start.retilt(motion, phase)
             if adds and even and (parts or self.edges_count):
+                self.moved[...] = phase
                 shifted(found, motion, phase)
                 phase += fresh
-            else:
-                shifted(before[n], motion, phase)
-                self.starts[n // self.frames].retilt(motion, phase)
+                self.backend.xp.copyto(phase, self.moved, where=start.dark)
             for one in parts:
                 follow(phase, found, fresh, one)
             near = all(2 * abs(step) <= edge for step, edge in zip(motion, edges, strict=True))
