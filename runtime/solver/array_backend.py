@@ -71,16 +71,38 @@ class Backend:
         """Unscaled DFT of each row of a strip, on the calling core alone."""
         fft.into(x, out, 1, forward, 1)
 
-    def through_columns(self, x: Array, multiply: Callable[[slice], None]) -> None:
-        """DFT of each column, `multiply` (called with the columns), inverse DFT; in place and not scaled.
+    def column_blocks(self, x: Array) -> dict[int, Array]:
+        """Columns of `x` [n, m], some at a time, by the first of them, each block contiguous."""
+        blocks: dict[int, Array] = {}
 
-        Some columns at a time, so that they stay in a core's cache.
+        def work(worker: int, columns: slice) -> None:
+            blocks[columns.start] = self.xp.ascontiguousarray(x[:, columns])
+
+        self.over_rows(x.shape[1], COLUMNS, work)
+        return blocks
+
+    def through_columns(
+        self, x: Array, factors: dict[int, Array], room: list[Array], multiply: Callable[[Array, Array], None]
+    ) -> None:
+        """DFT of each column, `multiply`, inverse DFT; in place and not scaled.
+
+        Parameters
+        ----------
+        x : complex array [n, m]
+        factors : dict of int to array
+            As from `column_blocks`.
+        room : list of complex array [COLUMNS n]
+            One of each worker.
+        multiply : callable
+            Called with some columns' spectra, contiguous so that they stay in a core's cache, and their factors.
         """
 
         def work(worker: int, columns: slice) -> None:
-            fft.into(x[:, columns], x[:, columns], 0, True, 1)
-            multiply(columns)
-            fft.into(x[:, columns], x[:, columns], 0, False, 1)
+            some = x[:, columns]
+            spectra = room[worker][: some.size].reshape(some.shape)
+            fft.into(some, spectra, 0, True, 1)
+            multiply(spectra, factors[columns.start])
+            fft.into(spectra, some, 0, False, 1)
 
         self.over_rows(x.shape[1], COLUMNS, work)
 
@@ -132,9 +154,14 @@ class CupyBackend(Backend):
     def columns_fft(self, x: Array, forward: bool) -> None:
         self._transform(x, x, 0, forward)
 
-    def through_columns(self, x: Array, multiply: Callable[[slice], None]) -> None:
+    def column_blocks(self, x: Array) -> dict[int, Array]:
+        return {0: x}
+
+    def through_columns(
+        self, x: Array, factors: dict[int, Array], room: list[Array], multiply: Callable[[Array, Array], None]
+    ) -> None:
         self.columns_fft(x, True)
-        multiply(slice(0, x.shape[1]))
+        multiply(x, factors[0])
         self.columns_fft(x, False)
 
     def _transform(self, x: Array, out: Array, axis: int, forward: bool) -> None:

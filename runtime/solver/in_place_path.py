@@ -21,7 +21,7 @@ import numpy as np
 from firmware_iface.errors import InputError
 from runtime.lightpath.grid import Grid
 from runtime.lightpath.light_path import LightPath
-from runtime.solver.array_backend import Backend, Room
+from runtime.solver.array_backend import COLUMNS, Backend, Room
 from runtime.solver.in_place_image import ImagePlane, pixel_filter
 from runtime.solver.in_place_panel import Panel
 from runtime.solver.iris_band import band, folded
@@ -72,10 +72,10 @@ class Optics:
         )
         room = room or Room(backend)
         self.panel = Panel(path, self.rows, self.columns, backend, room)
+        # Where one buffer can be both, the pupil multiplies in place.
+        self.in_place = fine == 1 and len(path.transfers) == 1 and path.crosstalk is None
         self._take_pupil(path)
         self.strongest = int(np.argmax(path.weights))
-        # Where one buffer can be both, the pupil multiplies in place.
-        self.in_place = fine == 1 and len(self.transfers) == 1 and path.crosstalk is None
         self.spectrum = self.panel.spectrum
         if not self.in_place:
             self.spectrum = room.zeros(
@@ -101,6 +101,12 @@ class Optics:
         )
         self.transfers = [xp.asarray(t.astype(path.source.dtype)) for t in transfers]
         self.conjugates = [t.conj() for t in self.transfers]
+        if self.in_place:
+            self._blocks, self._conjugate_blocks = (
+                self.backend.column_blocks(one[0]) for one in (self.transfers, self.conjugates)
+            )
+            rows = self.panel.spectrum.shape[0]
+            self._room = [xp.empty(COLUMNS * rows, path.source.dtype) for _ in range(self.backend.threads)]
 
     def in_band_order(self, over_band: np.ndarray, grid: Grid) -> np.ndarray:
         """Arrays over the band [M, n, m], lowest frequency first, in the order of this path's transfer functions."""
@@ -135,7 +141,7 @@ class Optics:
             self.panel.forward(phase, not self.in_place, state)
             for mode in range(len(self.transfers)):
                 if self.in_place:
-                    self._through_columns(self.transfers[mode])
+                    self._through_columns(self._blocks)
                 else:
                     self._through_pupil(mode)
                     self.backend.columns_fft(self.spectrum, False)
@@ -259,17 +265,16 @@ class Optics:
             self.image_plane.adjoint(state * len(self.transfers) + mode, image)
             self._back_through_pupil(mode, again=mode > 0)
 
-    def _through_columns(self, transfer: Array) -> None:
+    def _through_columns(self, transfers: dict[int, Array]) -> None:
         """Where one buffer is both the panel's and the image's: along the columns, and through the pupil, at once."""
-        spectrum, xp = self.spectrum, self.backend.xp
+        xp = self.backend.xp
 
-        def multiply(columns: slice) -> None:
+        def multiply(spectra: Array, transfer: Array) -> None:
             for run in self.rows.runs:
-                part = spectrum[run.panel, columns]
-                xp.multiply(part, transfer[run.band, columns], out=part)
-            spectrum[self.rows.image_gap, columns] = 0
+                xp.multiply(spectra[run.panel], transfer[run.band], out=spectra[run.panel])
+            spectra[self.rows.image_gap] = 0
 
-        self.backend.through_columns(spectrum, multiply)
+        self.backend.through_columns(self.spectrum, transfers, self._room, multiply)
 
     def _through_pupil(self, mode: int) -> None:
         """The panel's spectrum times a transfer function, onto the image's DFT."""
@@ -293,7 +298,7 @@ class Optics:
     def _back_through_pupil(self, mode: int, again: bool) -> None:
         """Adjoint of columns' inverse DFT and `_through_pupil`; `again`: added to the panel's spectrum."""
         if self.in_place:
-            self._through_columns(self.conjugates[mode])
+            self._through_columns(self._conjugate_blocks)
             return
         xp = self.backend.xp
         self.backend.columns_fft(self.spectrum, True)

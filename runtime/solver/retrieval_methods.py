@@ -51,6 +51,8 @@ class MemorylessBfgs:
     def begin(self) -> None:
         """Start from steepest descent."""
         self.first = True
+        # Scalar products of the gradient before with itself and with the move, where they follow from the last step's.
+        self.known: tuple[float, float] | None = None
 
     def step(self, phase: Array, out: Array) -> None:
         """One step: the move is a sum of this gradient, the one before and the move before."""
@@ -66,27 +68,31 @@ class MemorylessBfgs:
     def _coefficients(self) -> tuple[list[float], float, float]:
         """Factors of the gradient (a colour each), of the one before and of the move before."""
         steepest = [-1 / self.objective.curvature(c) for c in range(len(self.gradient))]
+        known, self.known = self.known, None
         if self.first:
             return steepest, 0.0, 0.0
-        gg, go, oo, sg, so = self._dots()
+        gradient, before, move = self.gradient, self.before, self.move
+        gg, go, sg = self._dots(((gradient, gradient), (gradient, before), (move, gradient)))
+        oo, so = known or self._dots(((before, before), (move, before)))
         sy, yy, yg = sg - so, gg - 2 * go + oo, gg - go
         if sy <= 1e-12 * yy:
             return steepest, 0.0, 0.0
         gamma, along = sy / yy, sg / sy
         beta = gamma * (yg - along * yy) / sy
-        return [gamma * (along - 1)] * len(steepest), -gamma * along, beta - along
+        a, b, c = gamma * (along - 1), -gamma * along, beta - along
+        if not self.bounded:  # the next move is this sum, and this gradient will be the one before
+            self.known = gg, a * gg + b * go + c * sg
+        return [a] * len(steepest), b, c
 
-    def _dots(self) -> tuple[float, ...]:
-        dot = self.backend.xp.einsum
-        sums = []
-        for trio in zip(self.gradient, self.before, self.move, strict=True):
+    def _dots(self, pairs: Sequence[tuple[Array, Array]]) -> tuple[float, ...]:
+        """Scalar products of pairs of arrays [C, H, W]."""
+        dot, sums = self.backend.xp.einsum, []
+        for colour in range(len(self.gradient)):
 
-            def work(worker: int, rows: slice, trio: tuple[Array, ...] = trio) -> tuple[float, ...]:
-                g, o, s = (whole[rows] for whole in trio)
-                pairs = ((g, g), (g, o), (o, o), (s, g), (s, o))
-                return tuple(float(dot("ij,ij->", u, v)) for u, v in pairs)
+            def work(worker: int, rows: slice, colour: int = colour) -> tuple[float, ...]:
+                return tuple(float(dot("ij,ij->", u[colour, rows], v[colour, rows])) for u, v in pairs)
 
-            sums.append(self.backend.over_rows(len(trio[0]), self.objective.strip, work))
+            sums.append(self.backend.over_rows(self.gradient.shape[1], self.objective.strip, work))
         return tuple(map(sum, zip(*sums, strict=True)))
 
     def _move(self, colour: int, a: float, b: float, c: float, phase: Array, out: Array) -> None:
