@@ -101,10 +101,11 @@ class Optics:
         )
         self.transfers = [xp.asarray(t.astype(path.source.dtype)) for t in transfers]
         self.conjugates = [t.conj() for t in self.transfers]
-        if self.in_place:
-            self._blocks, self._conjugate_blocks = (
-                self.backend.column_blocks(one[0]) for one in (self.transfers, self.conjugates)
-            )
+        self.modes = len(self.transfers)
+        if self.in_place:  # they are only used in blocks
+            (transfer,), (conjugate,) = self.transfers, self.conjugates
+            self._blocks, self._conjugate_blocks = map(self.backend.column_blocks, (transfer, conjugate))
+            self.transfers, self.conjugates = [], []
             rows = self.panel.spectrum.shape[0]
             self._room = [xp.empty(COLUMNS * rows, path.source.dtype) for _ in range(self.backend.threads)]
 
@@ -139,16 +140,16 @@ class Optics:
         """Fill irradiance at the image's own samples, before any filter; the fields are kept for `adjoint`."""
         for state in range(len(self.panel.states)):
             self.panel.forward(phase, not self.in_place, state)
-            for mode in range(len(self.transfers)):
+            for mode in range(self.modes):
                 if self.in_place:
                     self._through_columns(self._blocks)
                 else:
                     self._through_pupil(mode)
                     self.backend.columns_fft(self.spectrum, False)
-                self.image_plane.forward(state * len(self.transfers) + mode, image)
+                self.image_plane.forward(state * self.modes + mode, image)
 
     def factor_adjoint(self, phase: Array, slope: Array, factor: Array, axial: Array) -> float:
-        """Add to `factor` the gradient of a loss over a factor on the field that leaves the panel.
+        """Add to `factor` the gradient of a loss over a factor on the field that leaves the panel; not where in place.
 
         Parameters
         ----------
@@ -171,8 +172,8 @@ class Optics:
             if len(self.panel.states) > 1:
                 self.panel.forward(phase, True, state)
             left = self.panel.spectrum.copy()
-            for mode in range(len(self.transfers)):
-                self.image_plane.adjoint(state * len(self.transfers) + mode, slope)
+            for mode in range(self.modes):
+                self.image_plane.adjoint(state * self.modes + mode, slope)
                 self._back_through_pupil(mode, again=mode > 0)
                 along += self._along(left, mode, axial)
             self.panel.factor_adjoint(phase, factor)
@@ -261,8 +262,8 @@ class Optics:
 
     def _back(self, image: Array, state: int) -> None:
         """Fill the panel's spectrum with 2 slope z of every mode of a state, back through the pupil."""
-        for mode in range(len(self.transfers)):
-            self.image_plane.adjoint(state * len(self.transfers) + mode, image)
+        for mode in range(self.modes):
+            self.image_plane.adjoint(state * self.modes + mode, image)
             self._back_through_pupil(mode, again=mode > 0)
 
     def _through_columns(self, transfers: dict[int, Array]) -> None:
