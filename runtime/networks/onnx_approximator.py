@@ -170,12 +170,13 @@ def approximator_of(bundle: Bundle, shape: tuple[int, int, int]) -> Approximator
 
 
 def predistorted(d: Approximator, targets: np.ndarray) -> np.ndarray:
-    """Targets [C, 1, H, W] that D turns into the given ones, as nearly as two corrections allow.
+    """Targets [C, 1, H, W] that D turns into the given ones, as nearly as two corrections allow, of the same scale.
 
     Where D is near the identity, t - D(J) is about what J lacks.
     """
+    means = [float(np.mean(target, dtype=np.float64)) for target in targets]
     for c, (target,) in enumerate(targets):
-        np.multiply(target, 1 / float(np.mean(target, dtype=np.float64)), out=d.target[c])
+        np.multiply(target, 1 / means[c], out=d.target[c])
     d.irradiance[...] = d.target
     for _ in range(CORRECTIONS):
         d.correct()
@@ -186,6 +187,8 @@ def predistorted(d: Approximator, targets: np.ndarray) -> np.ndarray:
             made += wanted
             d.irradiance[c] += made
             np.maximum(d.irradiance[c], 0, out=d.irradiance[c])
+    for c, mean in enumerate(means):
+        d.irradiance[c] *= mean
     return d.irradiance[:, None]
 
 

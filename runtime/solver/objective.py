@@ -53,7 +53,7 @@ class Objective:
     rounding : SoftLevels or None
         What a panel of few levels makes of a phase.
     most_scale : list of float
-        The limit of each colour's scale, on amplitude: see `keep_light`. Not applied to light after D.
+        The limit of each colour's scale, on amplitude: see `keep_light`.
     """
 
     def __init__(
@@ -242,7 +242,9 @@ class Objective:
             light, wanted = self.light[c, 0], self.wanted[c, 0]
             xp.multiply(light, 1 / self.mean_light[c], out=light)
             d.irradiance[c] = self.backend.to_host(light)
-            self.scale[c] = _root_scale(light, wanted)
+            self.scale[c] = min(
+                _root_scale(light, wanted), self.most_scale[c] * math.sqrt(self.mean_light[c])
+            )
         self.looks = 1 if first else self.looks + 1
         if self.looks & (self.looks - 1) == 0:
             # D's scale over the light's changes ever more slowly: it is measured at looks 1, 2, 4, 8 ... only.

@@ -136,6 +136,27 @@ def test_three_colours_go_through_one_d() -> None:
         assert solution.qualities[k].psnr_db > unaware.psnr_db + 4
 
 
+@pytest.mark.parametrize("through", ["gradient", "predistorted"])
+def test_what_a_colour_gets_goes_with_its_picture_through_d_as_well(through: str) -> None:
+    """A D that changes nothing: light for colours in turn is shared out as without it."""
+    paths = [ideal_path(SHAPE, z, 0.5, np.float32) for z in (0.006, 0.008, 0.01)]
+    pictures = np.stack([light * scene(SHAPE, seed) for seed, light in enumerate((1.0, 0.3, 0.1))])
+    d = made(np.ones((1, 3, *SHAPE), np.float32))
+    with_d, plain = (
+        Solver(paths, approximator=one, through=through).solve(pictures, 8).given for one in (d, None)
+    )
+    np.testing.assert_allclose(with_d, plain, rtol=0.05)
+
+
+@pytest.mark.parametrize("through", ["gradient", "predistorted"])
+def test_a_long_descent_through_d_does_not_end_in_the_dark(through: str) -> None:
+    shape = (24, 32)
+    path, d = ideal_path(shape, 6e-3, 0.7, np.float32), made(np.ones((1, 1, *shape), np.float32))
+    solver = Solver(path, approximator=d, through=through)
+    (first,), (last,) = (solver.solve(scene(shape), n).given for n in (0, 600))
+    assert last > 0.45 * first
+
+
 def test_a_d_of_another_panel_or_for_planes_is_refused(path: LightPath) -> None:
     for paths, d in (
         (path, made(fall_off((32, 40)))),
