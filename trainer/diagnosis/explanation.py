@@ -159,9 +159,8 @@ def explain(
     if save:
         save(model)
     steps = [ExplanationStep(None, errors)]
-    rivals: dict[
-        str, dict[str, EffectInstance]
-    ] = {}  # of the effects that were added, those that looked alike
+    # Of the effects that were added, those that looked alike.
+    rivals: dict[str, dict[str, EffectInstance]] = {}
     diagnoses: list[Diagnosis] = []
 
     def without_unnecessary(

@@ -18,9 +18,8 @@ from trainer.model.model import EffectInstance, Model, raised
 POLYNOMIALS = 6
 SEARCH_PIXELS = 2 * 240 * 320  # of a scene, at least one capture: a pattern search need only come near
 SEARCH_SCENES = 3
-LEAST_EXPECTED = (
-    0.5  # of the excess that an order must remove: where a straight line expects less, it is not fitted
-)
+# Of the excess that an order must remove: where a straight line expects less, it is not fitted.
+LEAST_EXPECTED = 0.5
 # Orders are raised at once where each expects this share of what the one that expects most does: what others expect may
 # be its doing.
 RIVALS = 0.3
