@@ -146,19 +146,22 @@ def _with_fields(panel: Any, settings: PanelTable, field_us: int) -> Any:
     """A panel of the lab's own, if it shows frames of as many fields as [panel] says, each as long as it says."""
     if settings.fields == 1:
         return panel
-    found = f"{panel.fields} of {panel.field_us} µs" if isinstance(panel, FieldPanel) else "one"
-    if found != f"{settings.fields} of {field_us} µs":
-        panel.close()
-        raise InputError(
-            f"[panel] has {settings.fields} fields of {field_us} µs, and what '{settings.kind}' opens shows {found}; "
-            "give that function's result as many, or change fields and refresh_hz"
-        )
-    return panel
+    if isinstance(panel, FieldPanel):
+        if (panel.fields, panel.field_us) == (settings.fields, field_us):
+            return panel
+        found = f"{panel.fields} of {panel.field_us} µs"
+    else:
+        found = "one"
+    panel.close()
+    raise InputError(
+        f"[panel] has {settings.fields} fields of {field_us} µs, and what '{settings.kind}' opens shows {found}; "
+        "give that function's result as many, or change fields and refresh_hz"
+    )
 
 
 def _budgeted(panel: Any, gated: GatedLight | None) -> Any:
-    """The panel, which shows no more light than the lasers are budgeted for."""
-    if isinstance(panel, FieldPanel):
+    """The panel, which shows no more light than the lasers are budgeted for, where that is known."""
+    if isinstance(panel, FieldPanel) and gated is not None:
         panel.gated = gated
     return panel
 

@@ -58,8 +58,6 @@ class VideoFields:
 
     def send_fields(self, fields: Sequence[Field]) -> int:
         """A frame of fields, each lit as `lines_of` says; the table is sent only where it has to change."""
-        if len(fields) > MOST_FIELDS:
-            raise InputError(f"{len(fields)} fields do not fit the display link; give 1 to {MOST_FIELDS}.")
         lines = lines_of(fields, self.field_us, self._control.name)
         dark_us = lines[-1].dark_us - round(SPARE * len(lines) * self.field_us)
         if dark_us < 0:

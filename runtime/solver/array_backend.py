@@ -81,6 +81,10 @@ class Backend:
         self.over_rows(x.shape[1], COLUMNS, work)
         return blocks
 
+    def column_room(self, x: Array) -> list[Array]:
+        """Room for `through_columns` of `x` [n, m]."""
+        return [self.xp.empty(COLUMNS * len(x), x.dtype) for _ in range(self.threads)]
+
     def through_columns(
         self, x: Array, factors: dict[int, Array], room: list[Array], multiply: Callable[[Array, Array], None]
     ) -> None:
@@ -91,8 +95,8 @@ class Backend:
         x : complex array [n, m]
         factors : dict of int to array
             As from `column_blocks`.
-        room : list of complex array [COLUMNS n]
-            One of each worker.
+        room : list of complex array
+            As from `column_room`.
         multiply : callable
             Called with some columns' spectra, contiguous so that they stay in a core's cache, and their factors.
         """
@@ -156,6 +160,9 @@ class CupyBackend(Backend):
 
     def column_blocks(self, x: Array) -> dict[int, Array]:
         return {0: x}
+
+    def column_room(self, x: Array) -> list[Array]:
+        return []
 
     def through_columns(
         self, x: Array, factors: dict[int, Array], room: list[Array], multiply: Callable[[Array, Array], None]

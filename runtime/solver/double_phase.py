@@ -19,7 +19,7 @@ BOARDS = 8  # ways for the pixels of double phase to alternate
 LOUD = 0.98  # share of pixels whose amplitude double phase reproduces; brighter ones are cut
 SAMPLED = 5  # every so many pixels, an axis, are ranked for that
 FAINTEST = 0.7  # of the amplitude in the middle: fainter edges of the image are corrected only as far as this
-DARK = 0.1  # of the amplitude of the brightest pixels
+LIT = 0.1  # of the amplitude of the brightest pixels
 EDGES = 3  # times as far in as the panel's end darkens an even image, edges of a frame get a new start
 TILT = 0.4  # of the way from the middle of the pupil's opening to its edge; less where that is beyond half of the band
 RISE = 8  # times as far as tilted light comes from the side: over this the tilt rises along an edge
@@ -52,8 +52,8 @@ class Start:
         None where the start is not double phase, and where the iris is open (WIDE).
     edges : (int, int), pixels
         How far in that goes: rows, columns.
-    dark : bool array [H, W]
-        Where the last double phase has so little amplitude that its phase means nothing.
+    lit : bool array [H, W]
+        Where the last double phase has so much amplitude that its phase means something.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class Start:
         height, width = path.grid.shape
         pair = path.source.dtype
         self.wave = xp.zeros((height, width), pair)
-        self.dark = xp.zeros((height, width), bool)
+        self.lit = xp.ones((height, width), bool)
         strip = (3, objective.strip, width)
         self.rooms = [xp.empty(strip, path.response.dtype) for _ in range(self.backend.threads)]
         tiny = 1e-3 * math.sqrt(objective.power[colour]) + 1e-30
@@ -112,7 +112,7 @@ class Start:
             if unmodulated is not None:
                 here -= unmodulated[rows]
             xp.abs(here, out=part)
-            xp.less(part, DARK, out=self.dark[rows])
+            xp.greater_equal(part, LIT, out=self.lit[rows])
             xp.minimum(part, 1, out=part)
             arccos_into(xp, part, half, one)
             odd = rows.start % 2

@@ -76,7 +76,7 @@ class FirstPhases:
             self.noise = noise.astype(stacks[0][0].response.dtype)
         self.amplitude = np.zeros(self.shape, stacks[0][0].response.dtype)
         self.made = objective.backend.xp.zeros(objective.shape, stacks[0][0].response.dtype)
-        self.moved = objective.backend.xp.zeros_like(self.made[0])
+        self.on_fresh = objective.backend.xp.zeros_like(self.made[0])
         self.fits, self.aligned = False, True
 
     def cold(self, targets: np.ndarray, phases: Array, soon: bool = False) -> None:
@@ -177,10 +177,9 @@ class FirstPhases:
             shifted(before[n], motion, phase)
             start.retilt(motion, phase)
             if adds and even and (parts or self.edges_count):
-                self.moved[...] = phase
-                shifted(found, motion, phase)
-                phase += fresh
-                self.backend.xp.copyto(phase, self.moved, where=start.dark)
+                shifted(found, motion, self.on_fresh)
+                self.on_fresh += fresh
+                self.backend.xp.copyto(phase, self.on_fresh, where=start.lit)
             for one in parts:
                 follow(phase, found, fresh, one)
             near = all(2 * abs(step) <= edge for step, edge in zip(motion, edges, strict=True))

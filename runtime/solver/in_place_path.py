@@ -21,7 +21,7 @@ import numpy as np
 from firmware_iface.errors import InputError
 from runtime.lightpath.grid import Grid
 from runtime.lightpath.light_path import LightPath
-from runtime.solver.array_backend import COLUMNS, Backend, Room
+from runtime.solver.array_backend import Backend, Room
 from runtime.solver.in_place_image import ImagePlane, pixel_filter
 from runtime.solver.in_place_panel import Panel
 from runtime.solver.iris_band import band, folded
@@ -77,7 +77,9 @@ class Optics:
         self._take_pupil(path)
         self.strongest = int(np.argmax(path.weights))
         self.spectrum = self.panel.spectrum
-        if not self.in_place:
+        if self.in_place:
+            self._room = backend.column_room(self.spectrum)
+        else:
             self.spectrum = room.zeros(
                 "image spectrum", (fine * grid.padded[0], len(self.columns.frequencies)), pair
             )
@@ -106,8 +108,6 @@ class Optics:
             (transfer,), (conjugate,) = self.transfers, self.conjugates
             self._blocks, self._conjugate_blocks = map(self.backend.column_blocks, (transfer, conjugate))
             self.transfers, self.conjugates = [], []
-            rows = self.panel.spectrum.shape[0]
-            self._room = [xp.empty(COLUMNS * rows, path.source.dtype) for _ in range(self.backend.threads)]
 
     def in_band_order(self, over_band: np.ndarray, grid: Grid) -> np.ndarray:
         """Arrays over the band [M, n, m], lowest frequency first, in the order of this path's transfer functions."""

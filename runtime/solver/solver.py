@@ -246,6 +246,7 @@ class Solver:
         """
         targets = self._checked(np.ones(self.shape) if target is None else target)
         before, best, follows = self.before.copy(), self.best.copy(), self.follows
+        least = list(self.objective.least)
         for _ in range(2):  # the first touches memory for the first time and is not counted
             self.begin, self.step, self.finish = Pace(), Pace(), Pace()
             begun = time.perf_counter()
@@ -253,6 +254,7 @@ class Solver:
             self.cold = True
             solution = self._improve(targets, begun, 3, None, None)
         self.before, self.best[...], self.follows = before, best, follows
+        self.objective.least = least
         self.first.fits = False
         return solution
 
