@@ -53,8 +53,12 @@ def shared() -> Path:
 
 
 @pytest.fixture(scope="module")
-def only_service() -> Iterator[None]:
-    """No other test runs a service meanwhile: two of them, at real-time priority, leave two cores no time for more."""
-    with (Path(tempfile.gettempdir()) / "hololoop-tests-service.lock").open("w") as lock:
+def real_time() -> Iterator[None]:
+    """No other test that must keep time runs meanwhile: a service, or lasers that go dark after 100 ms of silence.
+
+    A service has real-time priority where that is allowed. Two of them leave two cores no time for more, and one can
+    keep another test's heartbeat from a core for too long.
+    """
+    with (Path(tempfile.gettempdir()) / "hololoop-tests-real-time.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield

@@ -49,6 +49,8 @@ GUIDES = [
         and name.split("/")[0] in (path.name, "trainer", "runtime", "firmware_iface")
     ),
 ]
+# what a block must keep time for
+IN_REAL_TIME = ("--emulated", "open_guarded_lasers", "hololoop-runtime serve")
 PROGRAMS = {"hololoop-trainer": trainer_main, "hololoop-runtime": runtime_main}
 SMALL = """
 name = "{name}"
@@ -211,11 +213,15 @@ def keep_toml(block: Block, folder: Path) -> None:
 
 
 @pytest.mark.parametrize("guide", GUIDES)
-def test_what_a_guide_shows_works(guide: str, workspace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_guide_shows_works(
+    guide: str, workspace: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
     blocks = blocks_of(guide)
     named = {word for block in blocks for word in re.findall(r"\w+", block.text)}
     with_few_effects(monkeypatch, "phase_response", *named)
     run = [b for b in blocks if b.language in ("console", "sh", "python") and not NOT_RUN.match(b.comment)]
+    if any(word in b.text for b in run for word in IN_REAL_TIME):
+        request.getfixturevalue("real_time")
     if guide != "README.md" and any("captures/" in b.text or "bundle/" in b.text for b in run):
         make_what_the_readme_makes()
     for k, block in enumerate(blocks):

@@ -31,6 +31,8 @@ from firmware_iface.virtual.remote_hardware import (
 )
 from firmware_iface.virtual.usb.panel_board import LitPattern
 
+pytestmark = pytest.mark.usefixtures("real_time")
+
 SHAPE = (24, 32)
 COLOURS = ("red", "green", "blue")
 BENCH = """

@@ -14,6 +14,8 @@ from firmware_iface.lasers import VIRTUAL_CHANNELS
 from firmware_iface.lasers.guarded_lasers import open_guarded_lasers
 from firmware_iface.virtual.remote_hardware import i2c_bus, running
 
+pytestmark = pytest.mark.usefixtures("real_time")
+
 
 @pytest.mark.parametrize(
     ("bench", "socket", "message"),

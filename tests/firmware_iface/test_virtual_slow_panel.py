@@ -22,6 +22,8 @@ from firmware_iface.panel.panel_board_messages import Timing
 from firmware_iface.virtual import VirtualHeadset, open_headset
 from firmware_iface.virtual.remote_hardware import RemoteCamera, i2c_bus, reach, running, usb_backend
 
+pytestmark = pytest.mark.usefixtures("real_time")
+
 SHAPE = (24, 32)
 BENCH = """
 [panel]

@@ -18,7 +18,7 @@ from runtime.service.shared_memory import crc32
 from tests.campaigns.headset import COLOURS, SHAPE, hardware, write_configuration
 from tests.runtime.calibration.drifting import devices
 
-pytestmark = pytest.mark.usefixtures("only_service")  # an emulated headset needs its share of the cores
+pytestmark = pytest.mark.usefixtures("real_time")  # an emulated headset needs its share of the cores
 
 FIELD_MS, LIGHT_MS = 5.556, 2.778  # of a virtual panel: a field, and the longest light in it
 

@@ -13,6 +13,8 @@ from firmware_iface.virtual.remote_hardware import RemoteHardware
 from runtime.cli import main
 from tests.campaigns.headset import connected, hardware, served, write_configuration
 
+pytestmark = pytest.mark.usefixtures("real_time")
+
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -13,7 +13,7 @@ from runtime.headset.followed_camera import FollowedCamera
 from runtime.headset.open_devices import open_devices
 from tests.campaigns.headset import SHAPE, hardware, write_configuration
 
-pytestmark = pytest.mark.usefixtures("only_service")
+pytestmark = pytest.mark.usefixtures("real_time")
 
 
 def test_a_picture_after_the_lasers_went_dark_is_refused_and_the_fault_is_named(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from firmware_iface.virtual import open_headset
 from runtime.cli import main
 from runtime.solver.pattern_files import read_given, read_pattern, write_pattern
 
-pytestmark = pytest.mark.usefixtures("only_service")  # an emulated headset needs its share of the cores
+pytestmark = pytest.mark.usefixtures("real_time")  # an emulated headset needs its share of the cores
 
 BENCH = """
 [panel]

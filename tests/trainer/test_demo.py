@@ -43,6 +43,7 @@ def test_the_display_is_at_the_end_of_the_reports_main_part() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("real_time")
 def test_the_quick_demo(tmp_path: Path) -> None:
     shares: list[float] = []
     result = run_demo(tmp_path / "demo", quick=True, progress=lambda done, what: shares.append(done))
@@ -82,6 +83,7 @@ s_curvature = 0.15
 """
 
 
+@pytest.mark.usefixtures("real_time")
 def test_the_camera_sees_each_colour_alone_in_the_frame_that_it_is_shown_in(tmp_path: Path) -> None:
     """Against the bench's noise-free truth, each colour for a time that makes up for what its pattern should give."""
     spec = str(tmp_path / "bench.toml")
@@ -105,6 +107,7 @@ def test_the_camera_sees_each_colour_alone_in_the_frame_that_it_is_shown_in(tmp_
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("real_time")
 def test_the_demo_in_colour(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spec = tmp_path / "bench.toml"
     spec.write_text(IN_COLOUR)

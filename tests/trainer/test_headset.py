@@ -20,7 +20,7 @@ from trainer.captures.capture_set import read_captures
 from trainer.captures.open_bench import RealHeadset, nominal_bench, open_bench
 from trainer.cli import main
 
-pytestmark = pytest.mark.usefixtures("only_service")
+pytestmark = pytest.mark.usefixtures("real_time")
 
 
 def test_real_lasers_stay_within_the_power_that_is_set(tmp_path: Path) -> None:

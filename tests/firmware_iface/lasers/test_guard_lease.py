@@ -15,6 +15,8 @@ import pytest
 from firmware_iface.lasers import guard_process
 from firmware_iface.lasers.guard_process import LEASE_S, Guard
 
+pytestmark = pytest.mark.usefixtures("real_time")
+
 LONG_S = 2 * LEASE_S
 
 

@@ -20,6 +20,8 @@ from firmware_iface.lasers.guarded_lasers import GuardedLasers, open_guarded_las
 from firmware_iface.virtual.i2c import LaserBoard
 from firmware_iface.virtual.i2c.bus_server import BoardServer
 
+pytestmark = pytest.mark.usefixtures("real_time")
+
 ROOT = Path(__file__).resolve().parents[3]
 SLACK_S = 0.15  # for a machine that has other work: everything is measured by the clock on the wall
 

@@ -13,7 +13,7 @@ from tests.campaigns.headset import hardware, write_configuration
 from tests.runtime.calibration.drifting import DISTANCE_MM, ideal_bundle
 from tests.trainer.hidden import bench_file
 
-pytestmark = pytest.mark.usefixtures("only_service", "spared_maps")
+pytestmark = pytest.mark.usefixtures("real_time", "spared_maps")
 
 SHAPE = (64, 80)
 

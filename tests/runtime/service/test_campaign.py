@@ -14,7 +14,7 @@ from tests.campaigns.faults import campaign, plans, summary
 from tests.campaigns.lane import Lane
 from tests.campaigns.soak import soak
 
-pytestmark = pytest.mark.usefixtures("only_service")
+pytestmark = pytest.mark.usefixtures("real_time")
 
 
 def test_every_kind_of_fault_is_survived() -> None:

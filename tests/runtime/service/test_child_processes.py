@@ -19,7 +19,7 @@ from runtime.service.process_messages import SOLVER
 from tests.campaigns.headset import urgent
 from tests.campaigns.lane import Lane
 
-pytestmark = pytest.mark.usefixtures("only_service")
+pytestmark = pytest.mark.usefixtures("real_time")
 
 
 @pytest.mark.parametrize(("schedule", "lower"), [(below, 1), (None, 0)])

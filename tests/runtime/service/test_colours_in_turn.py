@@ -25,7 +25,7 @@ from tests.campaigns.lane import Lane
 from tests.runtime.benches import converted, ideal_path
 from tests.waiting import until
 
-pytestmark = pytest.mark.usefixtures("only_service")
+pytestmark = pytest.mark.usefixtures("real_time")
 
 
 class Headset(NamedTuple):

@@ -14,7 +14,7 @@ from runtime.service.display_thread import DisplayClock, DisplayPattern, Display
 from runtime.service.slow_panel import SlowPanel
 from tests.waiting import until
 
-pytestmark = pytest.mark.usefixtures("only_service")  # its thread needs its share of the cores
+pytestmark = pytest.mark.usefixtures("real_time")  # its thread needs its share of the cores
 
 PERIOD_NS = 5_000_000
 STALE_NS = 100_000_000

@@ -24,7 +24,7 @@ from runtime.service.protocol import LaserState
 from tests.campaigns.headset import connected, picture, served
 from tests.runtime.benches import converted, ideal_path
 
-pytestmark = pytest.mark.usefixtures("only_service")
+pytestmark = pytest.mark.usefixtures("real_time")
 
 GUIDE = Path(serve.__file__).parents[1] / "service" / "README.md"
 BENCH = "virtual:demo"

@@ -15,7 +15,7 @@ from runtime.service.laser_heartbeat import LaserHeartbeat
 from runtime.service.protocol import LaserState
 from tests.waiting import until
 
-pytestmark = pytest.mark.usefixtures("only_service")  # its thread needs its share of the cores
+pytestmark = pytest.mark.usefixtures("real_time")  # its thread needs its share of the cores
 
 SHARES = tuple(0.02 + 0.001 * (k + 1) for k in range(len(SIZES_MRAD)))
 

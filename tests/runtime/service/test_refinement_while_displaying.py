@@ -19,7 +19,7 @@ from runtime.service.client import Client, RefusedError
 from runtime.service.protocol import Code, LaserState, PartState, Shown
 from tests.campaigns.headset import SHAPE, connected, hardware, picture, served, write_configuration
 
-pytestmark = pytest.mark.usefixtures("only_service")
+pytestmark = pytest.mark.usefixtures("real_time")
 
 DEFECT = """
 [[defect]]

@@ -30,7 +30,7 @@ from runtime.service.supervisor import Supervisor
 from tests.campaigns.headset import ENVIRONMENT, connected, hardware, picture, served, write_configuration
 from tests.waiting import until
 
-pytestmark = pytest.mark.usefixtures("only_service")
+pytestmark = pytest.mark.usefixtures("real_time")
 
 
 class Headset(NamedTuple):

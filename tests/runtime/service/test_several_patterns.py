@@ -34,7 +34,7 @@ from tests.campaigns.headset import SHAPE, connected, hardware, served, write_co
 from tests.campaigns.lane import Lane
 from tests.runtime.benches import converted, ideal_path, scene
 
-pytestmark = pytest.mark.usefixtures("only_service")
+pytestmark = pytest.mark.usefixtures("real_time")
 
 BLACK = 64  # counts of the simulated camera without light
 

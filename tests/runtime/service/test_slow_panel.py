@@ -15,7 +15,7 @@ from tests.campaigns.headset import SHAPE, write_configuration
 from tests.campaigns.lane import PICTURES, Lane
 from tests.runtime.benches import scene
 
-pytestmark = pytest.mark.usefixtures("only_service")
+pytestmark = pytest.mark.usefixtures("real_time")
 
 BLACK, LEAST = 64, 5  # counts of the simulated camera without light, and above them where there is some
 SHARE, REFRESH_HZ = 0.25, 25.0
