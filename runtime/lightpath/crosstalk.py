@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 from array_api_compat import array_namespace
@@ -11,16 +12,30 @@ from runtime.lightpath.periodic_axis import take
 Array = Any
 
 
-def mix_neighbours(phase: Array, taps: Array, axis: int) -> Array:
-    """Weighted sum of each pixel and its neighbours along an axis; border pixels repeat beyond the border."""
-    reach, count = (taps.shape[0] - 1) // 2, phase.shape[axis]
+def mix_neighbours(phase: Array, taps: Array, axis: int) -> Iterator[Array]:
+    """Weighted sums of each pixel and its neighbours along an axis; border pixels repeat beyond the border.
+
+    Parameters
+    ----------
+    phase : float array [..., H, W]
+    taps : float array [n, taps]
+        Weights of each sum.
+
+    Yields
+    ------
+    float array [..., H, W]
+        The sum of each row of taps.
+    """
+    reach, count = (taps.shape[1] - 1) // 2, phase.shape[axis]
     # Runs of a wider array take a quarter of the time of indices that stop at the border.
     wide = take(phase, [(0, 1)] * reach + [(0, count)] + [(count - 1, count)] * reach, axis)
-    return sum(taps[k] * take(wide, [(k, k + count)], axis) for k in range(taps.shape[0]))
+    runs = [take(wide, [(k, k + count)], axis) for k in range(taps.shape[1])]
+    for row in range(taps.shape[0]):
+        yield sum(taps[row, k] * run for k, run in enumerate(runs))
 
 
 def mix_neighbours_adjoint(gradient: Array, taps: Array, axis: int) -> Array:
-    """Adjoint of `mix_neighbours`."""
+    """Adjoint of one of the sums of `mix_neighbours`, with its own taps [taps]."""
     xp = array_namespace(gradient)
     reach = (taps.shape[0] - 1) // 2
     moved = xp.moveaxis(gradient, axis, -1)

@@ -135,16 +135,13 @@ def panel_spectrum(path: LightPath, phase: Array) -> Array:
         return aperture_spectrum(path, phase, (1, 1)) * _column_spectrum(path.grid, rows)
     ky, kx = path.crosstalk
     sub = (ky.shape[0], kx.shape[0])
+    down, across = (sub_pixel_offsets(path, phase, sub, axis) for axis in (0, 1))
     total = 0
-    for i in range(sub[0]):
-        mixed_rows = mix_neighbours(phase, ky[i, :], -2)
+    for i, mixed_rows in enumerate(mix_neighbours(phase, ky, -2)):
         along_rows = 0
-        for j in range(sub[1]):
-            field = panel_field(path, mix_neighbours(mixed_rows, kx[j, :], -1))
-            along_rows = along_rows + sub_pixel_offset(path, phase, sub, j, 1) * _row_spectrum(
-                path.grid, field
-            )
-        total = total + sub_pixel_offset(path, phase, sub, i, 0) * _column_spectrum(path.grid, along_rows)
+        for j, mixed in enumerate(mix_neighbours(mixed_rows, kx, -1)):
+            along_rows = along_rows + across[j] * _row_spectrum(path.grid, panel_field(path, mixed))
+        total = total + down[i] * _column_spectrum(path.grid, along_rows)
     return aperture_spectrum(path, phase, sub) * total / (sub[0] * sub[1])
 
 
@@ -212,13 +209,16 @@ def aperture_spectrum(path: LightPath, like: Array, sub: tuple[int, int]) -> Arr
     return rows[:, None] * columns[None, :]
 
 
-def sub_pixel_offset(path: LightPath, like: Array, sub: tuple[int, int], index: int, axis: int) -> Array:
-    """Linear phase over the band that puts a sub-pixel at its place in the pixel, an axis: [n, 1] or [1, m]."""
+def sub_pixel_offsets(path: LightPath, like: Array, sub: tuple[int, int], axis: int) -> list[Array]:
+    """Linear phases over the band that put each sub-pixel at its place in the pixel, an axis: [n, 1] or [1, m]."""
     xp = array_namespace(like)
     frequency = band_frequencies(path.grid, like)[axis]
-    place = path.grid.pitch * path.aperture[axis] * ((index + 0.5) / sub[axis] - 0.5)
-    angle = -2 * math.pi * place * (frequency[:, None] if axis == 0 else frequency[None, :])
-    return xp.cos(angle) + 1j * xp.sin(angle)
+    offsets = []
+    for index in range(sub[axis]):
+        place = path.grid.pitch * path.aperture[axis] * ((index + 0.5) / sub[axis] - 0.5)
+        angle = -2 * math.pi * place * (frequency[:, None] if axis == 0 else frequency[None, :])
+        offsets.append(xp.cos(angle) + 1j * xp.sin(angle))
+    return offsets
 
 
 def _row_spectrum(grid: Grid, field: Array) -> Array:

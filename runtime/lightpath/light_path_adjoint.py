@@ -24,7 +24,7 @@ from runtime.lightpath.light_path import (
     panel_spectrum,
     pixel_area_spectrum,
     states,
-    sub_pixel_offset,
+    sub_pixel_offsets,
     sum_modes,
 )
 from runtime.lightpath.modulation import factor_at, slope_at
@@ -163,16 +163,13 @@ def _panel_spectrum_adjoint(path: LightPath, phase: Array, spectrum: Array, fact
     ky, kx = path.crosstalk
     sub = (ky.shape[0], kx.shape[0])
     spectrum = aperture_spectrum(path, phase, sub) * spectrum / (sub[0] * sub[1])
+    down, across = (sub_pixel_offsets(path, phase, sub, axis) for axis in (0, 1))
     total = 0
-    for i in range(sub[0]):
-        mixed_rows = mix_neighbours(phase, ky[i, :], -2)
+    for i, mixed_rows in enumerate(mix_neighbours(phase, ky, -2)):
         row_gradient = 0
-        down = xp.conj(sub_pixel_offset(path, phase, sub, i, 0))
-        rows_back = _column_spectrum_adjoint(path.grid, down * spectrum)
-        for j in range(sub[1]):
-            driven = mix_neighbours(mixed_rows, kx[j, :], -1)
-            across = xp.conj(sub_pixel_offset(path, phase, sub, j, 1))
-            own = here(_row_spectrum_adjoint(path.grid, across * rows_back), driven)
+        rows_back = _column_spectrum_adjoint(path.grid, xp.conj(down[i]) * spectrum)
+        for j, driven in enumerate(mix_neighbours(mixed_rows, kx, -1)):
+            own = here(_row_spectrum_adjoint(path.grid, xp.conj(across[j]) * rows_back), driven)
             row_gradient = row_gradient + (own if factor else mix_neighbours_adjoint(own, kx[j, :], -1))
         total = total + (row_gradient if factor else mix_neighbours_adjoint(row_gradient, ky[i, :], -2))
     return total

@@ -159,11 +159,12 @@ def test_subpixels_of_equal_phase_are_the_pixel() -> None:
 def test_neighbours_mix_towards_the_side_that_the_taps_say() -> None:
     phase = np.zeros((3, 7))
     phase[:, 3] = 1
-    np.testing.assert_array_equal(
-        mix_neighbours(phase, np.array([0.1, 0.7, 0.2]), -1)[0], [0, 0, 0.2, 0.7, 0.1, 0, 0]
-    )
-    border = mix_neighbours(np.array([[1.0, 0, 0, 2]]), np.array([0.1, 0.7, 0.2]), -1)[0]
-    np.testing.assert_allclose(border, [0.8, 0.1, 0.4, 1.8])
+    taps = np.array([[0.1, 0.7, 0.2], [0, 1, 0]])
+    mixed, alone = mix_neighbours(phase, taps, -1)
+    np.testing.assert_array_equal(mixed[0], [0, 0, 0.2, 0.7, 0.1, 0, 0])
+    np.testing.assert_array_equal(alone, phase)
+    border, _ = mix_neighbours(np.array([[1.0, 0, 0, 2]]), taps, -1)
+    np.testing.assert_allclose(border[0], [0.8, 0.1, 0.4, 1.8])
 
 
 @pytest.mark.parametrize("name", PATHS)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from runtime.excess import PredictionErrors
 from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet, chosen, opened
-from trainer.fitting.gauss_newton import fit
+from trainer.fitting.gauss_newton import FitResult, fit
 from trainer.fitting.predictor import evaluate_captures, excess_on
 from trainer.fitting.refit import fit_from, least_for_order, raise_orders, settled
 from trainer.model.model import EffectInstance, Model, absent
@@ -30,11 +30,14 @@ class CandidateFit:
         With the candidate in it.
     held_out : PredictionErrors
         Errors of `model` on the held-out captures.
+    together : FitResult or None
+        Of `model`, where all of its effects were fitted together.
     """
 
     effect: str
     model: Model
     held_out: PredictionErrors
+    together: FitResult | None = None
 
 
 def try_effect(
@@ -157,7 +160,8 @@ def try_with_present(
     captures = opened(folder)
     batches = load(captures, chosen(captures, ids))
     started = fit_from(model, start, batches, iterations=8).model
-    return _judged(start.effect.name, fit(started, started.names, batches).model, captures, held_ids)
+    together = fit(started, started.names, batches)
+    return replace(_judged(start.effect.name, together.model, captures, held_ids), together=together)
 
 
 def _judged(name: str, model: Model, captures: CaptureSet, held_ids: tuple[str, ...]) -> CandidateFit:

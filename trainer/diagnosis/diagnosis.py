@@ -33,8 +33,6 @@ from trainer.formatting import number
 from trainer.model.model import Model
 from trainer.model.parameters import describe
 
-SHARES = 2  # of a screen, for each worker
-
 
 @dataclass(frozen=True)
 class Diagnosis:
@@ -304,8 +302,8 @@ def screen_all(
     roles: CaptureRoles, model: Model, effects: Sequence[Effect], pool: Pool, report: Progress
 ) -> list[ScreenResult]:
     """Screen every effect, shared out among the pool's workers."""
-    # More shares than workers, so that none waits long for the last; each costs the slopes of all that is present.
-    shares = min(SHARES * pool.workers if pool.workers > 1 else 1, len(effects)) or 1
+    # One for each worker: a share costs the slopes of all that is present.
+    shares = min(pool.workers, len(effects)) or 1
     ids = ids_of(roles.screened)
     tasks = [(roles.folder, ids, model, tuple(effects[k::shares])) for k in range(shares)]
     report(0.05, f"screening {len(effects)} effects")

@@ -281,8 +281,13 @@ def _added(roles: CaptureRoles, found: Diagnosis, pool: Pool) -> tuple[RankedEff
     """
     rival = _rival(found) if found.model.present else None
     ones = [one for one in (found.ranking[0], rival) if one is not None]
-    tasks = [(roles.folder, roles.ids, one.base, one.model.instance(one.effect.name)) for one in ones]
-    fitted = pool.map_here_if_one(all_refitted, tasks)
+    tasks = [
+        (roles.folder, roles.ids, one.base, one.model.instance(one.effect.name))
+        for one in ones
+        if one.together is None
+    ]
+    refitted = iter(pool.map_here_if_one(all_refitted, tasks))
+    fitted = [(one.together, one.held_out) if one.together else next(refitted) for one in ones]
     better = len(ones) > 1 and removed_excess(fitted[0][1], fitted[1][1]).interval()[0] > 0
     one, (together, errors) = (ones[1], fitted[1]) if better else (ones[0], fitted[0])
     model = with_orders_raised(roles, together)

@@ -23,6 +23,7 @@ from trainer.diagnosis.screen import ScreenResult
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.definition import Effect
 from trainer.effects.effect_catalogue import Catalogue
+from trainer.fitting.gauss_newton import FitResult
 from trainer.fitting.pool import Pool
 from trainer.fitting.predictor import evaluate_captures
 from trainer.model.model import Model
@@ -53,6 +54,8 @@ class RankedEffect:
         The removal is real, and it matters.
     indistinguishable_from : tuple of str
         Candidates that these captures cannot tell it from.
+    together : FitResult or None
+        Of `model`, where all of its effects were fitted together.
     """
 
     effect: Effect
@@ -61,6 +64,7 @@ class RankedEffect:
     removed: RemovedExcess
     worth_adding: bool
     indistinguishable_from: tuple[str, ...] = ()
+    together: FitResult | None = None
 
     @property
     def base(self) -> Model:
@@ -308,7 +312,11 @@ def rank(
             and worth_adding
             and _inseparable(one, other, before, thresholds, ideal_excess, candidates)
         )
-        ranked.append(RankedEffect(known[one.effect], one.model, one.held_out, removed, worth_adding, alike))
+        ranked.append(
+            RankedEffect(
+                known[one.effect], one.model, one.held_out, removed, worth_adding, alike, one.together
+            )
+        )
     return ranked
 
 
