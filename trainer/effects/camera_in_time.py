@@ -76,7 +76,7 @@ def vibration(sensor: Sensor, rms: Tensor, direction: Tensor, kurtosis: Tensor) 
         share = -kurtosis / 1.5
         return share * torch.special.bessel_j0(torch.sqrt(2 * w2)) + (1 - share) * torch.exp(-0.5 * w2)
 
-    return sensor if float(rms) == 0 else replace(sensor, capture_blur=blur)
+    return sensor if float(rms.detach()) == 0 else replace(sensor, capture_blur=blur)
 
 
 @effect(

@@ -129,7 +129,7 @@ def polarisation_leak(drive: Drive, real: Tensor, imaginary: Tensor, gain: Tenso
     turn = (gain - 1) * drive.response
     second = torch.polar(torch.ones_like(turn), turn)
     first = 1 + torch.complex(real, imaginary) * second
-    if float(crossed) == 0:
+    if float(crossed.detach()) == 0:
         return drive.modulated(first)
     shares = torch.tensor((1.0, SELDOM), dtype=turn.dtype)
     return drive.varying(torch.stack((first, crossed / SELDOM**0.5 * second)), shares)
