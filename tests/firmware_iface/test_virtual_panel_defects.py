@@ -1,4 +1,4 @@
-"""Physics of what real panels, sources and cameras do beside the first kinds of defects, on a simulated bench."""
+"""Physics of what a panel does beside the first kinds of defects, on a simulated bench."""
 
 from __future__ import annotations
 
@@ -7,72 +7,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from firmware_iface import InputError
-from firmware_iface.virtual import BenchDescription, VirtualHeadset, load_bench, make_defect
-from firmware_iface.virtual.bench_description import CameraDescription, ChannelDescription, IrisDescription
+from firmware_iface.virtual import VirtualHeadset, make_defect
 from firmware_iface.virtual.bench_optics import BenchOptics
-from firmware_iface.virtual.iris_opening import iris_opening
 from firmware_iface.virtual.rough_surface import rough_surface, spline_weights
 from firmware_iface.virtual.simulated_panel import Surface, beam_amplitude, disc_gain, panel_path_nm
 from firmware_iface.virtual.simulated_sensor import fringes
 from tests.firmware_iface.padded_light import samples
-
-H, W, Z = 48, 64, 12.0
-FAR = 30.0  # where orders of a grating of 4 columns lie 61 pixels apart
-ORDER_PX = FAR / np.sqrt((32e-3 / 520e-6) ** 2 - 1) / 8e-3
-NARROW = make_defect(
-    "illumination", waist_x_share=0.3, waist_y_share=0.3, centre_x_share=0, centre_y_share=0, ring=0
+from tests.firmware_iface.small_bench import (
+    LINEAR,
+    NARROW,
+    SPOT,
+    H,
+    W,
+    Z,
+    grating,
+    order_power,
+    quiet,
+    random_gray,
+    small,
+    uniform,
 )
-SPOT = replace(NARROW, waist_x_share=0.2, waist_y_share=0.2)
-LINEAR = {"s_curvature": 0.0, "lopsidedness": 0.0}
-
-
-def small(*defects, **changes) -> BenchDescription:
-    bench = load_bench("virtual:ideal").resized(H, W, Z)
-    return replace(bench, defects=tuple(defects), **changes)
-
-
-def quiet(*defects) -> VirtualHeadset:
-    """A headset whose camera has hardly any noise, with the laser on."""
-    camera = CameraDescription(W, H, bit_depth=16, full_well_e=1e9, read_noise_e=0.0)
-    headset = VirtualHeadset(small(*defects, camera=camera))
-    headset.lasers.set_power("green", 1.0)
-    return headset
-
-
-def spot(*defects) -> VirtualHeadset:
-    """The same, with a spot of light that does not saturate."""
-    headset = quiet(SPOT, *defects)
-    headset.camera.exposure_ms = 0.5
-    return headset
-
-
-def uniform(level=0):
-    return np.full((H, W), level, np.uint8)
-
-
-def random_gray(seed=0):
-    return np.random.default_rng(seed).integers(0, 256, (H, W), dtype=np.uint8)
-
-
-def grating(period):
-    return (256 * np.arange(W) / period % 256).astype(np.uint8)[None, :].repeat(H, 0)
-
-
-def order_power(bench, gray, order):
-    """Light in an order of a grating of 4 columns, over the light on the panel; order may be a fraction."""
-    light, y, x, per_pixel = samples(bench, gray, FAR)
-    near = (np.abs(x - order * ORDER_PX) < 16) & (np.abs(y) < 20)
-    return float((light * near).sum() / per_pixel / (H * W))
-
-
-def moments(picture):
-    """Centroid (y, x) and second moments (yy, xx, xy) about it, pixels."""
-    light = picture / picture.sum()
-    y, x = np.mgrid[0:H, 0:W]
-    cy, cx = (light * y).sum(), (light * x).sum()
-    v, u = y - cy, x - cx
-    return (cy, cx), ((light * v * v).sum(), (light * u * u).sum(), (light * v * u).sum())
 
 
 def test_a_uniform_patterns_energy_follows_the_amplitude_curve():
@@ -263,117 +217,6 @@ def test_the_delay_of_the_second_path_counts_as_a_gray_levels_does():
     assert light[90] / light[-90] == pytest.approx((1.12 / 0.88) ** 2, rel=0.1)
 
 
-def test_vibration_widens_a_spot_along_its_direction():
-    d = make_defect("vibration", rms_px=1.5, spread=0.0)
-    still, moved = (moments(spot(*more).expected_counts(uniform(), "green") - 64) for more in ((), (d,)))
-    np.testing.assert_allclose(still[0], moved[0], atol=1e-3)
-    turn = np.deg2rad(d.direction_deg)
-    expected = 1.5**2 * np.array([np.sin(turn) ** 2, np.cos(turn) ** 2, np.sin(turn) * np.cos(turn)])
-    np.testing.assert_allclose(np.subtract(moved[1], still[1]), expected, atol=0.02)
-
-
-def test_vibration_differs_from_capture_to_capture():
-    def grown(spread):
-        headset = spot(make_defect("vibration", rms_px=1.5, spread=spread))
-        pictures = [headset.camera.capture() - 64.0 for _ in range(60)]
-        return np.array([sum(moments(p)[1][:2]) for p in pictures])
-
-    base = sum(moments(spot().expected_counts(uniform(), "green") - 64)[1][:2])
-    assert np.ptp(grown(0.0)) < 0.02
-    rms = np.sqrt(np.clip(grown(0.4) - base, 0, None))
-    assert rms.mean() == pytest.approx(1.5, rel=0.15) and rms.std() == pytest.approx(0.6, rel=0.25)
-
-
-def test_the_camera_moves_from_frame_to_frame():
-    def centroids(seed=1, turns=60):
-        headset = spot(make_defect("frame_motion", seed=seed))
-        return np.array([moments(headset.camera.capture() - 64.0)[0] for _ in range(turns)])
-
-    rest = moments(spot().expected_counts(uniform(), "green") - 64)[0]
-    moved = centroids() - rest
-    assert np.abs(moved.mean(0)).max() < 3 * 0.3 / np.sqrt(60)
-    np.testing.assert_allclose(np.sqrt((moved**2).mean(0)), 0.3, rtol=0.25)
-    assert abs(np.corrcoef(moved[1:, 0], moved[:-1, 0])[0, 1]) < 0.4
-    np.testing.assert_array_equal(centroids(turns=3), centroids()[:3])
-    assert np.abs(centroids(2, 3) - centroids(turns=3)).max() > 0.05
-
-
-def test_the_fixed_pattern_is_in_every_capture_and_another_cameras_differs():
-    plain = quiet().expected_counts(uniform(), "green") - 64
-    found = []
-    for seed in (1, 1, 2):
-        headset = quiet(make_defect("fixed_pattern", seed=seed, offset_counts=0.0))
-        headset.camera.capture()
-        found.append(((headset.camera.capture() - 64.0) / plain - 1)[8:-8, 8:-8].ravel())
-    assert found[0].std() == pytest.approx(0.03, rel=0.05)
-    assert np.corrcoef(found[0], found[1])[0, 1] > 0.99
-    assert abs(np.corrcoef(found[0], found[2])[0, 1]) < 0.08
-    dark = quiet(make_defect("fixed_pattern", offset_counts=6.0))
-    dark.lasers.off()
-    offset = dark.camera.capture() - 64.0
-    assert offset.std() == pytest.approx(6.0, rel=0.05) and abs(offset.mean()) < 0.5
-    np.testing.assert_array_equal(dark.camera.capture() - 64.0, offset)
-
-
-def test_several_lines_are_the_sum_of_benches_of_one():
-    gray = random_gray(7)
-    d = make_defect("source_lines", third_separation_nm=-5.0, third_share=0.2)
-    seen = VirtualHeadset(small(d)).true_irradiance(gray, "green")
-    parts = []
-    for apart in (0.0, 6.0, -5.0):
-        # the path difference of a gray level is the panel's: its phase is less for a longer wave
-        response = make_defect("phase_response", gain=520 / (520 + apart), reference_nm=520 + apart, **LINEAR)
-        bench = small(response, channels=(ChannelDescription("green", 520 + apart),))
-        parts.append(VirtualHeadset(bench).true_irradiance(gray, "green"))
-    expected = 0.5 * parts[0] + 0.3 * parts[1] + 0.2 * parts[2]
-    np.testing.assert_allclose(seen, expected, atol=2e-3)
-    assert np.abs(seen - parts[0]).max() > 0.05
-
-
-def passes(iris, fy, fx, nominal="square"):
-    bench = small(iris, iris=IrisDescription(nominal, 1.0))
-    return float(iris_opening(bench).mask(np.array([fy]), np.array([fx]))[0, 0])
-
-
-def test_the_iris_has_a_shape_sides_and_a_rotation_of_its_own():
-    centred = {"half_width": 0.6, "centre_x_share": 0.0, "centre_y_share": 0.0}
-    circle = make_defect("iris", shape="circle", **centred)
-    assert passes(circle, 0.0, 0.55) == 1 and passes(circle, 0.55, 0.55) == 0
-    assert passes(make_defect("iris", shape="square", **centred), 0.55, 0.55, "circle") == 1
-    assert passes(make_defect("iris", **centred), 0.55, 0.55, "circle") == 0  # as bench.toml says
-    oblong = make_defect("iris", half_width_x=0.3, **centred)
-    assert passes(oblong, 0.55, 0.25) == 1 and passes(oblong, 0.25, 0.55) == 0
-    ellipse = replace(oblong, shape="circle")
-    assert passes(ellipse, 0.55, 0.0) == 1 and passes(ellipse, 0.55, 0.25) == 0
-    turned = make_defect("iris", rotation_deg=45.0, **centred)
-    assert passes(turned, 0.0, 0.8) == 1 and passes(turned, 0.55, 0.55) == 0
-    # from x towards y: the long side of a slit along x points to +x, +y
-    slit = make_defect("iris", rotation_deg=45.0, half_width_y=0.05, **centred)
-    assert passes(slit, 0.3, 0.3) == 1 and passes(slit, 0.3, -0.3) == 0
-
-
-def test_a_soft_edge_passes_half_where_a_hard_one_ends():
-    soft = make_defect("iris", half_width=0.6, soft_edge_share=0.2, centre_x_share=0.1, centre_y_share=0.0)
-    found = [passes(soft, 0.0, fx) for fx in (0.55, 0.65, 0.7, 0.75, 0.85)]
-    assert found[0] == 1 and found[4] == 0
-    assert found[1:4] == pytest.approx([0.5 + np.sqrt(0.125), 0.5, 0.5 - np.sqrt(0.125)], abs=1e-6)
-    band = BenchOptics(small(soft)).path("green", Z).band
-    assert 2 * band.fx[-1] >= 0.8 - 2 / band.padded[1]  # the edge's outer half is in the band
-
-
-def test_what_a_round_iris_cuts_off_is_lost():
-    def share(shape):
-        iris = make_defect("iris", half_width=1.0, centre_x_share=0, centre_y_share=0, shape=shape)
-        light, _, _, per_pixel = samples(small(iris), random_gray(8), 3.0)
-        return light.sum() / per_pixel / (H * W)
-
-    f = np.linspace(-0.5, 0.5, 401)
-    power = np.sinc(f)[:, None] ** 2 * np.sinc(f)[None, :] ** 2 * (f[1] - f[0]) ** 2
-    inside = np.hypot(f[:, None], f[None, :]) <= 0.5
-    assert share("circle") == pytest.approx(power[inside].sum(), rel=0.03)
-    assert share("square") == pytest.approx(power.sum(), rel=0.03)
-
-
 def test_a_rough_wavefront_and_beam_have_the_rms_that_is_asked_for():
     flat, rough = (
         panel_path_nm(make_defect("panel_wavefront", rough_rms_rad=rms), 4 * H, 4 * W, W / H)
@@ -401,82 +244,6 @@ def test_a_rough_surface_passes_smoothly_through_its_nodes():
     first, again, other = (rough_surface((7, 9), seed, 60, 80) for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert abs(np.corrcoef(first.ravel(), other.ravel())[0, 1]) < 0.5
-
-
-@pytest.mark.parametrize("interferes", [True, False])
-def test_the_gradient_agrees_with_finite_differences(interferes):
-    optics = BenchOptics(
-        small(
-            make_defect("crosstalk"),
-            make_defect("zero_order"),
-            make_defect("phase_response"),
-            make_defect("amplitude_modulation", fall=0.6),
-            make_defect("polarisation_leak", amplitude=0.4, interferes=interferes),
-            make_defect("phase_ripple", offset_rad=0.3),
-            make_defect("drivers"),
-            make_defect("coherent_ghost"),
-            make_defect("source_lines"),
-            make_defect("convention", phase_sign=-1, mirror_x=False),
-        )
-    )
-    rng = np.random.default_rng(9)
-    gray = rng.uniform(20, 230, (H, W))
-    light, pullback = optics.irradiance_and_pullback(gray, "green", Z)
-    weights = rng.standard_normal(light.shape).astype(np.float32)
-    gradient = pullback(weights)
-    for direction in (np.sign(gradient), np.where(gray > 128, 1.0, -0.5) * np.sign(gradient)):
-
-        def value(t, direction=direction):
-            moved = optics.irradiance(gray + t * direction, "green", Z)
-            return float((moved * weights).sum(dtype=np.float64))
-
-        slope = (value(0.05) - value(-0.05)) / 0.1
-        assert slope == pytest.approx((gradient * direction).sum(), rel=2e-3)
-
-
-def test_the_gradient_of_the_amplitude_alone_is_right():
-    """Of light that no phase changes: the total of a beam that clears the iris."""
-    optics = BenchOptics(small(NARROW, make_defect("amplitude_modulation")))
-    gray = np.full((H, W), 120.0)
-    light, pullback = optics.irradiance_and_pullback(gray, "green", Z)
-    gradient = pullback(np.ones_like(light)).sum()
-    slope = (
-        optics.irradiance(gray + 2, "green", Z).sum() - optics.irradiance(gray - 2, "green", Z).sum()
-    ) / 4
-    assert gradient == pytest.approx(slope, rel=1e-3) and gradient < 0
-
-
-def test_a_slow_panel_cannot_be_differentiated():
-    headset = quiet(make_defect("slow_response"))
-    with pytest.raises(InputError, match=r"slow_response.*take the defect out"):
-        headset.oracle_pattern(np.ones((H, W)), "green", iterations=1)
-
-
-def test_the_oracle_allows_for_what_the_drive_does():
-    y, x = np.mgrid[0:H, 0:W]
-    target = 0.2 + 0.8 * (np.hypot(x - W / 2, y - H / 2) < 12)
-    kinds = ("amplitude_modulation", "polarisation_leak", "drivers")
-    true = VirtualHeadset(small(*map(make_defect, kinds)))
-
-    def error(gray):
-        a, b = np.sqrt(np.clip(true.true_irradiance(gray, "green"), 0, None)), np.sqrt(target)
-        return ((a * (a * b).sum() / (a * a).sum() - b) ** 2).mean()
-
-    found = {
-        name: error(one.oracle_pattern(target, "green", iterations=40))
-        for name, one in (("true", true), ("ideal", VirtualHeadset(small())))
-    }
-    assert found["true"] < 0.7 * found["ideal"]
-
-
-def test_a_kink_in_the_phase_response_has_its_slopes():
-    kink = make_defect("phase_response", gain=1.0, kink=0.1, kink_at=0.25, **LINEAR)
-    drive = BenchOptics(small(kink)).drive("green")
-    gray = np.arange(256.0)[None, :]
-    turned = drive.turned(gray)[0]
-    assert turned[64] == pytest.approx(0.25 + 0.1)
-    assert np.diff(turned)[[10, 200]] * 256 == pytest.approx([1 + 0.4, 1 - 0.1 / 0.75])
-    assert drive.slope(gray)[0, [10, 200]] * 128 / np.pi == pytest.approx([1 + 0.4, 1 - 0.1 / 0.75], rel=1e-5)
 
 
 def test_fringes_and_stripes_fade_and_a_discs_phase_has_a_gain():
