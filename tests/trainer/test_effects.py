@@ -235,7 +235,7 @@ def second_moments(transfer: Tensor, scene: Scene) -> tuple[float, float]:
     return float((kernel.sum(1) * y**2).sum()) ** 0.5, float((kernel.sum(0) * x**2).sum()) ** 0.5
 
 
-@pytest.mark.parametrize("kurtosis", [0.0, -0.8])
+@pytest.mark.parametrize("kurtosis", [0.6, 0.0, -0.8, -1.3])
 def test_a_blur_has_the_width_that_it_says(kurtosis: float) -> None:
     widths = {"width_y": 1.6, "width_x": 2.3}
     scene = scene_of()
@@ -243,6 +243,26 @@ def test_a_blur_has_the_width_that_it_says(kurtosis: float) -> None:
     assert stages.sensor.blur is not None
     measured = second_moments(stages.sensor.blur, scene)
     assert measured == pytest.approx((1.6, 2.3), rel=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("kurtosis", "radii"), [(-1.0, np.sqrt((np.arange(200) + 0.5) / 200)), (-1.5, np.ones(1))]
+)
+def test_a_blur_can_be_a_disc_or_a_ring(kurtosis: float, radii: np.ndarray) -> None:
+    """The camera out of focus, or a source that is evenly bright: its points, added up one by one."""
+    width = 1.4
+    scene = scene_of()
+    stages = stages_for(scene, (present("sensor_blur", kurtosis=kurtosis, width_y=width, width_x=width),))
+    height, columns = scene.grid.image_shape
+    iy, ix = np.fft.fftfreq(height) * FINE, np.fft.rfftfreq(columns) * FINE
+    angles = 2 * np.pi * np.arange(64) / 64
+    radii = radii * width / np.sqrt(np.mean(radii**2) / 2)
+    expected = np.mean(
+        [np.cos(2 * np.pi * r * (iy[:, None] * np.sin(a) + ix * np.cos(a))) for r in radii for a in angles],
+        0,
+    )
+    assert stages.sensor.blur is not None
+    np.testing.assert_allclose(stages.sensor.blur.numpy(), expected, atol=2e-4)
 
 
 def test_a_source_displaces_the_picture_by_distance_times_angle() -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from trainer.effects.bessel import bessel_j0
 from trainer.effects.definition import Parameter, effect
 from trainer.effects.measured_values import blur_rms, pixel_pattern, shift_spread
 from trainer.prediction.stages import Sensor
@@ -74,7 +75,7 @@ def vibration(sensor: Sensor, rms: Tensor, direction: Tensor, kurtosis: Tensor) 
     def blur(amount: Tensor) -> Tensor:
         w2 = amount * whole
         share = -kurtosis / 1.5
-        return share * torch.special.bessel_j0(torch.sqrt(2 * w2)) + (1 - share) * torch.exp(-0.5 * w2)
+        return share * bessel_j0(torch.sqrt(torch.clamp(2 * w2, min=1e-12))) + (1 - share) * torch.exp(-0.5 * w2)
 
     return sensor if float(rms.detach()) == 0 else replace(sensor, capture_blur=blur)
 

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from trainer.effects.bessel import bessel_j0, bessel_j1_over_x
 from trainer.effects.definition import Parameter, effect
 from trainer.effects.free_form import FreeForm
 from trainer.effects.starts import distance_starts, wavelength_starts
@@ -332,7 +333,7 @@ def source_lines(pupil: Pupil, separation: Tensor, share: Tensor) -> Pupil:
             scale=0.5,
             low=-1.5,
             high=1.5,
-            about="shape: 0 Gaussian, -1 uniform disc",
+            about="shape: 0 Gaussian, -1 uniform disc, -1.5 ring",
             typical=(-1.5, 1.5),
         ),
         Parameter(
@@ -357,7 +358,8 @@ def source_lines(pupil: Pupil, separation: Tensor, share: Tensor) -> Pupil:
         ),
     ],
     formula=(
-        r"\hat{I}' = \hat{I}\,\Bigl[(1-h)\,e^{-w^2/2 + \kappa w^4/24} + h\,e^{-w_h^2/2}\Bigr],"
+        r"\hat{I}' = \hat{I}\,\bigl[(1-h)\,K_\kappa(w) + h\,K_0(w_h)\bigr],"
+        r" \quad K_0 = e^{-w^2/2}, \quad K_{-1} = J_1(2w)/w, \quad K_{-1.5} = J_0(\sqrt{2}\,w),"
         r" \qquad w = 2\pi z \sqrt{(\theta_x f_x)^2 + (\theta_y f_y)^2}"
     ),
 )
@@ -385,8 +387,10 @@ def kernel_transfer(
 ) -> Tensor:
     """Transfer function of a blur kernel with a core and a halo.
 
-    The core is the first two even cumulants of a kernel, exp(-w^2/2 + kurtosis w^4/24), w = 2 pi width f. The quartic
-    term is limited to half of the quadratic one, where the expansion ends. The halo is a round Gaussian.
+    The core has the same width whatever its kurtosis. At 0 it is a Gaussian, exp(-w^2/2) with w = 2 pi width f; at -1 a
+    uniform disc, J1(2w)/w; at -1.5 a ring, J0(sqrt(2) w); between two of these a sum of both. Above 0 it is the first
+    two even cumulants, exp(-w^2/2 + kurtosis w^4/24), the second limited to half of the first, where the expansion
+    ends. The halo is a round Gaussian.
 
     Parameters
     ----------
@@ -403,5 +407,15 @@ def kernel_transfer(
     Tensor [n, m]
     """
     w2 = (2 * math.pi) ** 2 * ((widths[0] * iy) ** 2 + (widths[1] * ix) ** 2)
-    core = torch.exp(w2 * (torch.clamp(kurtosis * w2 / 24, -0.25, 0.25) - 0.5))
+    peaked = torch.exp(w2 * (torch.clamp(kurtosis * w2 / 24, 0, 0.25) - 0.5))
+    core = peaked if float(kurtosis.detach()) >= 0 else _flat_topped(w2, -kurtosis, peaked)
     return (1 - halo) * core + halo * torch.exp(-0.5 * (2 * math.pi * widths[2]) ** 2 * (iy**2 + ix**2))
+
+
+def _flat_topped(w2: Tensor, flatness: Tensor, gaussian: Tensor) -> Tensor:
+    """The core between a Gaussian (flatness 0), a disc (1) and a ring (1.5), at squared frequencies w^2."""
+    w = torch.sqrt(torch.clamp(w2, min=1e-8))  # a quotient has no value at 0
+    disc = 2 * bessel_j1_over_x(2 * w)
+    if float(flatness.detach()) <= 1:
+        return torch.lerp(gaussian, disc, flatness)
+    return torch.lerp(disc, bessel_j0(math.sqrt(2) * w), 2 * (flatness - 1))

@@ -51,7 +51,7 @@ from trainer.prediction.stages import Sensor
             scale=0.5,
             low=-1.5,
             high=1.5,
-            about="shape: 0 Gaussian, -1 uniform disc",
+            about="shape: 0 Gaussian, -1 uniform disc, -1.5 ring",
             typical=(-1.5, 1.5),
         ),
         Parameter(
@@ -76,7 +76,8 @@ from trainer.prediction.stages import Sensor
         ),
     ],
     formula=(
-        r"\hat{I}' = \hat{I}\,\Bigl[(1-h)\,e^{-w^2/2 + \kappa w^4/24} + h\,e^{-w_h^2/2}\Bigr],"
+        r"\hat{I}' = \hat{I}\,\bigl[(1-h)\,K_\kappa(w) + h\,K_0(w_h)\bigr],"
+        r" \quad K_0 = e^{-w^2/2}, \quad K_{-1} = J_1(2w)/w, \quad K_{-1.5} = J_0(\sqrt{2}\,w),"
         r" \qquad w = 2\pi \sqrt{(\sigma_x f_x)^2 + (\sigma_y f_y)^2}"
     ),
 )
