@@ -191,19 +191,22 @@ def test_a_model_is_complete_below_the_larger_threshold() -> None:
 
 def test_explanations_are_inseparable_where_their_difference_may_be_none() -> None:
     t = Thresholds(excess=1e-4)
-    assert t.inseparable(RemovedExcess(0.0, 0.0), 0.0)
-    assert t.inseparable(RemovedExcess(0.01, 0.01), 0.0)
-    assert not t.inseparable(RemovedExcess(0.01, 0.001), 0.0)
-    assert t.inseparable(RemovedExcess(0.99e-4, 1e-9), 0.0)  # sure, but too little to choose by
-    assert not t.inseparable(RemovedExcess(1e-4, 1e-9), 0.0)
-    assert t.inseparable(RemovedExcess(-0.1, 0.001), 0.0)
+    assert t.inseparable(RemovedExcess(0.0, 0.0), 0.0, 1.0)
+    assert t.inseparable(RemovedExcess(0.01, 0.01), 0.0, 1.0)
+    assert not t.inseparable(RemovedExcess(0.01, 0.001), 0.0, 1.0)
+    assert t.inseparable(RemovedExcess(0.99e-4, 1e-9), 0.0, 1.0)  # sure, but too little to choose by
+    assert not t.inseparable(RemovedExcess(1e-4, 1e-9), 0.0, 1.0)
+    assert t.inseparable(RemovedExcess(-0.1, 0.001), 0.0, 1.0)
     # The level is that of one comparison: 1.97 standard errors separate two explanations, 1.95 do not.
-    assert not t.inseparable(RemovedExcess(0.0197, 0.01), 0.0)
-    assert t.inseparable(RemovedExcess(0.0195, 0.01), 0.0)
+    assert not t.inseparable(RemovedExcess(0.0197, 0.01), 0.0, 1.0)
+    assert t.inseparable(RemovedExcess(0.0195, 0.01), 0.0, 1.0)
     # Half of what the better one leaves may be its own wrong shape.
-    assert t.inseparable(RemovedExcess(0.0249, 1e-6), 0.05)
-    assert not t.inseparable(RemovedExcess(0.0251, 1e-6), 0.05)
-    assert not t.inseparable(RemovedExcess(0.01, 0.001), -1e-5)
+    assert t.inseparable(RemovedExcess(0.0249, 1e-6), 0.05, 1.0)
+    assert not t.inseparable(RemovedExcess(0.0251, 1e-6), 0.05, 1.0)
+    assert not t.inseparable(RemovedExcess(0.01, 0.001), -1e-5, 1.0)
+    # While other effects hide both, what is left says nothing of shapes.
+    assert t.inseparable(RemovedExcess(0.0249, 1e-6), 0.5, 0.025)
+    assert not t.inseparable(RemovedExcess(0.0251, 1e-6), 0.5, 0.025)
 
 
 def test_json_has_every_threshold() -> None:

@@ -159,7 +159,7 @@ def explain(
     if save:
         save(model)
     steps = [ExplanationStep(None, errors)]
-    # Of the effects that were added, those that looked alike.
+    # By each effect that was added, those that could have been added in its place.
     rivals: dict[str, dict[str, EffectInstance]] = {}
     diagnoses: list[Diagnosis] = []
 
@@ -256,7 +256,7 @@ def explain(
         rivals[newest] = {
             r.effect.name: r.model.instance(r.effect.name)
             for r in found.ranking
-            if r.effect.name in best.indistinguishable_from
+            if r.worth_adding and r.effect.name != newest
         }
     # A last pass: of every effect but the newest it is known already that the rest cannot do without it.
     if len(model.names) > 1:

@@ -35,6 +35,7 @@ PIXEL_SHARE = 0.01
 # where its order can be raised, removes at least RAISED of what the best does. All are near where the best leaves more
 # than LITTLE of the excess.
 NEAR, RAISED, LITTLE = 2.0, 0.3, 0.9
+AS_MUCH = 0.1  # share of what the best candidate removes, by which a plainer one may remove less
 FITTED_TOGETHER = 3  # candidates fitted with the present effects free, when none explains anything alone
 
 
@@ -168,7 +169,7 @@ def try_near(
         return [
             s.effect
             for (_, excess, _), s in zip(fits, screened, strict=True)
-            if left > LITTLE * before
+            if before - left < (1 - LITTLE) * abs(before)
             or excess <= _near(left, before, least, raising and len(s.start.effect.orders) > 1)
         ]
 
@@ -194,10 +195,13 @@ def telling_captures(roles: CaptureRoles, model: Model) -> list[Capture]:
 
 
 def _near(left: float, before: float, least: float, can_be_raised: bool) -> float:
-    """Excess on few captures up to which a candidate is near the best, which leaves `left` there."""
+    """Excess on few captures up to which a candidate is near the best, which leaves `left` there.
+
+    Excess is negative where a number for each pixel has been fitted to these very captures.
+    """
     if can_be_raised:
         return before - RAISED * (before - left)
-    return min(NEAR * left + least, (before + left) / 2)
+    return min(NEAR * max(left, 0.0) + least, (before + left) / 2)
 
 
 def try_further_all(
@@ -295,7 +299,7 @@ def rank(
         How many were screened, which the test of each is corrected for.
     """
     ordered = sorted(fits, key=lambda f: f.held_out.excess)
-    plainer = next((f for f in ordered[1:] if _is_plainer(f, ordered[0], known, thresholds)), None)
+    plainer = next((f for f in ordered[1:] if _is_plainer(f, ordered[0], before, known, thresholds)), None)
     if plainer is not None:  # of two that the captures cannot tell apart
         ordered.remove(plainer)
         ordered.insert(0, plainer)
@@ -320,9 +324,11 @@ def rank(
     return ranked
 
 
-def _is_plainer(one: CandidateFit, best: CandidateFit, known: Catalogue, thresholds: Thresholds) -> bool:
+def _is_plainer(
+    one: CandidateFit, best: CandidateFit, before: PredictionErrors, known: Catalogue, thresholds: Thresholds
+) -> bool:
     """Whether a candidate says as much as the best: as its plain form, less rare, or in half of the numbers."""
-    if not thresholds.inseparable(removed_excess(one.held_out, best.held_out), best.held_out.excess):
+    if not _alike(one, best, before, thresholds, AS_MUCH):
         return False
     if known[best.effect].same_as == one.effect or known[best.effect].rare > known[one.effect].rare:
         return True
@@ -344,4 +350,16 @@ def _inseparable(
     if not thresholds.worth_adding(removed_excess(before, other.held_out), ideal_excess, candidates):
         return False
     worse, better = (one, other) if one.held_out.excess > other.held_out.excess else (other, one)
-    return thresholds.inseparable(removed_excess(worse.held_out, better.held_out), better.held_out.excess)
+    return _alike(worse, better, before, thresholds)
+
+
+def _alike(
+    worse: CandidateFit,
+    better: CandidateFit,
+    before: PredictionErrors,
+    thresholds: Thresholds,
+    less: float = 0.5,
+) -> bool:
+    left = better.held_out.excess
+    difference = removed_excess(worse.held_out, better.held_out)
+    return thresholds.inseparable(difference, left, less * (before.excess - left))

@@ -120,12 +120,13 @@ class Thresholds:
         """Whether enough remains for any effect to be worth adding."""
         return excess > self.least(ideal_excess)
 
-    def inseparable(self, difference: RemovedExcess, unexplained: float) -> bool:
+    def inseparable(self, difference: RemovedExcess, unexplained: float, most: float) -> bool:
         """Whether the data cannot tell two explanations apart.
 
         They cannot when the interval of the difference includes zero, or when the difference is small: below `excess`,
         or below half of what the better one leaves unexplained. What it leaves is how wrong the shape of either may
-        be: a source's extent, which is modelled without the iris's edge, may come out a third worse than a blur.
+        be: a source's extent, which is modelled without the iris's edge, may come out a third worse than a blur. While
+        other effects are missing it leaves much, so there is a limit of its own.
 
         Parameters
         ----------
@@ -133,6 +134,8 @@ class Thresholds:
             Excess that the better one removes from the other.
         unexplained : float
             Excess that the better one leaves.
+        most : float
+            Difference that is never small, a share of what the better one removes.
         """
         low, _ = difference.interval(1 - self.level)
-        return low <= 0 or difference.value < max(self.excess, 0.5 * unexplained)
+        return low <= 0 or difference.value < max(self.excess, min(0.5 * unexplained, most))
