@@ -115,6 +115,26 @@ def all_refitted(
     return found, evaluate_captures(roles.captures, roles.held_out, found.model)
 
 
+def all_raised(
+    folder: Path, ids: tuple[str, ...], fitted: FitResult, errors: PredictionErrors
+) -> tuple[Model, PredictionErrors]:
+    """A fitted model with its effects' orders raised as far as that helps, and its held-out errors.
+
+    A task for any process.
+
+    Parameters
+    ----------
+    errors : PredictionErrors
+        Of the model as it is on the held-out captures.
+    """
+    captures = opened(folder)
+    roles = capture_roles(replace(captures, captures=tuple(chosen(captures, ids))))
+    model = with_orders_raised(roles, fitted)
+    if model is not fitted.model:
+        errors = evaluate_captures(roles.captures, roles.held_out, model)
+    return model, errors
+
+
 def with_orders_raised(roles: CaptureRoles, fitted: FitResult) -> Model:
     """A fitted model with its effects' orders raised as far as that helps, and numbers by pixel from all captures."""
     batches = load(roles.captures, roles.fitted)

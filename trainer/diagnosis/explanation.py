@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from runtime.excess import PredictionErrors, removed_excess
+from runtime.excess import PredictionErrors, RemovedExcess, removed_excess
 from runtime.program.progress import Progress, forward_only, no_progress, part_of
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import CaptureRoles, capture_roles
-from trainer.diagnosis.addition import all_refitted, gone_on, with_maps_again, with_orders_raised
+from trainer.diagnosis.addition import all_raised, all_refitted, gone_on, with_maps_again
 from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors, screen_candidates
-from trainer.diagnosis.exchange import exchanged
+from trainer.diagnosis.exchange import CLEARLY, exchanged
 from trainer.diagnosis.fitted_ranking import expects_the_rest
 from trainer.diagnosis.learned_rest import LearnedRest, learn_rest
 from trainer.diagnosis.ranking import RankedEffect
@@ -32,6 +33,7 @@ from trainer.model.model import EffectInstance, Model
 
 MOST_EFFECTS = 8  # an explanation longer than this explains nothing
 NEAR = 0.7  # of the excess that the best candidate removes: a candidate that removes so much is near
+ABOUT = 1.5  # times as much as another leaves: about as little
 
 
 @dataclass(frozen=True)
@@ -280,7 +282,7 @@ def _added(roles: CaptureRoles, found: Diagnosis, pool: Pool) -> tuple[RankedEff
     So its closest rival is fitted together with them, too, before the orders of the better one are raised.
     """
     rival = _rival(found) if found.model.present else None
-    ones = [one for one in (found.ranking[0], rival) if one is not None]
+    ones = [found.ranking[0]] if rival is None else [found.ranking[0], rival]
     tasks = [
         (roles.folder, roles.ids, one.base, one.model.instance(one.effect.name))
         for one in ones
@@ -288,24 +290,46 @@ def _added(roles: CaptureRoles, found: Diagnosis, pool: Pool) -> tuple[RankedEff
     ]
     refitted = iter(pool.map_here_if_one(all_refitted, tasks))
     fitted = [(one.together, one.held_out) if one.together else next(refitted) for one in ones]
-    better = len(ones) > 1 and removed_excess(fitted[0][1], fitted[1][1]).interval()[0] > 0
-    one, (together, errors) = (ones[1], fitted[1]) if better else (ones[0], fitted[0])
-    model = with_orders_raised(roles, together)
-    if model is not together.model:
-        errors = evaluate_captures(roles.captures, roles.held_out, model)
+    if rival is not None and rival.worth_adding:
+        better = removed_excess(fitted[0][1], fitted[1][1]).interval()[0] > 0
+        ones, fitted = ones[better:][:1], fitted[better:][:1]
+    elif rival is not None and fitted[1][1].excess > ABOUT * fitted[0][1].excess:
+        ones, fitted = ones[:1], fitted[:1]
+    raised = pool.map_here_if_one(all_raised, [(roles.folder, roles.ids, *one) for one in fitted])
+    one, (model, errors) = ones[0], raised[0]
+    if len(raised) > 1:
+        # One that only the screen speaks for may have numbers that suit a little of anything.
+        other, after = raised[1]
+        if after.excess < CLEARLY * errors.excess and removed_excess(errors, after).interval()[0] > 0:
+            return ones[1], other, after
     return one, model, errors
 
 
 def _rival(found: Diagnosis) -> RankedEffect | None:
     """The candidate that may be right instead of the best one.
 
-    It is the one that the screen, which lets present effects move, expects most of; or the next best, where it is near.
+    It is the one that the screen, which lets present effects move, expects most of; or the next best, where it is near;
+    or one of which the screen expects about as much, even if it got nowhere while present effects stayed as they were.
+    The last is told from the best one only after orders are raised.
     """
     best, *others = (r for r in found.ranking if r.worth_adding)
-    expected = found.screened[0].effect if found.screened else best.effect.name
-    if expected != best.effect.name:
-        return next((r for r in others if r.effect.name == expected), None)
-    return next((r for r in others if r.removed.value > NEAR * best.removed.value), None)
+    first = found.screened[0] if found.screened else None
+    if first is None or first.effect == best.effect.name:
+        near = next((r for r in others if r.removed.value > NEAR * best.removed.value), None)
+    else:
+        near = next((r for r in others if r.effect.name == first.effect), None)
+    if near is not None or first is None or best.together is not None:
+        return near
+    names = [r.effect.name for r in found.ranking if r.worth_adding]
+    about = (s for s in found.screened if s.after < ABOUT * first.after and s.effect not in names)
+    return next((_unfitted(found, s) for s in about if not s.start.effect.rare), None)
+
+
+def _unfitted(found: Diagnosis, expected: ScreenResult) -> RankedEffect:
+    """A candidate as it starts, of which only the screen has said something."""
+    start = expected.start
+    unknown = RemovedExcess(0.0, math.inf)
+    return RankedEffect(start.effect, found.model.having(start), found.held_out, unknown, False)
 
 
 def _any_gone_on(
