@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,41 +17,15 @@ from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import catalogue
 from trainer.model.model import Model, absent
 
-
-@dataclass
-class Candidate:
-    """What the ranking says of an effect."""
-
-    effect: Any
-    removed: Any
-    worth_adding: bool = True
-
-
-def found(ranking: dict[str, float], screened: list[str], worthless: tuple[str, ...] = ()) -> Any:
-    """A diagnosis: excess that each fitted candidate removes, best first, and the screen's order."""
-    ranked = [
-        Candidate(SimpleNamespace(name=n), SimpleNamespace(value=v), n not in worthless)
-        for n, v in ranking.items()
-    ]
-    return SimpleNamespace(ranking=ranked, screened=[SimpleNamespace(effect=n) for n in screened])
-
-
-@pytest.mark.parametrize(
-    ("ranking", "screened", "worthless", "rival"),
-    [
-        # A present effect took up most of the right one: alone it removes little, the screen expects most of it.
-        ({"modulation": 0.028, "leak": 0.011}, ["leak", "modulation"], (), "leak"),
-        ({"modulation": 0.028, "leak": 0.021}, ["modulation", "leak"], (), "leak"),  # near
-        ({"modulation": 0.028, "leak": 0.011}, ["modulation", "leak"], (), None),  # far behind in both
-        ({"modulation": 0.028, "leak": 0.011}, ["leak", "modulation"], ("leak",), None),
-        ({"modulation": 0.028}, ["modulation"], (), None),
-    ],
+BENCH = Bench(
+    "ideal",
+    Panel(8, 8, 8.0),
+    (Channel("green", 520.0),),
+    30.0,
+    Iris(),
+    Camera(8, 8, 8.0, True, 12, 64.0, 10500.0, 5.0),
 )
-def test_the_rival_is_what_the_screen_expects_most_of_or_what_is_near(
-    ranking: dict[str, float], screened: list[str], worthless: tuple[str, ...], rival: str | None
-) -> None:
-    one = _rival(found(ranking, screened, worthless))
-    assert (one and one.effect.name) == rival
+KNOWN = catalogue()
 
 
 def errors(excess: float) -> PredictionErrors:
@@ -63,6 +36,56 @@ def errors(excess: float) -> PredictionErrors:
     )
 
 
+def found(
+    ranking: dict[str, float], screened: dict[str, float], worthless: tuple[str, ...], together: bool
+) -> Any:
+    """A diagnosis: excess that each fitted candidate removes, and that the screen expects each to leave, best first."""
+    ranked = [
+        SimpleNamespace(
+            effect=KNOWN[name],
+            removed=SimpleNamespace(value=value),
+            worth_adding=name not in worthless,
+            together=True if together else None,
+        )
+        for name, value in ranking.items()
+    ]
+    expected = [
+        SimpleNamespace(effect=name, after=after, start=absent(KNOWN[name], BENCH))
+        for name, after in screened.items()
+    ]
+    return SimpleNamespace(ranking=ranked, screened=expected, model=Model(BENCH), held_out=errors(0.03))
+
+
+BEST, OTHER, RARE = "amplitude_modulation", "stray_light", "polarisation_leak"
+
+
+@pytest.mark.parametrize(
+    ("ranking", "screened", "worthless", "together", "rival"),
+    [
+        # A present effect took up most of the right one: alone it removes little, the screen expects most of it.
+        ({BEST: 0.028, RARE: 0.011}, {RARE: 0.001, BEST: 0.002}, (), False, RARE),
+        ({BEST: 0.028, RARE: 0.021}, {BEST: 0.001, RARE: 0.002}, (), False, RARE),  # near
+        ({BEST: 0.028, OTHER: 0.011}, {BEST: 0.001, OTHER: 0.002}, (), False, None),  # far behind in both
+        ({BEST: 0.028}, {BEST: 0.001}, (), False, None),
+        # It got nowhere while present effects stayed as they were, but the screen expects about as much of it.
+        ({BEST: 0.028, OTHER: 0.0}, {OTHER: 0.001, BEST: 0.002}, (OTHER,), False, OTHER),
+        ({BEST: 0.028}, {BEST: 0.010, OTHER: 0.014}, (), False, OTHER),
+        ({BEST: 0.028}, {BEST: 0.010, OTHER: 0.016}, (), False, None),
+        ({BEST: 0.028}, {BEST: 0.010, RARE: 0.011}, (), False, None),  # few benches have it
+        ({BEST: 0.028}, {BEST: 0.010, OTHER: 0.014}, (), True, None),  # fitted already, and far behind
+    ],
+)
+def test_the_rival_is_what_the_screen_expects_most_of_or_what_is_near(
+    ranking: dict[str, float],
+    screened: dict[str, float],
+    worthless: tuple[str, ...],
+    together: bool,
+    rival: str | None,
+) -> None:
+    one = _rival(found(ranking, screened, worthless, together))
+    assert (one and one.effect.name) == rival
+
+
 @pytest.mark.parametrize(
     ("leak", "first"),
     [
@@ -71,11 +94,9 @@ def errors(excess: float) -> PredictionErrors:
     ],
 )
 def test_of_two_that_look_alike_the_one_that_few_benches_have_comes_second(leak: float, first: str) -> None:
-    known, camera = catalogue(), Camera(8, 8, 8.0, True, 12, 64.0, 10500.0, 5.0)
-    bench = Bench("ideal", Panel(8, 8, 8.0), (Channel("green", 520.0),), 30.0, Iris(), camera)
     fits = [
-        CandidateFit(name, Model(bench).having(absent(known[name], bench)), errors(excess))
+        CandidateFit(name, Model(BENCH).having(absent(KNOWN[name], BENCH)), errors(excess))
         for name, excess in (("polarisation_leak", leak), ("phase_response", 0.2))
     ]
-    ranking = rank(errors(0.5), fits, known, Thresholds(), 0.5, len(known))
+    ranking = rank(errors(0.5), fits, KNOWN, Thresholds(), 0.5, len(KNOWN))
     assert ranking[0].effect.name == first
