@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 
 from firmware_iface.panel import open_board
 from firmware_iface.panel.fields import Field, FieldPanel, colours_in_turn
-from firmware_iface.panel.panel_board_messages import (
-    Timing,
-)
+from firmware_iface.panel.panel_board_messages import Timing
 from firmware_iface.virtual.usb import BoardModel, VirtualUsb
 
 SHAPE = (3, 5)

@@ -108,11 +108,16 @@ def all_refitted(
 
     A task for any process.
     """
-    captures = opened(folder)
-    roles = capture_roles(replace(captures, captures=tuple(chosen(captures, ids))))
+    roles = _roles_of(folder, ids)
     model = base.having(fitted)
     found = fit(model, model.names, load(roles.captures, roles.fitted))
     return found, evaluate_captures(roles.captures, roles.held_out, found.model)
+
+
+def _roles_of(folder: Path, ids: tuple[str, ...]) -> CaptureRoles:
+    """The roles of these captures of a set, in any process."""
+    captures = opened(folder)
+    return capture_roles(replace(captures, captures=tuple(chosen(captures, ids))))
 
 
 def all_raised(
@@ -127,8 +132,7 @@ def all_raised(
     errors : PredictionErrors
         Of the model as it is on the held-out captures.
     """
-    captures = opened(folder)
-    roles = capture_roles(replace(captures, captures=tuple(chosen(captures, ids))))
+    roles = _roles_of(folder, ids)
     model = with_orders_raised(roles, fitted)
     if model is not fitted.model:
         errors = evaluate_captures(roles.captures, roles.held_out, model)

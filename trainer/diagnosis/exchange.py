@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from runtime.excess import PredictionErrors, removed_excess
 from trainer.captures.capture_table import ids_of
 from trainer.captures.held_out import CaptureRoles
-from trainer.diagnosis.addition import all_refitted, with_orders_raised
+from trainer.diagnosis.addition import all_raised, all_refitted
 from trainer.diagnosis.candidate_fits import try_together_on_few
 from trainer.diagnosis.ranking import telling_captures
 from trainer.fitting.pool import Pool
@@ -66,8 +66,7 @@ def exchanged(
     (old, new, _), (together, after) = min(found, key=lambda one: one[1][1].excess)
     if after.excess > CLEARLY * errors.excess:  # before orders are raised, which is most of the work
         return None
-    other = with_orders_raised(roles, together)
-    after = evaluate_captures(roles.captures, roles.held_out, other)
+    other, after = all_raised(roles.folder, roles.ids, together, after)
     if after.excess > CLEARLY * errors.excess or removed_excess(errors, after).interval()[0] <= 0:
         return None
     return old, new, other, after

@@ -33,7 +33,7 @@ from trainer.model.model import EffectInstance, Model
 
 MOST_EFFECTS = 8  # an explanation longer than this explains nothing
 NEAR = 0.7  # of the excess that the best candidate removes: a candidate that removes so much is near
-ABOUT = 1.5  # times as much as another leaves: about as little
+ABOUT = 1.5  # times the excess that another leaves, or is expected to: about as much
 
 
 @dataclass(frozen=True)
@@ -279,7 +279,8 @@ def _added(roles: CaptureRoles, found: Diagnosis, pool: Pool) -> tuple[RankedEff
     """The effect to add, the model with it, everything refitted, and that model's held-out errors.
 
     A candidate is ranked while present effects stay as they are, and these may have taken up a part of the right one.
-    So its closest rival is fitted together with them, too, before the orders of the better one are raised.
+    So its closest rival is fitted together with them, too, before the orders of the better one are raised. A rival that
+    only the screen speaks for, and that leaves about as much, has its orders raised, too.
     """
     rival = _rival(found) if found.model.present else None
     ones = [found.ranking[0]] if rival is None else [found.ranking[0], rival]
@@ -290,11 +291,13 @@ def _added(roles: CaptureRoles, found: Diagnosis, pool: Pool) -> tuple[RankedEff
     ]
     refitted = iter(pool.map_here_if_one(all_refitted, tasks))
     fitted = [(one.together, one.held_out) if one.together else next(refitted) for one in ones]
-    if rival is not None and rival.worth_adding:
-        better = removed_excess(fitted[0][1], fitted[1][1]).interval()[0] > 0
-        ones, fitted = ones[better:][:1], fitted[better:][:1]
-    elif rival is not None and fitted[1][1].excess > ABOUT * fitted[0][1].excess:
-        ones, fitted = ones[:1], fitted[:1]
+    if rival is not None:
+        (_, left), (_, after) = fitted
+        if not rival.worth_adding:
+            kept = [0, 1] if after.excess <= ABOUT * left.excess else [0]
+        else:
+            kept = [1] if removed_excess(left, after).interval()[0] > 0 else [0]
+        ones, fitted = [ones[k] for k in kept], [fitted[k] for k in kept]
     raised = pool.map_here_if_one(all_raised, [(roles.folder, roles.ids, *one) for one in fitted])
     one, (model, errors) = ones[0], raised[0]
     if len(raised) > 1:
@@ -312,7 +315,7 @@ def _rival(found: Diagnosis) -> RankedEffect | None:
     or one of which the screen expects about as much, even if it got nowhere while present effects stayed as they were.
     The last is told from the best one only after orders are raised.
     """
-    best, *others = (r for r in found.ranking if r.worth_adding)
+    best, *others = worthwhile = [r for r in found.ranking if r.worth_adding]
     first = found.screened[0] if found.screened else None
     if first is None or first.effect == best.effect.name:
         near = next((r for r in others if r.removed.value > NEAR * best.removed.value), None)
@@ -320,7 +323,7 @@ def _rival(found: Diagnosis) -> RankedEffect | None:
         near = next((r for r in others if r.effect.name == first.effect), None)
     if near is not None or first is None or best.together is not None:
         return near
-    names = [r.effect.name for r in found.ranking if r.worth_adding]
+    names = [r.effect.name for r in worthwhile]
     about = (s for s in found.screened if s.after < ABOUT * first.after and s.effect not in names)
     return next((_unfitted(found, s) for s in about if not s.start.effect.rare), None)
 

@@ -35,7 +35,8 @@ PIXEL_SHARE = 0.01
 # where its order can be raised, removes at least RAISED of what the best does. All are near where the best leaves more
 # than LITTLE of the excess.
 NEAR, RAISED, LITTLE = 2.0, 0.3, 0.9
-AS_MUCH = 0.1  # share of what the best candidate removes, by which a plainer one may remove less
+# Of what the better of two candidates removes: by so much less removes one that is like it, and a plainer one.
+ALIKE, PLAINER = 0.5, 0.1
 FITTED_TOGETHER = 3  # candidates fitted with the present effects free, when none explains anything alone
 
 
@@ -328,7 +329,7 @@ def _is_plainer(
     one: CandidateFit, best: CandidateFit, before: PredictionErrors, known: Catalogue, thresholds: Thresholds
 ) -> bool:
     """Whether a candidate says as much as the best: as its plain form, less rare, or in half of the numbers."""
-    if not _alike(one, best, before, thresholds, AS_MUCH):
+    if not _alike(one, best, before, thresholds, PLAINER):
         return False
     if known[best.effect].same_as == one.effect or known[best.effect].rare > known[one.effect].rare:
         return True
@@ -350,7 +351,7 @@ def _inseparable(
     if not thresholds.worth_adding(removed_excess(before, other.held_out), ideal_excess, candidates):
         return False
     worse, better = (one, other) if one.held_out.excess > other.held_out.excess else (other, one)
-    return _alike(worse, better, before, thresholds)
+    return _alike(worse, better, before, thresholds, ALIKE)
 
 
 def _alike(
@@ -358,8 +359,9 @@ def _alike(
     better: CandidateFit,
     before: PredictionErrors,
     thresholds: Thresholds,
-    less: float = 0.5,
+    less: float,
 ) -> bool:
+    """Whether captures cannot tell two apart, and the worse removes less by no more than this share of the better."""
     left = better.held_out.excess
     difference = removed_excess(worse.held_out, better.held_out)
     return thresholds.inseparable(difference, left, less * (before.excess - left))

@@ -75,9 +75,8 @@ def vibration(sensor: Sensor, rms: Tensor, direction: Tensor, kurtosis: Tensor) 
     def blur(amount: Tensor) -> Tensor:
         w2 = amount * whole
         share = -kurtosis / 1.5
-        return share * bessel_j0(torch.sqrt(torch.clamp(2 * w2, min=1e-12))) + (1 - share) * torch.exp(
-            -0.5 * w2
-        )
+        sinusoid = bessel_j0(torch.sqrt(torch.clamp(2 * w2, min=1e-12)))  # a root has no slope at 0
+        return share * sinusoid + (1 - share) * torch.exp(-0.5 * w2)
 
     return sensor if float(rms.detach()) == 0 else replace(sensor, capture_blur=blur)
 
