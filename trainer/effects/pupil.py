@@ -15,7 +15,7 @@ from trainer.effects.free_form import FreeForm
 from trainer.effects.starts import distance_starts, wavelength_starts
 from trainer.effects.term_names import aberration_terms
 from trainer.effects.zernike import zernike_count, zernike_surface
-from trainer.prediction.stages import Pupil
+from trainer.prediction.stages import Pupil, SourceExtent
 
 LINES = 5  # nodes of the Gauss-Hermite rule that represents a laser line
 FWHM = 2 * math.sqrt(2 * math.log(2))
@@ -302,6 +302,7 @@ def source_lines(pupil: Pupil, separation: Tensor, share: Tensor) -> Pupil:
 @effect(
     stage="pupil",
     acts_on="display",
+    touches_iris=True,
     parameters=[
         Parameter(
             "extent_y",
@@ -376,21 +377,21 @@ def spatial_coherence(
     Deng and Chu 2017, Coherence properties of different light sources and their effect on the image sharpness and
     speckle of holographic displays, Sci. Rep. 7, 5893.
     """
-    # Exact except at the iris's edge, and hundreds of times cheaper than one propagation for each source point.
-    reach = 1e-3 * torch.abs(pupil.distance)
-    widths = (reach * extent_y, reach * extent_x, reach * halo_extent)
-    return pupil.filtered(kernel_transfer(pupil.iy, pupil.ix, widths, kurtosis, halo))
+    widths = 1e-3 * extent_y, 1e-3 * extent_x
+
+    def core(ky: Tensor, kx: Tensor) -> Tensor:
+        return (1 - halo) * kernel_core(ky, kx, widths, kurtosis)
+
+    def outer(ky: Tensor, kx: Tensor) -> Tensor:
+        return halo * kernel_halo(ky, kx, 1e-3 * halo_extent)
+
+    return replace(pupil, extent=SourceExtent(core, outer, widths))
 
 
 def kernel_transfer(
     iy: Tensor, ix: Tensor, widths: tuple[Tensor, Tensor, Tensor], kurtosis: Tensor, halo: Tensor
 ) -> Tensor:
     """Transfer function of a blur kernel with a core and a halo.
-
-    The core has the same width whatever its kurtosis. At 0 it is a Gaussian, exp(-w^2/2) with w = 2 pi width f; at -1 a
-    uniform disc, J1(2w)/w; at -1.5 a ring, J0(sqrt(2) w); between two of these a sum of both. Above 0 it is the first
-    two even cumulants, exp(-w^2/2 + kurtosis w^4/24), the second limited to half of the first, where the expansion
-    ends. The halo is a round Gaussian.
 
     Parameters
     ----------
@@ -406,10 +407,25 @@ def kernel_transfer(
     -------
     Tensor [n, m]
     """
-    w2 = (2 * math.pi) ** 2 * ((widths[0] * iy) ** 2 + (widths[1] * ix) ** 2)
+    ky, kx = 2 * math.pi * iy, 2 * math.pi * ix
+    return (1 - halo) * kernel_core(ky, kx, widths[:2], kurtosis) + halo * kernel_halo(ky, kx, widths[2])
+
+
+def kernel_core(ky: Tensor, kx: Tensor, widths: tuple[Tensor, Tensor], kurtosis: Tensor) -> Tensor:
+    """Transfer function of a core, the same rms width whatever its kurtosis, over radians per unit of `widths`.
+
+    With w = k width: at a kurtosis of 0 a Gaussian, exp(-w^2/2); at -1 a uniform disc, J1(2w)/w; at -1.5 a ring,
+    J0(sqrt(2) w); between two of these a sum of both. Above 0 it is the first two even cumulants,
+    exp(-w^2/2 + kurtosis w^4/24), the second limited to half of the first, where the expansion ends.
+    """
+    w2 = (widths[0] * ky) ** 2 + (widths[1] * kx) ** 2
     peaked = torch.exp(w2 * (torch.clamp(kurtosis * w2 / 24, 0, 0.25) - 0.5))
-    core = peaked if float(kurtosis.detach()) >= 0 else _flat_topped(w2, -kurtosis, peaked)
-    return (1 - halo) * core + halo * torch.exp(-0.5 * (2 * math.pi * widths[2]) ** 2 * (iy**2 + ix**2))
+    return peaked if float(kurtosis.detach()) >= 0 else _flat_topped(w2, -kurtosis, peaked)
+
+
+def kernel_halo(ky: Tensor, kx: Tensor, width: Tensor) -> Tensor:
+    """Transfer function of a round Gaussian halo, over radians per unit of its rms width."""
+    return torch.exp(-0.5 * width**2 * (ky**2 + kx**2))
 
 
 def _flat_topped(w2: Tensor, flatness: Tensor, gaussian: Tensor) -> Tensor:

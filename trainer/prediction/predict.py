@@ -7,7 +7,8 @@ irradiance, counts.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -28,11 +29,13 @@ from runtime.lightpath.modulation import Modulation
 from runtime.lightpath.propagation import far_field_matrix
 from trainer.device import array_of
 from trainer.kept_results import kept_by_device, kept_for_same
+from trainer.prediction.capture_gain import own_gain
 from trainer.prediction.capture_motion import blurred_spectrum, displaced_spectrum
 from trainer.prediction.panel_gradient import has_panel_gradient, image_with_panel_gradient
 from trainer.prediction.pupil_modes import pupil_modes
 from trainer.prediction.samples_at import samples_at
 from trainer.prediction.scene import Scene, Stages, bare_stages
+from trainer.prediction.source_extent import extent_transfer, lit_by_extent
 from trainer.prediction.stages import Drive, Pupil, Sensor
 
 MODULATION_SAMPLES = 512  # over phase: a linear step between them errs by 1e-5
@@ -144,11 +147,16 @@ def bare_irradiance(scene: Scene, gray: np.ndarray) -> np.ndarray:
 
 
 def display_filter(stages: Stages) -> Tensor | None:
-    """The irradiance filter that applies to the eye too: source extent and ghosts."""
-    parts = [f for f in (stages.pupil.irradiance_filter, stages.sensor.irradiance_filter) if f is not None]
-    if not parts:
-        return None
-    return parts[0] if len(parts) == 1 else parts[0] * parts[1]
+    """The irradiance filter that applies to the eye too: source extent and ghosts.
+
+    What the iris's edge takes of light from aside is left out: the headset computes one picture, not five.
+    """
+    pupil, found = stages.pupil, None
+    extent = None if pupil.extent is None else extent_transfer(pupil)
+    for part in (extent, pupil.irradiance_filter, stages.sensor.irradiance_filter):
+        if part is not None:
+            found = part if found is None else found * part
+    return found
 
 
 @dataclass(frozen=True)
@@ -160,7 +168,7 @@ class Trace:
     spectrum : complex Tensor [B, K, n, m]
         The panel's, in each of its states; empty where only what happens at the panel has a gradient.
     image : Tensor
-        Irradiance before filters.
+        Irradiance before filters, of the source with its extent.
     """
 
     spectrum: Tensor
@@ -197,17 +205,32 @@ def trace(
     if before is not None and start == "sensor":
         return before
     path = light_path(scene, stages)
-    exposure = list(states(path))
     if before is not None and start == "pupil":
         spectrum = before.spectrum
     else:
         phase = driven_phase(path, stages, gray, earlier)
         if has_panel_gradient(path, phase):
-            return Trace(torch.empty(0), image_with_panel_gradient(path, phase))
-        spectra = [panel_spectrum(state, phase) for state in exposure]
+            return Trace(
+                torch.empty(0), _lit(scene, stages, path, lambda p: image_with_panel_gradient(p, phase))
+            )
+        spectra = [panel_spectrum(state, phase) for state in states(path)]
         spectrum = spectra[0][:, None] if len(spectra) == 1 else torch.stack(spectra, 1)
-    parts = [mode_irradiance(state, spectrum[:, k]) for k, state in enumerate(exposure)]
-    return Trace(spectrum, parts[0] if len(parts) == 1 else torch.stack(parts).sum(0))
+
+    def image(path: LightPath) -> Tensor:
+        parts = [mode_irradiance(state, spectrum[:, k]) for k, state in enumerate(states(path))]
+        return parts[0] if len(parts) == 1 else torch.stack(parts).sum(0)
+
+    return Trace(spectrum, _lit(scene, stages, path, image))
+
+
+def _lit(scene: Scene, stages: Stages, path: LightPath, image: Callable[[LightPath], Tensor]) -> Tensor:
+    """Irradiance with the source's extent, of a function that gives that of a light path of a point's light."""
+
+    def image_of(pupil: Pupil) -> Tensor:
+        own = pupil is stages.pupil
+        return image(path if own else light_path(scene, replace(stages, pupil=pupil)))
+
+    return lit_by_extent(stages.pupil, image_of)
 
 
 def light_on_camera(
@@ -260,7 +283,7 @@ def light_on_camera(
 
 @kept_for_same(2)  # of a fit's model and of its trial
 def _camera_transfer(scene: Scene, pupil: Pupil, sensor: Sensor) -> Tensor:
-    """Transfer function of all that blurs irradiance: the pixel's area, source extent, ghosts, the camera."""
+    """Transfer function of all that filters irradiance in the image: the pixel's area, ghosts, the camera."""
     transfer = _pixel_area(scene, sensor)
     for extra in (pupil.irradiance_filter, sensor.irradiance_filter, sensor.blur):
         if extra is not None:
@@ -293,11 +316,7 @@ def counts(
     if sensor.gain is not None:
         signal = signal * sensor.gain
     if sensor.free_capture_gain and measured is not None:
-        observed, weight = measured
-        if sensor.offset is not None:
-            observed = observed - sensor.offset
-        own = (observed * signal * weight).sum((-2, -1)) / (signal**2 * weight).sum((-2, -1))
-        signal = signal * own[:, None, None]
+        signal = signal * own_gain(sensor, signal, measured)
     if sensor.offset is not None:
         signal = signal + sensor.offset
     if sensor.response is not None:

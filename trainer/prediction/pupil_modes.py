@@ -31,7 +31,9 @@ def _bare_modes(scene: Scene) -> tuple[Tensor, Tensor]:
     return _modes(scene, bare_stages(scene).pupil)
 
 
-@kept_for_same(2)  # of a fit's model and of its trial
+@kept_for_same(
+    10
+)  # of a fit's model and of its trial, with the four further pupils of a source with an extent
 def _last_modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
     return _modes(scene, pupil)
 

@@ -144,6 +144,24 @@ class Panel:
 
 
 @dataclass(frozen=True)
+class SourceExtent:
+    """Directions from which the panel is lit; their irradiances add.
+
+    Attributes
+    ----------
+    core, halo : callable
+        The mean of exp(-j k.angle) over the directions near the axis, and over all others, times their share of the
+        light: their characteristic functions, of a column and a row of k (1/rad).
+    rms : (Tensor, Tensor), rad
+        Angle of the directions near the axis, along rows and columns.
+    """
+
+    core: Callable[[Tensor, Tensor], Tensor]
+    halo: Callable[[Tensor, Tensor], Tensor]
+    rms: tuple[Tensor, Tensor]
+
+
+@dataclass(frozen=True)
 class Pupil:
     """The path from the panel to the image plane, over spatial frequency.
 
@@ -180,6 +198,8 @@ class Pupil:
         Offsets of the laser's lines, m, and their weights.
     irradiance_filter : Tensor or None
         Transfer function of irradiance over (iy, ix).
+    extent : SourceExtent or None
+        Of the source; None where it is a point.
     """
 
     channel: str
@@ -203,6 +223,7 @@ class Pupil:
     transmission: Tensor | None = None
     lines: tuple[Tensor, Tensor] | None = None
     irradiance_filter: Tensor | None = None
+    extent: SourceExtent | None = None
 
     def delayed(self, path_difference: Tensor) -> Pupil:
         """The pupil with a path difference [n, m], m, added."""
