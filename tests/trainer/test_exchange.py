@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from tests.trainer.hidden import bench_file
@@ -9,7 +11,8 @@ from trainer.captures.acquire import acquire_from
 from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.held_out import capture_roles
-from trainer.diagnosis.exchange import exchanged
+from trainer.diagnosis.exchange import exchanged, one_for_two
+from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import catalogue
 from trainer.fitting.gains import with_gains
 from trainer.fitting.gauss_newton import fit
@@ -49,3 +52,42 @@ def test_held_out_captures_decide(
     assert (None if found is None else found[:2]) == expected
     if found is not None:
         assert found[2].names == (rival,) and found[3].excess < 0.5 * errors.excess
+
+
+@pytest.mark.parametrize(
+    ("hidden", "stands"),
+    [
+        (("polarisation_leak",), True),
+        (("amplitude_modulation", "phase_response"), False),
+    ],
+)
+def test_a_rival_stands_for_two_effects_where_it_does_as_well(
+    hidden: tuple[str, ...], stands: bool, tmp_path: Path
+) -> None:
+    """A leak has a phase and an amplitude curve; of these two a leak has only some."""
+    bench = bench_file(tmp_path, *(f'kind = "{name}"' for name in hidden))
+    acquire_from(str(bench), tmp_path / "captures", patterns=6)
+    captures = read_captures(tmp_path / "captures")
+    roles = capture_roles(captures)
+    batches = load(captures, roles.fitted)
+    ideal = with_gains(captures, Model(captures.bench), roles.fitted)
+
+    def fitted(*effects: tuple[str, int]) -> Model:
+        model = ideal
+        for name, order in effects:
+            model = model.having(absent(catalogue()[name], captures.bench, order))
+        return fit(model, model.names, batches, 30).model
+
+    model = fitted(("amplitude_modulation", 6), ("phase_response", 6))
+    errors = evaluate_captures(captures, roles.held_out, model)
+    assert errors.excess < 5e-4
+    leak = fitted(("polarisation_leak", 0)).instance("polarisation_leak")
+    with open_pool(1) as pool:
+        found = one_for_two(
+            roles, model, errors, {"amplitude_modulation": {leak.effect.name: leak}}, Thresholds(), 1.0, pool
+        )
+    assert (None if found is None else found[:3]) == (
+        ("polarisation_leak", "amplitude_modulation", "phase_response") if stands else None
+    )
+    if found is not None:
+        assert found[3].names == ("polarisation_leak",) and found[4].excess < 5e-4

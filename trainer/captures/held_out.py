@@ -99,7 +99,9 @@ def with_stopping(rows: Sequence[Capture], most: int) -> tuple[list[Capture], li
 
 
 def sample(captures: Iterable[Capture], pixels: int, most: int) -> list[Capture]:
-    """Different patterns for a fit, spread over colours and planes.
+    """Different patterns for a fit, spread over colours and planes, each as it was captured last.
+
+    A repeat follows its own pattern. What a slow panel showed before the first capture of a set, nobody knows.
 
     Parameters
     ----------
@@ -115,7 +117,7 @@ def sample(captures: Iterable[Capture], pixels: int, most: int) -> list[Capture]
     """
     by_scene: dict[tuple[str, float], dict[str, Capture]] = {}
     for c in captures:
-        by_scene.setdefault((c.channel, c.plane_mm), {}).setdefault(c.pattern, c)
+        by_scene.setdefault((c.channel, c.plane_mm), {})[c.pattern] = c
     columns = [list(patterns.values()) for patterns in by_scene.values()]
     # Patterns of one kind often follow each other: spread the choice over the whole list.
     columns = [[column[i] for i in _spread(len(column))] for column in columns]

@@ -1,6 +1,7 @@
-"""An effect of a model exchanged for one that the captures could not tell it from when it was added.
+"""Effects of a model exchanged for one that the captures could not tell from one of them when it was added.
 
-An effect that was added early may have stood for the right one: the two looked alike while others were missing.
+An effect that was added early may have stood for the right one: the two looked alike while others were missing. Then a
+later one may have been added for what the first does not do as the right one does: the right one stands for both.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.addition import all_raised, all_refitted
 from trainer.diagnosis.candidate_fits import try_together_on_few
 from trainer.diagnosis.ranking import telling_captures
+from trainer.diagnosis.verdict import Thresholds
 from trainer.fitting.pool import Pool
 from trainer.fitting.predictor import evaluate_captures
 from trainer.model.model import EffectInstance, Model
@@ -70,3 +72,51 @@ def exchanged(
     if after.excess > CLEARLY * errors.excess or removed_excess(errors, after).interval()[0] <= 0:
         return None
     return old, new, other, after
+
+
+def one_for_two(
+    roles: CaptureRoles,
+    model: Model,
+    errors: PredictionErrors,
+    rivals: Rivals,
+    thresholds: Thresholds,
+    ideal_excess: float,
+    pool: Pool,
+) -> tuple[str, str, str, Model, PredictionErrors] | None:
+    """The model with a rival of one effect in place of that one and another of its stage, where it does as well.
+
+    Parameters
+    ----------
+    errors : PredictionErrors
+        Of `model` on the held-out captures.
+    rivals : mapping
+        As of `exchanged`.
+
+    Returns
+    -------
+    (str, str, str, Model, PredictionErrors) or None
+        The rival's effect, the two, and the model with it, everything refitted.
+    """
+    stages = {name: model.instance(name).effect.stage for name in model.names}
+    triples = [
+        (old, other, new, model.without(old).without(other), fitted)
+        for old, others in rivals.items()
+        for new, fitted in others.items()
+        for other in model.names
+        if old in stages and new not in stages and other != old and stages[other] == stages[old]
+    ]
+    if not triples:
+        return None
+    few = telling_captures(roles, model)
+    enough = evaluate_captures(roles.captures, few, model).excess + thresholds.least(ideal_excess)
+    ids = ids_of(few)
+    on_few = pool.map_here_if_one(try_together_on_few, [(roles.folder, ids, *one[3:]) for one in triples])
+    triples = [one for one, excess in zip(triples, on_few, strict=True) if excess < enough]
+    tasks = [(roles.folder, roles.ids, *one[3:]) for one in triples]
+    found = list(zip(triples, pool.map_here_if_one(all_refitted, tasks), strict=True))
+    if not found:
+        return None
+    (old, other, new, *_), (together, after) = min(found, key=lambda one: one[1][1].excess)
+    if thresholds.worth_adding(removed_excess(after, errors), ideal_excess, 1):
+        return None
+    return new, old, other, together.model, after

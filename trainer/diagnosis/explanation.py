@@ -14,7 +14,7 @@ from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import CaptureRoles, capture_roles
 from trainer.diagnosis.addition import all_raised, all_refitted, gone_on, with_maps_again
 from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors, screen_candidates
-from trainer.diagnosis.exchange import CLEARLY, exchanged
+from trainer.diagnosis.exchange import CLEARLY, exchanged, one_for_two
 from trainer.diagnosis.fitted_ranking import expects_the_rest
 from trainer.diagnosis.learned_rest import LearnedRest, learn_rest
 from trainer.diagnosis.ranking import RankedEffect
@@ -260,6 +260,18 @@ def explain(
             for r in found.ranking
             if r.worth_adding and r.effect.name != newest
         }
+    alike = {
+        step.added: {n: rivals[step.added][n] for n in step.indistinguishable_from if n in rivals[step.added]}
+        for step in steps
+        if step.added in rivals
+    }
+    simpler = one_for_two(roles, model, errors, alike, diagnoses[-1].thresholds, ideal.excess, pool)
+    if simpler is not None:
+        new, old, other, model, errors = simpler
+        model = recorded(recorded(model, new, errors, old), None, errors, other)
+        steps += [ExplanationStep(new, errors, removed=old), ExplanationStep(None, errors, removed=other)]
+        if save:
+            save(model)
     # A last pass: of every effect but the newest it is known already that the rest cannot do without it.
     if len(model.names) > 1:
         kept = model.names
@@ -280,7 +292,8 @@ def _added(roles: CaptureRoles, found: Diagnosis, pool: Pool) -> tuple[RankedEff
 
     A candidate is ranked while present effects stay as they are, and these may have taken up a part of the right one.
     So its closest rival is fitted together with them, too, before the orders of the better one are raised. A rival that
-    only the screen speaks for, and that leaves about as much, has its orders raised, too.
+    only the screen speaks for, and that leaves about as much, has its orders raised, too, and so has one that more
+    benches have than the best.
     """
     rival = _rival(found) if found.model.present else None
     ones = [found.ranking[0]] if rival is None else [found.ranking[0], rival]
@@ -291,21 +304,33 @@ def _added(roles: CaptureRoles, found: Diagnosis, pool: Pool) -> tuple[RankedEff
     ]
     refitted = iter(pool.map_here_if_one(all_refitted, tasks))
     fitted = [(one.together, one.held_out) if one.together else next(refitted) for one in ones]
+    undecided = False
     if rival is not None:
         (_, left), (_, after) = fitted
-        if not rival.worth_adding:
-            kept = [0, 1] if after.excess <= ABOUT * left.excess else [0]
-        else:
-            kept = [1] if removed_excess(left, after).interval()[0] > 0 else [0]
-        ones, fitted = [ones[k] for k in kept], [fitted[k] for k in kept]
+        if ones[0].effect.rare and not rival.effect.rare:
+            undecided = True
+        elif not rival.worth_adding:
+            undecided = after.excess <= ABOUT * left.excess
+        elif _better(after, left, clearly=rival.effect.rare):
+            ones, fitted = ones[1:], fitted[1:]
+        if not undecided:
+            ones, fitted = ones[:1], fitted[:1]
     raised = pool.map_here_if_one(all_raised, [(roles.folder, roles.ids, *one) for one in fitted])
-    one, (model, errors) = ones[0], raised[0]
-    if len(raised) > 1:
-        # One that only the screen speaks for may have numbers that suit a little of anything.
-        other, after = raised[1]
-        if after.excess < CLEARLY * errors.excess and removed_excess(errors, after).interval()[0] > 0:
-            return ones[1], other, after
-    return one, model, errors
+    which = 0
+    if undecided:
+        (_, left), (_, after) = raised
+        if ones[0].effect.rare:
+            which = 0 if _better(left, after, clearly=True) else 1
+        else:
+            # One that only the screen speaks for may have numbers that suit a little of anything.
+            which = 1 if _better(after, left, clearly=True) else 0
+    return ones[which], *raised[which]
+
+
+def _better(one: PredictionErrors, other: PredictionErrors, clearly: bool) -> bool:
+    """Whether held-out captures prefer one of two models; clearly: whether it leaves at most half, too."""
+    enough = not clearly or one.excess < CLEARLY * other.excess
+    return enough and removed_excess(other, one).interval()[0] > 0
 
 
 def _rival(found: Diagnosis) -> RankedEffect | None:

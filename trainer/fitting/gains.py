@@ -6,14 +6,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
-from trainer.captures.batches import load, load_batch
+from trainer.captures.batches import load_batch
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.capture_table import Capture
-from trainer.fitting.gauss_newton import fit
 from trainer.fitting.least_squares_gain import with_gain
 from trainer.fitting.predictor import Predictor
 from trainer.model.model import Model
-from trainer.model.model_stages import scene_for, stages_of
 
 
 def with_gains(
@@ -33,10 +31,6 @@ def with_gains(
         return model
     channels = list(dict.fromkeys(c.channel for c in rows))
     found = with_gain(replace(model, gain={}), _Predictors(captures, model, rows, done))
-    scene = scene_for(model, rows[0].channel, rows[0].plane_mm)
-    if stages_of(scene, model).sensor.response is not None:
-        # Counts are not proportional to light: least squares only gives the fit its start.
-        found = fit(found, [], load(captures, rows)).model
     return replace(model, gain={**model.gain, **{c: found.gain[c] for c in channels}})
 
 

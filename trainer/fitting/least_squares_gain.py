@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from trainer.fitting.predictor import Predictor
 from trainer.model.model import Model
+from trainer.prediction.capture_gain import SETTLED, STEPS, brightness_step, brightness_terms
 from trainer.prediction.predict import counts
 
 
@@ -22,6 +24,7 @@ def with_gain(model: Model, predictors: Sequence[Predictor], lights: Sequence[Te
         Irradiance on the camera of each predictor's batch under the model; computed where not given.
     """
     sums: dict[str, list[float]] = {}
+    bent = False
     for k, predictor in enumerate(predictors):
         batch = predictor.batch
         unit = replace(model, gain={batch.channel: 1.0})
@@ -34,9 +37,47 @@ def with_gain(model: Model, predictors: Sequence[Predictor], lights: Sequence[Te
             ones.append(counts(predictor.scene, plain, light[part], exposed[part], None))
             signal, added = batch.signal[part], stages.sensor.offset
             signals.append(signal if added is None else signal - added)
+            bent = bent or stages.sensor.response is not None
         one, light_counts = batch.as_compared(torch.cat(ones)), torch.cat(signals)
         total = sums.setdefault(batch.channel, [0.0, 0.0])
         total[0] += float((batch.mask * light_counts * one).sum(dtype=torch.float64))
         total[1] += float((batch.mask * one**2).sum(dtype=torch.float64))
     gain = {**model.gain, **{c: max(a, 1e-12) / max(b, 1e-30) for c, (a, b) in sums.items()}}
-    return replace(model, gain=gain)
+    model = replace(model, gain=gain)
+    if not bent:
+        return model
+    if lights is None:
+        lights = [p.light(model, p.trace(model)) for p in predictors]
+    return _through_response(model, predictors, lights)
+
+
+def _through_response(model: Model, predictors: Sequence[Predictor], lights: Sequence[Tensor]) -> Model:
+    """The model with the gains that counts call for which are not proportional to light, from its own gains on."""
+    for _ in range(STEPS):
+        sums: dict[str, Tensor] = {}
+        for predictor, light in zip(predictors, lights, strict=True):
+            batch = predictor.batch
+            terms = brightness_terms(_counts_of(model, predictor, light), batch.signal, batch.mask)
+            both = torch.stack([t.sum(dtype=torch.float64) for t in terms])
+            sums[batch.channel] = sums[batch.channel] + both if batch.channel in sums else both
+        changes = {c: float(brightness_step(along, power)) for c, (along, power) in sums.items()}
+        gain = {**model.gain, **{c: model.gain[c] * math.exp(change) for c, change in changes.items()}}
+        model = replace(model, gain=gain)
+        if max(abs(change) for change in changes.values()) < SETTLED:
+            break
+    return model
+
+
+def _counts_of(model: Model, predictor: Predictor, light: Tensor) -> Callable[[float], Tensor]:
+    """Counts of a batch at so many times the light, without a gain of each capture's own."""
+    batch = predictor.batch
+    gain = model.gain[batch.channel] * batch.exposure[:, None, None]
+
+    def found(factor: float) -> Tensor:
+        parts = []
+        for part, stages in predictor.parts(model):
+            steady = replace(stages, sensor=replace(stages.sensor, free_capture_gain=False))
+            parts.append(counts(predictor.scene, steady, light[part], factor * gain[part], None))
+        return batch.as_compared(torch.cat(parts))
+
+    return found

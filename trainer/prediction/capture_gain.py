@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -34,24 +36,47 @@ def own_gain(sensor: Sensor, signal: Tensor, measured: tuple[Tensor, Tensor]) ->
         if sensor.offset is not None:
             observed = observed - sensor.offset
         return _sum(observed * signal * weight) / _sum(signal**2 * weight)
+
+    def step() -> Tensor:
+        return brightness_step(
+            *brightness_terms(lambda f: _counts(sensor, f * own * signal), observed, weight)
+        )
+
     own = torch.ones_like(signal[:, :1, :1])
     with torch.no_grad():
         for _ in range(STEPS):
-            step = _step(sensor, own * signal, observed, weight)
-            own = own * torch.exp(step)
-            if float(step.abs().max()) < SETTLED:
+            change = step()
+            own = own * torch.exp(change)
+            if float(change.abs().max()) < SETTLED:
                 break
     # The last step has the derivatives of the whole search, as the ones before have come to rest.
-    return own * torch.exp(_step(sensor, own * signal, observed, weight)) if torch.is_grad_enabled() else own
+    return own * torch.exp(step()) if torch.is_grad_enabled() else own
 
 
-def _step(sensor: Sensor, light: Tensor, observed: Tensor, weight: Tensor) -> Tensor:
-    """Change of the brightness's logarithm that fits the counts better, [B, 1, 1]."""
-    error = observed - _counts(sensor, light)
-    slope = (_counts(sensor, (1 + APART) * light) - _counts(sensor, (1 - APART) * light)) / (2 * APART)
-    power = _sum(slope**2 * weight)
-    step = _sum(error * slope * weight) / torch.where(power > 0, power, torch.ones_like(power))
-    return torch.clamp(step, -MOST, MOST)
+def brightness_terms(
+    counts_of: Callable[[float], Tensor], observed: Tensor, weight: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Sums over each picture from which a better brightness follows, where counts are not proportional to light.
+
+    Parameters
+    ----------
+    counts_of : callable
+        Counts [B, h, w] at so many times the light.
+    observed, weight : Tensor [B, h, w]
+
+    Returns
+    -------
+    (Tensor, Tensor), each [B, 1, 1]
+        Of error times slope, and of the slope's square, over the logarithm of the light.
+    """
+    error = observed - counts_of(1)
+    slope = (counts_of(1 + APART) - counts_of(1 - APART)) / (2 * APART)
+    return _sum(error * slope * weight), _sum(slope**2 * weight)
+
+
+def brightness_step(along: Tensor, power: Tensor) -> Tensor:
+    """Change of the light's logarithm by Gauss-Newton, from sums as `brightness_terms` gives them."""
+    return torch.clamp(along / torch.where(power > 0, power, torch.ones_like(power)), -MOST, MOST)
 
 
 def _counts(sensor: Sensor, light: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ with the difference carried from the camera's pixels to the panel's where the tw
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -27,6 +27,7 @@ from trainer.fitting.predictor import Predictor
 from trainer.model.bundle_export import acting_on_display
 from trainer.model.model import Model
 from trainer.model.model_stages import scene_for, stages_of
+from trainer.prediction.capture_gain import own_gain
 from trainer.prediction.predict import counts, light_path
 from trainer.prediction.scene import Scene, Stages
 from trainer.training.camera_to_panel import onto_panel
@@ -185,7 +186,7 @@ def expected_counts(model: Model, batch: Batch) -> tuple[Scene, Stages, Tensor, 
     scene, stages = predictor.scene, predictor.stages(model)
     with torch.no_grad():
         light = predictor.light(model, predictor.trace(model))
-        own = _own_gain(scene, stages, light, model, batch)
+        own = _own_gain(stages, light, model, batch)
         gain = model.gain[batch.channel] * batch.exposure[:, None, None] * own
     with torch.enable_grad():
         light.requires_grad_(True)
@@ -194,16 +195,15 @@ def expected_counts(model: Model, batch: Batch) -> tuple[Scene, Stages, Tensor, 
     return scene, stages, expected.detach(), sensitivity.expand_as(expected)
 
 
-def _own_gain(scene: Scene, stages: Stages, light: Tensor, model: Model, batch: Batch) -> Tensor:
+def _own_gain(stages: Stages, light: Tensor, model: Model, batch: Batch) -> Tensor:
     """A capture's own gain where laser power drifts, else 1."""
     sensor = stages.sensor
     if not sensor.free_capture_gain:
         return torch.ones(1, 1, 1)
-    linear = replace(stages, sensor=replace(sensor, offset=None, response=None, free_capture_gain=False))
-    one = counts(scene, linear, light, model.gain[batch.channel] * batch.exposure[:, None, None], None)
-    signal = batch.signal if sensor.offset is None else batch.signal - sensor.offset
-    total = (signal * one * batch.mask).sum((-2, -1)) / (one**2 * batch.mask).sum((-2, -1))
-    return total[:, None, None]
+    signal = light * model.gain[batch.channel] * batch.exposure[:, None, None]
+    if sensor.gain is not None:
+        signal = signal * sensor.gain
+    return own_gain(sensor, signal, (batch.signal, batch.mask))
 
 
 def display_irradiance(model: Model, batch: Batch) -> Tensor:
