@@ -425,3 +425,22 @@ def test_illumination_lights_the_panel_and_its_leak() -> None:
     torch.testing.assert_close(panel.source.abs(), expected)
     assert panel.leak is not None
     torch.testing.assert_close(panel.leak.real, 0.1 * expected)
+
+
+def test_a_broad_line_is_as_smooth_as_many_wavelengths() -> None:
+    """Far from the panel the wavelengths of a broad line displace fine detail by pixels, and five show apart."""
+    width, plane = 15.0, 15.0
+    scene = scene_of(plane=plane)
+
+    def of_lines(count: int) -> Tensor:
+        nodes = torch.linspace(-3.5, 3.5, count, dtype=torch.float64)
+        weights = torch.exp(-0.5 * nodes**2)
+        bare = stages_for(scene, ())
+        lines = bare.pupil.emitting(nodes * 1e-9 * width / 2.3548, weights / weights.sum())
+        return predicted(scene, replace(bare, pupil=lines))
+
+    smooth = of_lines(41)
+    found = predicted(scene, stages_for(scene, (present("temporal_coherence", line_width=width),)))
+    off, five = (float(((c - smooth) ** 2).mean() / smooth.var()) for c in (found, of_lines(5)))
+    assert off < 1e-5
+    assert five > 30 * off

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,7 +16,8 @@ from trainer.effects.term_names import aberration_terms
 from trainer.effects.zernike import zernike_count, zernike_surface
 from trainer.prediction.stages import Pupil, SourceExtent
 
-LINES = 5  # nodes of the Gauss-Hermite rule that represents a laser line
+# A laser line is a sum of wavelengths, evenly apart out to so many standard deviations, five to MOST_LINES of them.
+LINE_REACH, FEWEST_LINES, MOST_LINES = 3.0, 5, 13
 FWHM = 2 * math.sqrt(2 * math.log(2))
 
 
@@ -247,11 +247,28 @@ def temporal_coherence(pupil: Pupil, line_width: Tensor) -> Pupil:
     Deng and Chu 2017, Coherence properties of different light sources and their effect on the image sharpness and
     speckle of holographic displays, Sci. Rep. 7, 5893.
     """
-    rule = np.polynomial.hermite_e.hermegauss(LINES)
-    nodes, weights = (
-        torch.as_tensor(a / s, dtype=line_width.dtype) for a, s in zip(rule, (1, rule[1].sum()), strict=True)
+    deviation = 1e-9 / FWHM * line_width
+    count = _lines_needed(pupil, float(deviation.detach()))
+    nodes = torch.linspace(-LINE_REACH, LINE_REACH, count, dtype=line_width.dtype)
+    weights = torch.exp(-0.5 * nodes**2)
+    weights = weights / weights.sum()
+    nodes = nodes / torch.sqrt((weights * nodes**2).sum())  # what is cut off at the ends
+    return pupil.emitting(nodes * deviation, weights)
+
+
+def _lines_needed(pupil: Pupil, deviation: float) -> int:
+    """Wavelengths that add up like a Gaussian line with a standard deviation (m).
+
+    Each displaces what passes near the iris's edge; between two of them, light there may turn against the rest by less
+    than a whole turn, with room for the width of the line's own characteristic function.
+    """
+    edge = float(pupil.half_width.detach()) / (2 * pupil.pitch)
+    turned = (
+        1.5 * math.pi * abs(float(pupil.distance.detach())) * deviation * edge**2
+    )  # rad, towards the corner
+    return min(
+        FEWEST_LINES + 2 * math.ceil(max(LINE_REACH * (turned + 3) / (2 * math.pi) - 2, 0)), MOST_LINES
     )
-    return pupil.emitting(nodes * line_width * 1e-9 / FWHM, weights)
 
 
 @effect(
