@@ -14,7 +14,12 @@ from trainer.effects.starts import displacements
 
 LIKELY_GAIN, LIKELY_OFFSET = 0.05, 20.0  # where the estimate of their spreads begins: share, counts
 LIKELY_VARIANCES = tuple(0.06 * 1.6**n for n in range(-1, 10))  # of a blur, pixels^2, from 0.04 to 4
-ROUNDS = 6  # of that estimate
+ROUNDS = 6  # of taking away what neighbours tell
+SPREAD_ROUNDS, SETTLED = (
+    300,
+    1e-3,
+)  # of the spreads' estimate at most, and the share of them that a last one changes
+SPREAD_PIXELS = 50_000  # that it is made from
 REACH = 3  # pixels each way: the neighbours that a pixel's number is predicted from
 
 
@@ -68,23 +73,40 @@ def pixel_pattern(evidence: Sequence[Evidence]) -> dict[str, Any]:
         beyond = array_of(one.batch.signal.double()) - expected
         terms = (expected**2, expected, np.ones_like(expected), expected * beyond, beyond)
         sums += np.stack([(weight * t).sum(0) for t in terms])
-    gain_spread, offset_spread = LIKELY_GAIN, LIKELY_OFFSET
     # First what neighbours tell goes, again and again, because each time it is drawn towards zero.
     for _ in range(ROUNDS):
-        gain, offset, _ = _most_probable(sums, gain_spread, offset_spread)
+        gain, offset, _ = _most_probable(sums, LIKELY_GAIN, LIKELY_OFFSET)
         gain, offset = gain - _own(gain), offset - _own(offset)
         sums[3] -= sums[0] * gain + sums[1] * offset
         sums[4] -= sums[1] * gain + sums[2] * offset
-    for _ in range(ROUNDS):
-        gain, offset, (gain_variance, offset_variance) = _most_probable(sums, gain_spread, offset_spread)
-        gain_spread = max(float(np.sqrt(np.mean(gain**2 + gain_variance))), 1e-5)
-        offset_spread = max(float(np.sqrt(np.mean(offset**2 + offset_variance))), 1e-3)
+    gain_spread, offset_spread = _spreads(sums)
+    gain, offset, _ = _most_probable(sums, gain_spread, offset_spread)
     return {
         "gain": np.maximum(gain, -0.99),
         "offset": offset,
         "gain_rms": max(100 * gain_spread, 0.01),
         "offset_rms": max(offset_spread, 0.01),
     }
+
+
+def _spreads(sums: np.ndarray) -> tuple[float, float]:
+    """Spreads of the pixels' gains and offsets that make what was seen most probable (expectation maximisation).
+
+    References
+    ----------
+    Dempster, Laird and Rubin 1977, Maximum likelihood from incomplete data via the EM algorithm, J. R. Stat. Soc. B
+    39, 1.
+    """
+    some = sums.reshape(len(sums), -1)
+    some = some[:, :: max(1, some.shape[1] // SPREAD_PIXELS)]
+    spreads = LIKELY_GAIN, LIKELY_OFFSET
+    for _ in range(SPREAD_ROUNDS):
+        gain, offset, variances = _most_probable(some, *spreads)
+        found = [float(np.sqrt(np.mean(v**2 + s))) for v, s in zip((gain, offset), variances, strict=True)]
+        before, spreads = spreads, (max(found[0], 1e-5), max(found[1], 1e-3))
+        if all(abs(a / b - 1) < SETTLED for a, b in zip(spreads, before, strict=True)):
+            break
+    return spreads
 
 
 def _most_probable(

@@ -47,7 +47,7 @@ def lit_by_extent(pupil: Pupil, image_of: Callable[[Pupil], Tensor]) -> Tensor:
 
     References
     ----------
-    Goodman, Introduction to Fourier Optics, section 6.1; Goodman, Statistical Optics, section 5.6.
+    Goodman, Introduction to Fourier Optics, section 6.1; Goodman, Statistical Optics, chapter 7.
     """
     image = image_of(pupil)
     if pupil.extent is None:
