@@ -1,7 +1,7 @@
-"""Effects of a model exchanged for one that the captures could not tell from one of them when it was added.
+"""Effects of a model exchanged for one that could have been added in place of one of them.
 
-An effect that was added early may have stood for the right one: the two looked alike while others were missing. Then a
-later one may have been added for what the first does not do as the right one does: the right one stands for both.
+An effect that was added early may have stood for the right one: the two looked alike while others were missing. A later
+one may then have been added for what the first does not do as the right one does, and the right one stands for both.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def one_for_two(
     ideal_excess: float,
     pool: Pool,
 ) -> tuple[str, str, str, Model, PredictionErrors] | None:
-    """The model with a rival of one effect in place of that one and another of its stage, where it does as well.
+    """The model with one effect in place of two of its stage, a rival of one of them, where it does as well.
 
     Parameters
     ----------
@@ -103,7 +103,8 @@ def one_for_two(
         for old, others in rivals.items()
         for new, fitted in others.items()
         for other in model.names
-        if old in stages and new not in stages and other != old and stages[other] == stages[old]
+        if old in stages and new not in stages and other != old
+        if stages[other] == stages[old] == fitted.effect.stage
     ]
     if not triples:
         return None

@@ -260,12 +260,8 @@ def explain(
             for r in found.ranking
             if r.worth_adding and r.effect.name != newest
         }
-    alike = {
-        step.added: {n: rivals[step.added][n] for n in step.indistinguishable_from if n in rivals[step.added]}
-        for step in steps
-        if step.added in rivals
-    }
-    simpler = one_for_two(roles, model, errors, alike, diagnoses[-1].thresholds, ideal.excess, pool)
+    kept = model.names
+    simpler = one_for_two(roles, model, errors, rivals, diagnoses[-1].thresholds, ideal.excess, pool)
     if simpler is not None:
         new, old, other, model, errors = simpler
         model = recorded(recorded(model, new, errors, old), None, errors, other)
@@ -274,11 +270,10 @@ def explain(
             save(model)
     # A last pass: of every effect but the newest it is known already that the rest cannot do without it.
     if len(model.names) > 1:
-        kept = model.names
         model, errors = without_unnecessary(model, errors, [steps[-1].added] if steps[-1].added else [])
-        if model.names != kept:
-            found = diagnose(captures, model, known, pool, thresholds, None, ideal, thorough=False)
-            diagnoses.append(found)
+    if model.names != kept:
+        found = diagnose(captures, model, known, pool, thresholds, None, ideal, thorough=False)
+        diagnoses.append(found)
     rest = None
     if learn and diagnoses[-1].verdict != "complete" and not below_the_noise(errors):
         rest = learn_rest(roles, model, diagnoses[-1], pool, part_of(report, 0.8, 1.0))
