@@ -1,0 +1,29 @@
+"""Which of a set's captures a fit takes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from trainer.captures.capture_table import Capture
+from trainer.captures.held_out import sample
+
+
+def row(number: int, pattern: str, plane_mm: float = 30.0) -> Capture:
+    return Capture(str(number), "green", plane_mm, pattern, Path("p.png"), Path("i.png"), 10.0, float(number))
+
+
+def test_of_a_repeated_pattern_the_last_capture_is_taken() -> None:
+    """What a slow panel showed before the first capture of a set, nobody knows; a repeat follows its own pattern."""
+    rows = [row(0, "a"), row(1, "a"), row(2, "b"), row(3, "c"), row(4, "b")]
+    assert sorted(c.capture for c in sample(rows, 1, 8)) == ["1", "3", "4"]
+
+
+def test_each_plane_has_a_capture_and_patterns_are_spread() -> None:
+    rows = [row(k, f"p{k}") for k in range(8)] + [row(8 + k, f"p{k}", 40.0) for k in range(8)]
+    taken = sample(rows, 1, 4)
+    assert [(c.plane_mm, c.pattern) for c in taken] == [
+        (30.0, "p0"),
+        (40.0, "p0"),
+        (30.0, "p4"),
+        (40.0, "p4"),
+    ]
