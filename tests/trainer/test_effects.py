@@ -176,30 +176,6 @@ def test_every_number_of_every_effect_has_a_derivative(name: str) -> None:
         assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(slope, rel=near, abs=1e-3 / p.scale), p.name
 
 
-def test_laser_drift_is_a_switch_and_the_gain_is_measured() -> None:
-    drift = present("laser_drift", spread=3.0)
-    scene = scene_of(drift)
-    truth = predicted(scene, stages_for(scene, ()))
-    measured = truth * torch.tensor([1.1, 0.9], dtype=torch.float64)[:, None, None]
-    weight = torch.ones_like(truth)
-    own = predicted(scene, stages_for(scene, (drift,)), (measured, weight))
-    torch.testing.assert_close(own, measured)
-    held = predicted(scene, stages_for(scene, (present("laser_drift", spread=0.0),)), (measured, weight))
-    torch.testing.assert_close(held, truth)
-
-
-def test_the_drifting_gain_is_one_of_light_where_counts_are_not_proportional_to_it() -> None:
-    bent = present("sensor_response", bend=np.array([-0.9, 0.2]), order=2)
-    scene = scene_of(bent)
-    light = light_on_camera(scene, stages_for(scene, ()), trace(scene, stages_for(scene, ()), gray()).image)
-    brightness = torch.full((2, 1, 1), 400.0, dtype=torch.float64)
-    drifting = brightness * torch.tensor([1.3, 0.6], dtype=torch.float64)[:, None, None]
-    truth = counts(scene, stages_for(scene, (bent,)), light, drifting, None)
-    both = stages_for(scene, (present("laser_drift", spread=3.0), bent))
-    found = counts(scene, both, light, brightness, (truth, torch.ones_like(truth)))
-    torch.testing.assert_close(found, truth, rtol=1e-4, atol=1e-4)
-
-
 def flat_light(*effects: EffectInstance) -> Tensor:
     """Light in the middle of the picture of a panel that shows gray 0."""
     scene = scene_of(*effects)
@@ -367,15 +343,6 @@ def test_crosstalk_shares_out_the_phase_of_each_pixel_and_no_more() -> None:
     assert abs(float((columns * reach).sum())) > 0.01  # and to one side with it
 
 
-def test_a_line_has_the_width_that_it_says() -> None:
-    lines = stages_for(scene_of(), (present("temporal_coherence", line_width=4.0),)).pupil.lines
-    assert lines is not None
-    offsets, weights = lines
-    assert float(weights.sum()) == pytest.approx(1)
-    spread = math.sqrt(float((weights * offsets**2).sum()))
-    assert spread * 2 * math.sqrt(2 * math.log(2)) == pytest.approx(4e-9)
-
-
 def test_a_response_keeps_its_sign_and_its_ends() -> None:
     turned = replace(bench(), panel=replace(bench().panel, phase_sign=-1))
     response = present("phase_response", gain=0.9, curvature=0.2)
@@ -425,22 +392,3 @@ def test_illumination_lights_the_panel_and_its_leak() -> None:
     torch.testing.assert_close(panel.source.abs(), expected)
     assert panel.leak is not None
     torch.testing.assert_close(panel.leak.real, 0.1 * expected)
-
-
-def test_a_broad_line_is_as_smooth_as_many_wavelengths() -> None:
-    """Far from the panel the wavelengths of a broad line displace fine detail by pixels, and five show apart."""
-    width, plane = 15.0, 15.0
-    scene = scene_of(plane=plane)
-
-    def of_lines(count: int) -> Tensor:
-        nodes = torch.linspace(-3.5, 3.5, count, dtype=torch.float64)
-        weights = torch.exp(-0.5 * nodes**2)
-        bare = stages_for(scene, ())
-        lines = bare.pupil.emitting(nodes * 1e-9 * width / 2.3548, weights / weights.sum())
-        return predicted(scene, replace(bare, pupil=lines))
-
-    smooth = of_lines(41)
-    found = predicted(scene, stages_for(scene, (present("temporal_coherence", line_width=width),)))
-    off, five = (float(((c - smooth) ** 2).mean() / smooth.var()) for c in (found, of_lines(5)))
-    assert off < 1e-5
-    assert five > 30 * off

@@ -6,7 +6,7 @@ one may then have been added for what the first does not do as the right one doe
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 from runtime.excess import PredictionErrors, removed_excess
 from trainer.captures.capture_table import ids_of
@@ -15,6 +15,7 @@ from trainer.diagnosis.addition import all_raised, all_refitted
 from trainer.diagnosis.candidate_fits import try_together_on_few
 from trainer.diagnosis.ranking import telling_captures
 from trainer.diagnosis.verdict import Thresholds
+from trainer.fitting.gauss_newton import FitResult
 from trainer.fitting.pool import Pool
 from trainer.fitting.predictor import evaluate_captures
 from trainer.model.model import EffectInstance, Model
@@ -51,21 +52,12 @@ def exchanged(
         for new, fitted in others.items()
         if old in model.names and new not in model.names
     ]
-    if not pairs:
+    trials = [(model.without(old), fitted) for old, _, fitted in pairs]
+    found = _best(roles, model, trials, lambda left: CLEARLY * left, pool)
+    if found is None:
         return None
-    # What a model cannot explain of few captures, with its numbers free to suit these alone, it cannot explain of all.
-    few = telling_captures(roles, model)
-    left = evaluate_captures(roles.captures, few, model).excess
-    ids = ids_of(few)
-    on_few = pool.map_here_if_one(
-        try_together_on_few, [(roles.folder, ids, model.without(old), fitted) for old, _, fitted in pairs]
-    )
-    pairs = [pair for pair, excess in zip(pairs, on_few, strict=True) if excess < CLEARLY * left]
-    tasks = [(roles.folder, roles.ids, model.without(old), fitted) for old, _, fitted in pairs]
-    found = list(zip(pairs, pool.map_here_if_one(all_refitted, tasks), strict=True))
-    if not found:
-        return None
-    (old, new, _), (together, after) = min(found, key=lambda one: one[1][1].excess)
+    which, together, after = found
+    old, new, _ = pairs[which]
     if after.excess > CLEARLY * errors.excess:  # before orders are raised, which is most of the work
         return None
     other, after = all_raised(roles.folder, roles.ids, together, after)
@@ -106,18 +98,47 @@ def one_for_two(
         if old in stages and new not in stages and other != old
         if stages[other] == stages[old] == fitted.effect.stage
     ]
-    if not triples:
+    trials = [(base, fitted) for *_, base, fitted in triples]
+    found = _best(roles, model, trials, lambda left: left + thresholds.least(ideal_excess), pool)
+    if found is None:
         return None
-    few = telling_captures(roles, model)
-    enough = evaluate_captures(roles.captures, few, model).excess + thresholds.least(ideal_excess)
-    ids = ids_of(few)
-    on_few = pool.map_here_if_one(try_together_on_few, [(roles.folder, ids, *one[3:]) for one in triples])
-    triples = [one for one, excess in zip(triples, on_few, strict=True) if excess < enough]
-    tasks = [(roles.folder, roles.ids, *one[3:]) for one in triples]
-    found = list(zip(triples, pool.map_here_if_one(all_refitted, tasks), strict=True))
-    if not found:
-        return None
-    (old, other, new, *_), (together, after) = min(found, key=lambda one: one[1][1].excess)
+    which, together, after = found
+    old, other, new, *_ = triples[which]
     if thresholds.worth_adding(removed_excess(after, errors), ideal_excess, 1):
         return None
     return new, old, other, together.model, after
+
+
+def _best(
+    roles: CaptureRoles,
+    model: Model,
+    trials: Sequence[tuple[Model, EffectInstance]],
+    most: Callable[[float], float],
+    pool: Pool,
+) -> tuple[int, FitResult, PredictionErrors] | None:
+    """The trial, a model and an effect added to it, that leaves least when everything is fitted together.
+
+    Parameters
+    ----------
+    most : callable
+        Excess on few captures above which a trial is not fitted to all, from the excess of `model` there.
+
+    Returns
+    -------
+    (int, FitResult, PredictionErrors) or None
+        Which one, its fit, and its errors on the held-out captures.
+    """
+    if not trials:
+        return None
+    # What a model cannot explain of few captures, with its numbers free to suit these alone, it cannot explain of all.
+    few = telling_captures(roles, model)
+    enough = most(evaluate_captures(roles.captures, few, model).excess)
+    ids = ids_of(few)
+    on_few = pool.map_here_if_one(try_together_on_few, [(roles.folder, ids, *trial) for trial in trials])
+    promising = [k for k, excess in enumerate(on_few) if excess < enough]
+    tasks = [(roles.folder, roles.ids, *trials[k]) for k in promising]
+    found = list(zip(promising, pool.map_here_if_one(all_refitted, tasks), strict=True))
+    if not found:
+        return None
+    which, (together, after) = min(found, key=lambda one: one[1][1].excess)
+    return which, together, after

@@ -125,8 +125,7 @@ class Thresholds:
 
         They cannot when the interval of the difference includes zero, or when the difference is small: below `excess`,
         or below half of what the better one leaves unexplained. What it leaves is how wrong the shape of either may
-        be: a source's extent, which is modelled without the iris's edge, may come out a third worse than a blur. While
-        other effects are missing it leaves much, so there is a limit of its own.
+        be. While other effects are missing it leaves much, so there is a limit of its own.
 
         Parameters
         ----------

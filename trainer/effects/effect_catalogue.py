@@ -13,7 +13,7 @@ from pathlib import Path
 from types import ModuleType
 
 from firmware_iface.errors import InputError
-from trainer.effects import camera_in_time, drive, modulation, panel, pupil, sensor
+from trainer.effects import camera_in_time, drive, light_source, modulation, panel, pupil, sensor
 from trainer.effects.definition import Effect
 from trainer.effects.own_effect import line_in_file
 
@@ -36,9 +36,9 @@ BUILT_IN: tuple[Effect, ...] = (
     pupil.wavelength,
     pupil.pupil_aberration,
     pupil.iris,
-    pupil.temporal_coherence,
-    pupil.source_lines,
-    pupil.spatial_coherence,
+    light_source.temporal_coherence,
+    light_source.source_lines,
+    light_source.spatial_coherence,
     sensor.sensor_blur,
     sensor.misregistration,
     sensor.vignetting,

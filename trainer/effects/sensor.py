@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from runtime.lightpath.legendre import legendre_count, legendre_curve, legendre_surface
+from trainer.effects.blur_kernel import kernel_transfer
 from trainer.effects.definition import Parameter, effect
 from trainer.effects.free_form import FreeForm, along
-from trainer.effects.pupil import kernel_transfer
 from trainer.effects.starts import gain_spread, ghost_starts, registration_starts
 from trainer.effects.term_names import curve_terms, distortion_terms, surface_terms, surface_terms_with_mean
 from trainer.prediction.stages import Sensor

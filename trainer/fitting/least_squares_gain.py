@@ -24,38 +24,36 @@ def with_gain(model: Model, predictors: Sequence[Predictor], lights: Sequence[Te
         Irradiance on the camera of each predictor's batch under the model; computed where not given.
     """
     sums: dict[str, list[float]] = {}
-    bent = False
+    bent: list[tuple[Predictor, Tensor]] = []
     for k, predictor in enumerate(predictors):
         batch = predictor.batch
         unit = replace(model, gain={batch.channel: 1.0})
         light = predictor.light(unit, predictor.trace(unit)) if lights is None else lights[k]
         exposed = batch.exposure[:, None, None]
         ones, signals = [], []
-        for part, stages in predictor.parts(unit):
+        parts = predictor.parts(unit)
+        if any(stages.sensor.response is not None for _, stages in parts):
+            bent.append((predictor, light))
+        for part, stages in parts:
             linear = replace(stages.sensor, offset=None, response=None, free_capture_gain=False)
             plain = replace(stages, sensor=linear)
             ones.append(counts(predictor.scene, plain, light[part], exposed[part], None))
             signal, added = batch.signal[part], stages.sensor.offset
             signals.append(signal if added is None else signal - added)
-            bent = bent or stages.sensor.response is not None
         one, light_counts = batch.as_compared(torch.cat(ones)), torch.cat(signals)
         total = sums.setdefault(batch.channel, [0.0, 0.0])
         total[0] += float((batch.mask * light_counts * one).sum(dtype=torch.float64))
         total[1] += float((batch.mask * one**2).sum(dtype=torch.float64))
     gain = {**model.gain, **{c: max(a, 1e-12) / max(b, 1e-30) for c, (a, b) in sums.items()}}
     model = replace(model, gain=gain)
-    if not bent:
-        return model
-    if lights is None:
-        lights = [p.light(model, p.trace(model)) for p in predictors]
-    return _through_response(model, predictors, lights)
+    return _through_response(model, bent) if bent else model
 
 
-def _through_response(model: Model, predictors: Sequence[Predictor], lights: Sequence[Tensor]) -> Model:
-    """The model with the gains that counts call for which are not proportional to light, from its own gains on."""
+def _through_response(model: Model, lit: Sequence[tuple[Predictor, Tensor]]) -> Model:
+    """The model with the gains of batches whose counts are not proportional to light, from its own gains on."""
     for _ in range(STEPS):
         sums: dict[str, Tensor] = {}
-        for predictor, light in zip(predictors, lights, strict=True):
+        for predictor, light in lit:
             batch = predictor.batch
             terms = brightness_terms(_counts_of(model, predictor, light), batch.signal, batch.mask)
             both = torch.stack([t.sum(dtype=torch.float64) for t in terms])

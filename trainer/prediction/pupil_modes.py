@@ -31,9 +31,7 @@ def _bare_modes(scene: Scene) -> tuple[Tensor, Tensor]:
     return _modes(scene, bare_stages(scene).pupil)
 
 
-@kept_for_same(
-    10
-)  # of a fit's model and of its trial, with the four further pupils of a source with an extent
+@kept_for_same(10)  # of a fit's model and of its trial, each with the four further places of an extent's iris
 def _last_modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
     return _modes(scene, pupil)
 
