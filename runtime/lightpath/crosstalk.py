@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 from array_api_compat import array_namespace
@@ -12,7 +11,7 @@ from runtime.lightpath.periodic_axis import take
 Array = Any
 
 
-def mix_neighbours(phase: Array, taps: Array, axis: int) -> Iterator[Array]:
+def mix_neighbours(phase: Array, taps: Array, axis: int) -> Array:
     """Weighted sums of each pixel and its neighbours along an axis; border pixels repeat beyond the border.
 
     Parameters
@@ -21,17 +20,16 @@ def mix_neighbours(phase: Array, taps: Array, axis: int) -> Iterator[Array]:
     taps : float array [n, taps]
         Weights of each sum.
 
-    Yields
-    ------
-    float array [..., H, W]
+    Returns
+    -------
+    float array [n, ..., H, W]
         The sum of each row of taps.
     """
+    xp = array_namespace(phase)
     reach, count = (taps.shape[1] - 1) // 2, phase.shape[axis]
-    # Runs of a wider array take a quarter of the time of indices that stop at the border.
     wide = take(phase, [(0, 1)] * reach + [(0, count)] + [(count - 1, count)] * reach, axis)
-    runs = [take(wide, [(k, k + count)], axis) for k in range(taps.shape[1])]
-    for row in range(taps.shape[0]):
-        yield sum(taps[row, k] * run for k, run in enumerate(runs))
+    runs = xp.stack([take(wide, [(k, k + count)], axis) for k in range(taps.shape[1])])
+    return xp.tensordot(taps, runs, axes=1)
 
 
 def mix_neighbours_adjoint(gradient: Array, taps: Array, axis: int) -> Array:

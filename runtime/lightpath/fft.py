@@ -11,7 +11,9 @@ import os
 from typing import Any
 
 import numpy as np
-from array_api_compat import array_namespace, is_torch_array
+from array_api_compat import array_namespace
+
+from runtime.lightpath.host_arrays import of_kind, on_host
 
 try:
     import ducc0.fft as _ducc
@@ -38,7 +40,7 @@ def rfft2(x: Array) -> Array:
     """DFT of a real array over its last two axes: [..., n, m] to [..., n, m//2 + 1]."""
     host = _on_host(x)
     if host is not None:
-        return _as(x, _ducc.r2c(host, axes=(-2, -1), nthreads=_threads(x)))
+        return of_kind(x, _ducc.r2c(host, axes=(-2, -1), nthreads=_threads(x)))
     return array_namespace(x).fft.rfftn(x, axes=(-2, -1))
 
 
@@ -48,7 +50,7 @@ def irfft2(x: Array, shape: tuple[int, int]) -> Array:
     if host is not None:
         size = shape[1]
         back = _ducc.c2r(host, lastsize=size, axes=(-2, -1), forward=False, inorm=2, nthreads=_threads(x))
-        return _as(x, back)
+        return of_kind(x, back)
     return array_namespace(x).fft.irfftn(x, s=shape, axes=(-2, -1))
 
 
@@ -59,7 +61,7 @@ def irfft(x: Array, n: int) -> Array:
         whole = np.zeros((*host.shape[:-1], n // 2 + 1), host.dtype)
         whole[..., : host.shape[-1]] = host
         back = _ducc.c2r(whole, lastsize=n, axes=(-1,), forward=False, inorm=2, nthreads=_threads(x))
-        return _as(x, back)
+        return of_kind(x, back)
     return array_namespace(x).fft.irfft(x, n=n, axis=-1)
 
 
@@ -117,22 +119,7 @@ def real_from(spectrum: np.ndarray, image: np.ndarray, threads: int = THREADS, s
 
 def _on_host(x: Array) -> np.ndarray | None:
     """The array for ducc0 to work on; None where another library must."""
-    if _ducc is None:  # pragma: no cover
-        return None
-    if isinstance(x, np.ndarray):
-        return x
-    if not is_torch_array(x) or x.device.type != "cpu" or x.requires_grad:
-        return None
-    try:
-        host: np.ndarray = x.resolve_conj().resolve_neg().numpy()
-    except RuntimeError:  # a tensor that carries derivatives in another way
-        return None
-    return host
-
-
-def _as(x: Array, result: np.ndarray) -> Array:
-    """A result as an array of x's kind, on the same memory."""
-    return result if isinstance(x, np.ndarray) else array_namespace(x).asarray(result, device=x.device)
+    return None if _ducc is None else on_host(x)
 
 
 def _threads(x: Array) -> int:
@@ -156,7 +143,7 @@ def _transform(given: Array, axis: int, n: int | None, forward: bool) -> Array:
     out = x if length != given.shape[axis] else None  # in place where it is our own
     if _ducc is None:  # pragma: no cover
         return (_scipy.fft if forward else _scipy.ifft)(x, axis=axis, workers=THREADS)
-    return _as(
+    return of_kind(
         given,
         _ducc.c2c(
             x, axes=(axis,), forward=forward, inorm=0 if forward else 2, out=out, nthreads=_threads(given)

@@ -32,6 +32,7 @@ from runtime.lightpath.grid import (
     image_frequencies,
     image_window,
 )
+from runtime.lightpath.host_arrays import unit_phasor
 from runtime.lightpath.modulation import Modulation, factor_at
 from runtime.lightpath.periodic_axis import take
 
@@ -110,9 +111,7 @@ def panel_phase(path: LightPath, gray: Array) -> Array:
 
 def panel_field(path: LightPath, phase: Array) -> Array:
     """Field [..., H, W] that leaves the panel's pixels at a phase (rad), before their aperture, in its first state."""
-    xp = array_namespace(phase)
-    # Cosine and sine written apart cost a fraction of a complex exponential.
-    field = path.source * (xp.cos(phase) + 1j * xp.sin(phase))
+    field = path.source * unit_phasor(phase)
     if path.modulation is not None:
         field = field * factor_at(path.modulation, nominal_phase(path, phase))
     return field if path.leak is None else field + path.leak
@@ -136,13 +135,13 @@ def panel_spectrum(path: LightPath, phase: Array) -> Array:
     ky, kx = path.crosstalk
     sub = (ky.shape[0], kx.shape[0])
     down, across = (sub_pixel_offsets(path, phase, sub, axis) for axis in (0, 1))
-    total = 0
+    xp, total = array_namespace(phase), 0
     for i, mixed_rows in enumerate(mix_neighbours(phase, ky, -2)):
-        along_rows = 0
-        for j, mixed in enumerate(mix_neighbours(mixed_rows, kx, -1)):
-            along_rows = along_rows + across[j] * _row_spectrum(path.grid, panel_field(path, mixed))
-        total = total + down[i] * _column_spectrum(path.grid, along_rows)
-    return aperture_spectrum(path, phase, sub) * total / (sub[0] * sub[1])
+        fields = panel_field(path, mix_neighbours(mixed_rows, kx, -1))
+        # All sub-pixels of a row at once: of small pictures, calls cost as much as numbers.
+        along_rows = xp.sum(across * _row_spectrum(path.grid, fields), axis=0)
+        total = total + down[i, ...] * _column_spectrum(path.grid, along_rows)
+    return aperture_spectrum(path, phase, sub) / (sub[0] * sub[1]) * total
 
 
 def image_field(path: LightPath, spectrum: Array, mode: int) -> Array:
@@ -209,16 +208,20 @@ def aperture_spectrum(path: LightPath, like: Array, sub: tuple[int, int]) -> Arr
     return rows[:, None] * columns[None, :]
 
 
-def sub_pixel_offsets(path: LightPath, like: Array, sub: tuple[int, int], axis: int) -> list[Array]:
-    """Linear phases over the band that put each sub-pixel at its place in the pixel, an axis: [n, 1] or [1, m]."""
+def sub_pixel_offsets(path: LightPath, like: Array, sub: tuple[int, int], axis: int) -> Array:
+    """Linear phases over the band that put each sub-pixel at its place in the pixel, an axis.
+
+    Returns
+    -------
+    complex array [sub-pixels, ..., n, 1] or [sub-pixels, ..., 1, m]
+        With as many axes besides the first as `like`.
+    """
     xp = array_namespace(like)
     frequency = band_frequencies(path.grid, like)[axis]
-    offsets = []
-    for index in range(sub[axis]):
-        place = path.grid.pitch * path.aperture[axis] * ((index + 0.5) / sub[axis] - 0.5)
-        angle = -2 * math.pi * place * (frequency[:, None] if axis == 0 else frequency[None, :])
-        offsets.append(xp.cos(angle) + 1j * xp.sin(angle))
-    return offsets
+    places = (xp.arange(sub[axis], dtype=frequency.dtype, device=frequency.device) + 0.5) / sub[axis] - 0.5
+    angles = -2 * math.pi * path.grid.pitch * path.aperture[axis] * places[:, None] * frequency[None, :]
+    band = (-1, 1) if axis == 0 else (1, -1)
+    return xp.reshape(unit_phasor(angles), (sub[axis], *[1] * (like.ndim - 2), *band))
 
 
 def _row_spectrum(grid: Grid, field: Array) -> Array:

@@ -147,7 +147,9 @@ class CaptureRoles:
     fitted : tuple of Capture
         For fits.
     screened : tuple of Capture
-        For the screen.
+        For the screen, one of each colour and plane.
+    screenable : tuple of Capture
+        Those of `fitted` that may be screened in their place.
     probed : tuple of Capture
         For the probes.
     held_out : tuple of Capture
@@ -159,6 +161,7 @@ class CaptureRoles:
     captures: CaptureSet
     fitted: tuple[Capture, ...]
     screened: tuple[Capture, ...]
+    screenable: tuple[Capture, ...]
     probed: tuple[Capture, ...]
     held_out: tuple[Capture, ...]
     is_held_out: bool = True
@@ -188,15 +191,24 @@ def capture_roles(captures: CaptureSet) -> CaptureRoles:
     count = len(scenes(divided.fitted))
     fitted = sample(divided.fitted, pixels, max(FIT_CAPTURES, count))
     # A panel that still shows the pattern before is seen only where that was another one.
-    all_rows = captures.captures
-    after_another = {b.capture for a, b in pairwise(all_rows) if a.pattern != b.pattern}
-    telling = [c for c in divided.fitted if c.capture in after_another]
-    screened = sample(telling if len(scenes(telling)) == count else divided.fitted, pixels, count)
+    after_another = {b.capture for a, b in pairwise(captures.captures) if a.pattern != b.pattern}
+
+    def telling(rows: Sequence[Capture]) -> Sequence[Capture]:
+        found = [c for c in rows if c.capture in after_another]
+        return found if len(scenes(found)) == count else rows
+
+    screened = sample(telling(divided.fitted), pixels, count)
     probed = sample(divided.fitted, pixels // 2, max(PROBE_CAPTURES, count))
     most = max(2 * count, HELD_PIXELS // pixels)
     held_out = list(divided.held_out)
     if len(held_out) > most:
         held_out = held_out[:: -(-len(held_out) // most)]
     return CaptureRoles(
-        captures, tuple(fitted), tuple(screened), tuple(probed), tuple(held_out), divided.is_held_out
+        captures,
+        tuple(fitted),
+        tuple(screened),
+        tuple(telling(fitted)),
+        tuple(probed),
+        tuple(held_out),
+        divided.is_held_out,
     )

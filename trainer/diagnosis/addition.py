@@ -13,6 +13,7 @@ from trainer.captures.capture_set import CaptureSet, chosen, opened
 from trainer.captures.capture_table import Capture
 from trainer.captures.held_out import FIT_CAPTURES, CaptureRoles, capture_roles, scenes, split, with_stopping
 from trainer.diagnosis.screen import ScreenResult, screen_batches
+from trainer.diagnosis.telling import screened_captures
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.definition import Effect
 from trainer.fitting.free_form_effects import refined, with_free_form
@@ -79,7 +80,8 @@ def add(
     if effect.name in model.names:
         start = model.instance(effect.name)
     else:
-        screened: list[ScreenResult] = screen_batches(load(captures, roles.screened), model, (effect,))
+        batches = load(captures, screened_captures(roles, model))
+        screened: list[ScreenResult] = screen_batches(batches, model, (effect,))
         start = screened[0].start
     report(0.3, f"fitting {effect.name}")
     added = add_from(roles, model, start)

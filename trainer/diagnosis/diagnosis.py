@@ -20,9 +20,10 @@ from trainer.diagnosis.fitted_ranking import fitted_ranking
 from trainer.diagnosis.previews import CandidatePreview, previews
 from trainer.diagnosis.probes import ProbeResult, probe
 from trainer.diagnosis.ranking import RankedEffect
-from trainer.diagnosis.screen import ScreenResult, screen
+from trainer.diagnosis.screen import ScreenResult, screen, shares_of_work
 from trainer.diagnosis.separate import captures_that_separate
 from trainer.diagnosis.table_facts import DRIFT, exposure_facts, facts_sentence, plane_facts
+from trainer.diagnosis.telling import screened_captures
 from trainer.diagnosis.verdict import Thresholds, below_the_noise, noise_floor, verdict_of
 from trainer.effects.definition import STAGES, Effect
 from trainer.effects.effect_catalogue import Catalogue
@@ -293,22 +294,17 @@ def tells(effect: Effect, captures: CaptureSet) -> bool:
 def screen_candidates(
     roles: CaptureRoles, model: Model, known: Catalogue, pool: Pool, report: Progress
 ) -> list[ScreenResult]:
-    """Screen the effects that a model lacks and that the captures can tell."""
+    """Screen the effects that a model lacks and that the captures can tell, shared out among the pool's workers."""
     candidates = [e for e in known.values() if e.name not in model.names and tells(e, roles.captures)]
-    return screen_all(roles, model, candidates, pool, report)
-
-
-def screen_all(
-    roles: CaptureRoles, model: Model, effects: Sequence[Effect], pool: Pool, report: Progress
-) -> list[ScreenResult]:
-    """Screen every effect, shared out among the pool's workers."""
-    # One for each worker: a share costs the slopes of all that is present.
-    shares = min(pool.workers, len(effects)) or 1
-    ids = ids_of(roles.screened)
-    tasks = [(roles.folder, ids, model, tuple(effects[k::shares])) for k in range(shares)]
-    report(0.05, f"screening {len(effects)} effects")
+    # One share for each worker, as each costs the slopes of all that is present.
+    shares = shares_of_work(candidates, model, pool.workers)
+    ids = ids_of(screened_captures(roles, model))
+    what = f"screening {len(candidates)} effects"
+    report(0.05, what)
     results = pool.map(
-        screen, tasks, lambda n: report(0.05 + 0.25 * n / shares, f"screening {len(effects)} effects")
+        screen,
+        [(roles.folder, ids, model, tuple(share)) for share in shares],
+        lambda n: report(0.05 + 0.25 * n / len(shares), what),
     )
     return [one for share in results for one in share]
 

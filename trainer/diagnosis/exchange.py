@@ -13,7 +13,7 @@ from trainer.captures.capture_table import ids_of
 from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.addition import all_raised, all_refitted
 from trainer.diagnosis.candidate_fits import try_together_on_few
-from trainer.diagnosis.ranking import telling_captures
+from trainer.diagnosis.telling import telling_captures
 from trainer.diagnosis.verdict import Thresholds
 from trainer.fitting.gauss_newton import FitResult
 from trainer.fitting.pool import Pool
@@ -131,7 +131,7 @@ def _best(
     if not trials:
         return None
     # What a model cannot explain of few captures, with its numbers free to suit these alone, it cannot explain of all.
-    few = telling_captures(roles, model)
+    few = telling_captures(roles.captures, roles.fitted, model)
     enough = most(evaluate_captures(roles.captures, few, model).excess)
     ids = ids_of(few)
     on_few = pool.map_here_if_one(try_together_on_few, [(roles.folder, ids, *trial) for trial in trials])

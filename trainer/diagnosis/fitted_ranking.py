@@ -29,6 +29,9 @@ FITTED_FIRST = 5  # candidates fitted after the screen; all of them when none of
 # nothing that is worth adding, or enough for another look at all of them. At first those are fitted that the screen
 # expects to remove at least this share of what the best one does.
 SETTLES, RIVALS = 0.1, 0.5
+# Of the least that is worth adding: a candidate of which few captures show less than this share, where the model is
+# complete and all that is left is not much more than that least, is not fitted to all.
+SHOWS = 0.25
 
 
 def fitted_ranking(
@@ -110,23 +113,27 @@ def _first_fits(
     # The screen says little of an effect whose derivatives do not reach, or that shows from capture to capture only.
     blind = [s for s in order if known[s.effect].rugged or known[s.effect].measure]
     wanted = promising + [s for s in blind if s not in promising]
-    if thresholds.complete(before.excess, ideal_excess) and not thresholds.may_be_worth_adding(
-        before.excess, ideal_excess
-    ):
+    complete = thresholds.complete(before.excess, ideal_excess)
+    if complete and not thresholds.may_be_worth_adding(before.excess, ideal_excess):
         return try_all(roles, model, wanted[:2], pool, report, 0.3, 0.6)
     if thorough:
         return try_all(roles, model, wanted, pool, report, 0.3, 0.6)
+    least = thresholds.excess
+    if complete:
+        shown = SHOWS * thresholds.least(ideal_excess)
+        hopeful = [s for s in wanted if s in blind or s.removed_excess > shown]
+        return try_near(roles, model, hopeful, [], least, pool, report, 0.3, 0.6, shown)
     if model.present and expects_the_rest(order):
         # Present effects may have taken up a part of the one that explains the rest: the screen lets them move.
-        first = [s for s in promising if s.after < NEAR * order[0].after + thresholds.excess]
-        fits = fit_with_present(roles, model, first, thresholds.excess, pool)
+        first = [s for s in promising if s.after < NEAR * order[0].after + least]
+        fits = fit_with_present(roles, model, first, least, pool)
     else:
         first = [s for s in promising if s.removed_excess > RIVALS * order[0].removed_excess]
-        fits = try_near(roles, model, first, [], thresholds.excess, pool, report, 0.3, 0.4)
+        fits = try_near(roles, model, first, [], least, pool, report, 0.3, 0.4)
     if _settled(fits, before, thresholds, ideal_excess):
         return fits
     rest = [s for s in wanted if s not in first]
-    return fits + try_near(roles, model, rest, fits, thresholds.excess, pool, report, 0.4, 0.6)
+    return fits + try_near(roles, model, rest, fits, least, pool, report, 0.4, 0.6)
 
 
 def expects_the_rest(screened: Sequence[ScreenResult]) -> bool:

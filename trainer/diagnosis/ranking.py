@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from runtime.excess import PredictionErrors, RemovedExcess, removed_excess
 from runtime.program.progress import Progress
-from trainer.captures.capture_table import Capture, ids_of
+from trainer.captures.capture_table import ids_of
 from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.candidate_fits import (
     CandidateFit,
@@ -20,6 +21,7 @@ from trainer.diagnosis.candidate_fits import (
     try_with_present,
 )
 from trainer.diagnosis.screen import ScreenResult
+from trainer.diagnosis.telling import telling_captures
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.definition import Effect
 from trainer.effects.effect_catalogue import Catalogue
@@ -131,6 +133,7 @@ def try_near(
     report: Progress,
     start: float,
     end: float,
+    shown: float = -math.inf,
 ) -> list[CandidateFit]:
     """Fit candidates to few captures, and those that come near the best there to all.
 
@@ -145,6 +148,8 @@ def try_near(
         Excess that makes no difference.
     report, start, end
         As for `try_all`.
+    shown : float
+        Excess that a candidate must remove on few captures to be fitted to all.
 
     Returns
     -------
@@ -153,7 +158,7 @@ def try_near(
     """
     if len(screened) + len(others) < 2:
         return try_all(roles, model, screened, pool, report, start, end)
-    telling = telling_captures(roles, model)
+    telling = telling_captures(roles.captures, roles.fitted, model)
     few = ids_of(telling)
     screened = sorted(screened, key=lambda s: not s.start.effect.rugged)
     ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
@@ -170,8 +175,11 @@ def try_near(
         return [
             s.effect
             for (_, excess, _), s in zip(fits, screened, strict=True)
-            if before - left < (1 - LITTLE) * abs(before)
-            or excess <= _near(left, before, least, raising and len(s.start.effect.orders) > 1)
+            if before - excess > shown
+            and (
+                before - left < (1 - LITTLE) * abs(before)
+                or excess <= _near(left, before, least, raising and len(s.start.effect.orders) > 1)
+            )
         ]
 
     def to_all(names: Collection[str]) -> list[CandidateFit]:
@@ -183,16 +191,6 @@ def try_near(
     if left <= surely_near < min(f.held_out.excess for f in (*others, *found)):
         found += to_all(set(near(raising=True)) - {f.effect for f in found})
     return found
-
-
-def telling_captures(roles: CaptureRoles, model: Model) -> list[Capture]:
-    """The capture of each colour and plane of which a model leaves most unexplained, in counts."""
-    left = {}
-    for c in roles.fitted:
-        errors = evaluate_captures(roles.captures, [c], model)
-        left[c.capture] = float(errors.squared.sum() - errors.noise.sum())
-    ordered = sorted(roles.fitted, key=lambda c: left[c.capture])
-    return list({(c.channel, c.plane_mm): c for c in ordered}.values())
 
 
 def _near(left: float, before: float, least: float, can_be_raised: bool) -> float:
@@ -250,7 +248,7 @@ def fit_with_present(
     """
     ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
     if len(screened) > 1:
-        few = ids_of(telling_captures(roles, model))
+        few = ids_of(telling_captures(roles.captures, roles.fitted, model))
         left = pool.map(try_together_on_few, [(roles.folder, few, model, s.start) for s in screened])
         most = NEAR * min(left) + least
         screened = [s for s, there in zip(screened, left, strict=True) if there <= most]

@@ -7,6 +7,7 @@ effects projected out; those of present effects with more than 100 numbers stay 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -73,21 +74,20 @@ def screen(
 
 def screen_batches(batches: list[Batch], model: Model, effects: tuple[Effect, ...]) -> list[ScreenResult]:
     """Screen effects on batches, for a model with fitted gains."""
+    predictors = [Predictor(model, b) for b in batches]
+    points = [p.trace(model) for p in predictors]
+    few = [p.effect.name for p in model.present if not has_many(p)]
+    residual, present = stacked(model, keys_of(model, few), predictors, points)
+    noise = sum(float((b.mask * b.noise).sum()) for b in batches)
+    scale = signal_variance(batches)
+    before = (remaining(residual, present) - noise) / scale
+    narrow, wide = (predictors, points), None
     results = []
-    prepared: dict[bool, tuple[list[Predictor], list[Trace], Tensor, Tensor]] = {}
     for effect in effects:
-        opens_iris = effect.touches_iris
-        if opens_iris not in prepared:
-            reach = model if not opens_iris else model.having(absent(effect, model.bench))
-            predictors = [Predictor(reach, b) for b in batches]
-            points = [p.trace(model) for p in predictors]
-            few = [p.effect.name for p in model.present if not has_many(p)]
-            nuisance = stacked(model, keys_of(model, few), predictors, points)
-            prepared[opens_iris] = (predictors, points, *nuisance)
-        predictors, points, residual, present = prepared[opens_iris]
-        noise = sum(float((b.mask * b.noise).sum()) for b in batches)
-        scale = signal_variance(batches)
-        before = (remaining(residual, present) - noise) / scale
+        predictors, points = narrow
+        if effect.touches_iris:
+            wide = wide or _with_wider_band(model, effect, batches)
+            predictors, points = wide
         start = _start(effect, model, predictors, points)
         trial = model.having(start)
         moved = [p.trace(trial, effect.stage, t) for p, t in zip(predictors, points, strict=True)]
@@ -100,6 +100,30 @@ def screen_batches(batches: list[Batch], model: Model, effects: tuple[Effect, ..
         after = (left - noise) / scale
         results.append(ScreenResult(effect.name, start, before, after))
     return results
+
+
+def _with_wider_band(
+    model: Model, effect: Effect, batches: list[Batch]
+) -> tuple[list[Predictor], list[Trace]]:
+    """Predictors whose band has room for what an effect opens, and the model's light there."""
+    predictors = [Predictor(model.having(absent(effect, model.bench)), b) for b in batches]
+    return predictors, [p.trace(model) for p in predictors]
+
+
+def shares_of_work(effects: Sequence[Effect], model: Model, count: int) -> list[list[Effect]]:
+    """Effects in at most so many shares whose screens take about as long.
+
+    The work is counted in predictions: one for each number of an effect and for each of its starting points.
+    """
+    work = {e.name: len(start_points(e, model)) + len(_numbers(e, model)) for e in effects}
+    shares: list[list[Effect]] = [[] for _ in range(min(count, len(effects)))]
+    for effect in sorted(effects, key=lambda e: -work[e.name]):
+        min(shares, key=lambda share: sum(work[e.name] for e in share)).append(effect)
+    return shares
+
+
+def _numbers(effect: Effect, model: Model) -> tuple[tuple[str, str, int], ...]:
+    return keys_of(model.having(absent(effect, model.bench)), [effect.name])
 
 
 def _start(effect: Effect, model: Model, predictors: list[Predictor], points: list[Trace]) -> EffectInstance:

@@ -30,6 +30,7 @@ from trainer.diagnosis.explanation import explain
 from trainer.diagnosis.previews import CandidatePreview, previews
 from trainer.diagnosis.ranking import RankedEffect, rank
 from trainer.diagnosis.screen import screen_batches
+from trainer.diagnosis.telling import screened_captures
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import catalogue, find_effect, forget_effect_files
 from trainer.fitting.gains import with_gains
@@ -175,11 +176,12 @@ def try_own(
     model = with_gains(captures, model, roles.fitted)
     before = evaluate_captures(captures, roles.held_out, model)
     ideal = ideal_errors(roles, model) if model.present else before
+    screened = screened_captures(roles, model)
     progress, fits = _progress(say), []
     for k, name in enumerate(names):
         progress(k / len(names), f"fitting {name}")
         one = find_effect(known, name)
-        batches = load(captures, roles.screened)
+        batches = load(captures, screened)
         start = screen_batches(batches, model, (one,))[0].start
         ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
         fits.append(try_effect(folder, ids, held, model, start, True))
