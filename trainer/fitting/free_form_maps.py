@@ -8,7 +8,6 @@ captures share.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,6 +15,7 @@ from torch import Tensor
 from runtime.program.progress import Progress
 from trainer.captures.batches import Batch
 from trainer.fitting.predictor import Predictor
+from trainer.fitting.side_by_side import side_by_side
 from trainer.model.model import Model
 from trainer.prediction.free_stages import FreeFormStage, Tensors
 from trainer.prediction.predict import Trace, counts, light_on_camera, trace
@@ -98,6 +98,8 @@ def descend(
     ----------
     Liu and Nocedal 1989.
     """
+    each = [(one, k) for one in fitted for k in range(len(one.batch.ids))]
+    pixels = fitted[0].batch.gray[0].numel()
     raw = {n: torch.zeros(shape, requires_grad=True) for n, (shape, _) in free.shapes.items()}
     optimiser = torch.optim.LBFGS(
         list(raw.values()),
@@ -111,15 +113,21 @@ def descend(
     def physical(of: Mapping[str, Tensor]) -> Tensors:
         return {n: t * free.shapes[n][1] for n, t in of.items()}
 
+    @torch.enable_grad()
+    def of_capture(which: tuple[FreeFormBatch, int]) -> tuple[float, tuple[Tensor | None, ...]]:
+        one, k = which
+        return _with_gradient(one.squared_error(free, physical(raw), k) / scale, raw)
+
     def loss_and_gradient() -> float:
-        optimiser.zero_grad()
         maps = physical(raw)
-        losses: list[Any] = [((maps[n] / spread) ** 2).sum() / scale for n, spread in free.prior.items()]
-        total = sum(_backward(loss) for loss in losses)
-        for one in fitted:
-            for k in range(len(one.batch.ids)):
-                total += _backward(one.squared_error(free, physical(raw), k) / scale)
-        return total
+        priors = [((maps[n] / spread) ** 2).sum() / scale for n, spread in free.prior.items()]
+        parts = [_with_gradient(loss, raw) for loss in priors]
+        with torch.no_grad():
+            parts += side_by_side(of_capture, each, pixels)
+            for k, variable in enumerate(raw.values()):
+                slopes = [slope for _, part in parts if (slope := part[k]) is not None]
+                variable.grad = sum(slopes, torch.zeros_like(variable))
+        return sum(loss for loss, _ in parts)
 
     @torch.no_grad()
     def stopping_error() -> float:
@@ -141,6 +149,6 @@ def descend(
         return physical(best)
 
 
-def _backward(loss: Tensor) -> float:
-    loss.backward()
-    return float(loss.detach())
+def _with_gradient(loss: Tensor, variables: Tensors) -> tuple[float, tuple[Tensor | None, ...]]:
+    """A loss and its gradient over each variable, None for one that it does not depend on."""
+    return float(loss.detach()), torch.autograd.grad(loss, tuple(variables.values()), allow_unused=True)
