@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
-from tests.trainer.test_effects import predicted, present, scene_of
+from tests.trainer.hidden import LARGER, bench_file, ran
+from tests.trainer.test_effects import moved, predicted, present, scene_of
 from trainer.model.model_stages import stages_for
 
 
@@ -39,3 +41,40 @@ def test_a_broad_line_is_as_smooth_as_many_wavelengths() -> None:
     off, five = (float(((c - smooth) ** 2).mean() / smooth.var()) for c in (found, of_lines(5)))
     assert off < 1e-5
     assert five > 30 * off
+
+
+@pytest.mark.parametrize("apart_nm", [-30.0, 12.0, 45.0])
+@pytest.mark.parametrize("beside", [(), ("crosstalk",), ("amplitude_modulation",)])
+def test_a_line_sees_the_panel_s_delay_at_its_own_wavelength(
+    apart_nm: float, beside: tuple[str, ...]
+) -> None:
+    """The same light comes from a laser of that wavelength on a panel whose response is that much shorter."""
+    others = tuple(moved(name) for name in beside)
+    scene = scene_of(*others)
+    stages = stages_for(scene, others)
+    lines = stages.pupil.emitting(
+        torch.tensor([1e-9 * apart_nm], dtype=torch.float64), torch.ones(1, dtype=torch.float64)
+    )
+    found = predicted(scene, replace(stages, pupil=lines))
+
+    (colour,) = scene.bench.channels
+    colour = replace(colour, wavelength_nm=colour.wavelength_nm + apart_nm)
+    there = replace(scene, bench=replace(scene.bench, channels=(colour,)))
+    scale = scene.wavelength / there.wavelength
+    # What a pixel absorbs depends on its gray level, which the response over it is not a part of.
+    drive = replace(stages.drive, response=scale * stages.drive.response)
+    expected = predicted(there, replace(stages, drive=drive))
+    same = predicted(there, stages)
+    off, unscaled = (float(((c - expected) ** 2).mean() / expected.var()) for c in (found, same))
+    assert off < 1e-4
+    assert unscaled > 100 * off
+
+
+def test_two_lines_far_apart_are_one_effect(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With one panel for both lines, a third as much as nothing is left, and phase_response is named beside them."""
+    bench = bench_file(tmp_path, 'kind = "source_lines"\nseparation_nm = 15\nshare = 0.4', **LARGER)
+    captures = tmp_path / "captures"
+    ran(capsys, "capture", "--bench", bench, "--out", captures, "--patterns", 8)
+    found = ran(capsys, "explain", captures, "--out", tmp_path / "model.toml")
+    assert [s["added"] for s in found["steps"]] == [None, "source_lines"]
+    assert found["steps"][-1]["excess"] < 1e-4

@@ -18,7 +18,7 @@ from trainer.fitting.predictor import Predictor
 from trainer.fitting.side_by_side import side_by_side
 from trainer.model.model import Model
 from trainer.prediction.free_stages import FreeFormStage, Tensors
-from trainer.prediction.predict import Trace, counts, light_on_camera, trace
+from trainer.prediction.predict import counts, light_on_camera, trace
 
 HISTORY = 10  # steps that L-BFGS keeps
 PATIENCE = 3  # rounds without progress on the captures that say when to stop
@@ -47,7 +47,7 @@ class FreeFormBatch:
         """Counts [1, h, w] of capture k."""
         scene, gray = self.predictor.scene, self.batch.gray[k : k + 1]
         stages = free.apply(self.stages[k], tensors)
-        before = Trace(self.base.spectrum[k : k + 1], self.base.image[k : k + 1])
+        before = self.base.of(k)
         if free.irradiance is None:
             earlier = self.predictor.earlier(stages, k)
             image = trace(scene, stages, gray, free.stage, before, earlier).image

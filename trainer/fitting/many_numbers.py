@@ -175,7 +175,7 @@ class ManySlopes:
                 self.model.instance(name).values[parameter], dtype=q.scene.dtype
             ).requires_grad_()
             tensors.setdefault(name, {})[parameter] = value
-        batch, before = q.batch, Trace(point.spectrum[k : k + 1], point.image[k : k + 1])
+        batch, before = q.batch, point.of(k)
         with torch.enable_grad():
             moment = batch.moments[k] if batch.moments else None
             stages = stages_of(q.scene, self.model, tensors, moment)

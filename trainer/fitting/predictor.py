@@ -52,12 +52,12 @@ class Predictor:
 
         def part(k: int) -> Trace:
             stages = shared or self.stages(model, k)
-            one = None if before is None else Trace(before.spectrum[k : k + 1], before.image[k : k + 1])
+            one = None if before is None else before.of(k)
             gray, earlier = self.batch.gray[k : k + 1], self.earlier(stages, k)
             return trace(self.scene, stages, gray, start, one, earlier)
 
         parts = side_by_side(part, range(self.batch.gray.shape[0]), self.batch.gray[0].numel())
-        return Trace(torch.cat([p.spectrum for p in parts]), torch.cat([p.image for p in parts]))
+        return Trace(torch.cat([p.spectra for p in parts]), torch.cat([p.image for p in parts]))
 
     def earlier(self, stages: Stages, k: int) -> Tensor | None:
         """Patterns shown before capture k [1, n, H, W], where the panel still shows something of them."""

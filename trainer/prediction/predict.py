@@ -24,7 +24,7 @@ from runtime.camera.sampling import (
 from runtime.lightpath.fft import rfft2
 from runtime.lightpath.gray_levels import shown_as
 from runtime.lightpath.grid import FINE
-from runtime.lightpath.light_path import LightPath, mode_irradiance, panel_phase, panel_spectrum, states
+from runtime.lightpath.light_path import LightPath, panel_phase
 from runtime.lightpath.modulation import Modulation
 from runtime.lightpath.propagation import far_field_matrix
 from trainer.device import array_of
@@ -32,7 +32,8 @@ from trainer.kept_results import kept_by_device, kept_for_same
 from trainer.prediction.capture_gain import own_gain
 from trainer.prediction.capture_motion import blurred_spectrum, displaced_spectrum
 from trainer.prediction.panel_gradient import has_panel_gradient, image_with_panel_gradient
-from trainer.prediction.pupil_modes import pupil_modes
+from trainer.prediction.panel_spectra import irradiance_of, panel_spectra
+from trainer.prediction.pupil_modes import phase_scales, pupil_modes
 from trainer.prediction.samples_at import samples_at
 from trainer.prediction.scene import Scene, Stages, bare_stages
 from trainer.prediction.source_extent import extent_transfer, lit_by_extent
@@ -165,14 +166,18 @@ class Trace:
 
     Attributes
     ----------
-    spectrum : complex Tensor [B, K, n, m]
-        The panel's, in each of its states; empty where only what happens at the panel has a gradient.
+    spectra : complex Tensor [B, states, 1 or 3, n, m]
+        The panel's, as from `panel_spectra`; empty where only what happens at the panel has a gradient.
     image : Tensor
         Irradiance before filters, of the source with its extent.
     """
 
-    spectrum: Tensor
+    spectra: Tensor
     image: Tensor
+
+    def of(self, k: int) -> Trace:
+        """The results of capture k alone."""
+        return Trace(self.spectra[k : k + 1], self.image[k : k + 1])
 
 
 def trace(
@@ -204,23 +209,17 @@ def trace(
     """
     if before is not None and start == "sensor":
         return before
-    path = light_path(scene, stages)
-    if before is not None and start == "pupil":
-        spectrum = before.spectrum
-    else:
+    path, scales = light_path(scene, stages), phase_scales(scene, stages.pupil)
+    spectra = before.spectra if before is not None and start == "pupil" else None
+    if spectra is None or spectra.shape[2] < (1 if scales is None else 3):
         phase = driven_phase(path, stages, gray, earlier)
-        if has_panel_gradient(path, phase):
+        if scales is None and has_panel_gradient(path, phase):
             return Trace(
                 torch.empty(0), _lit(scene, stages, path, lambda p: image_with_panel_gradient(p, phase))
             )
-        spectra = [panel_spectrum(state, phase) for state in states(path)]
-        spectrum = spectra[0][:, None] if len(spectra) == 1 else torch.stack(spectra, 1)
-
-    def image(path: LightPath) -> Tensor:
-        parts = [mode_irradiance(state, spectrum[:, k]) for k, state in enumerate(states(path))]
-        return parts[0] if len(parts) == 1 else torch.stack(parts).sum(0)
-
-    return Trace(spectrum, _lit(scene, stages, path, image))
+        spectra = panel_spectra(path, phase, scales is not None)
+    found = spectra
+    return Trace(found, _lit(scene, stages, path, lambda p: irradiance_of(p, found, scales)))
 
 
 def _lit(scene: Scene, stages: Stages, path: LightPath, image: Callable[[LightPath], Tensor]) -> Tensor:

@@ -26,6 +26,14 @@ def pupil_modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
     return _bare_modes(scene) if pupil is bare_stages(scene).pupil else _last_modes(scene, pupil)
 
 
+def phase_scales(scene: Scene, pupil: Pupil) -> Tensor | None:
+    """By how much each mode's line sees the panel's phase scaled, [M]; None for a source of one line.
+
+    A delay is as many waves more as the wavelength is shorter.
+    """
+    return None if pupil.lines is None else scene.wavelength / (scene.wavelength + _lit(*pupil.lines)[0])
+
+
 @kept_by_device(16)
 def _bare_modes(scene: Scene) -> tuple[Tensor, Tensor]:
     return _modes(scene, bare_stages(scene).pupil)
