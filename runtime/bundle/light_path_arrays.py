@@ -7,7 +7,8 @@
      "arrays": {field of LightPath: name of an array}}
 
 Fields that are None in a LightPath are not listed; `crosstalk` is two arrays, crosstalk_rows and
-crosstalk_columns, and `modulation` three: modulation_ends, modulation_factors and modulation_shares.
+crosstalk_columns, and `modulation` three: modulation_ends, modulation_factors and modulation_shares. A modulation over
+the phase on the panel, after the gain, has "modulation_by_phase": true beside the arrays.
 Arrays that several planes or colours share are stored once. Where the panel has few gray levels, the description's
 `panel` lists them as `gray_levels`: a light path's response is then of these alone, so that solvers see them. Where
 it is slow, `panel` has `slow_response_share` (unit 1): of the phase before, what is left when a pattern was shown for
@@ -85,6 +86,7 @@ def pack_light_paths(
                     "band": list(grid.band),
                     "pitch_m": grid.pitch,
                 },
+                **({"modulation_by_phase": True} if path.modulation_by_phase else {}),
                 "arrays": names,
             }
         )
@@ -187,6 +189,7 @@ def load_light_path(bundle: Bundle, channel: str | None = None, plane_mm: float 
         aperture=(arrays["aperture"][0], arrays["aperture"][1]),  # type: ignore[index]
         irradiance_filter=arrays["irradiance_filter"],
         modulation=None if ends is None or factors is None or shares is None else (ends, factors, shares),
+        modulation_by_phase=record.get("modulation_by_phase") is True,
         gray_levels=gray_levels,
     )
 

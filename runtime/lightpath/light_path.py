@@ -68,6 +68,8 @@ class LightPath:
         Factor m on the field as it depends on the pixel's phase: the phases (rad, before `gain`) of the first and
         last sample, the factor at N phases evenly between them in each of K states, and each state's share of the
         exposure. The states' irradiances add.
+    modulation_by_phase : bool
+        Whether the phases of `modulation` are those on the panel, after `gain`.
     irradiance_filter : array or None
         A transfer function of irradiance over the `rfft2` frequencies of the fine grid, which acts on what the eye
         gets too.
@@ -88,6 +90,7 @@ class LightPath:
     irradiance_filter: Array | None = None
     far_field: tuple[Array, Array] | None = None
     modulation: Modulation | None = None
+    modulation_by_phase: bool = False
     gray_levels: tuple[int, ...] = ()
 
 
@@ -113,13 +116,13 @@ def panel_field(path: LightPath, phase: Array) -> Array:
     """Field [..., H, W] that leaves the panel's pixels at a phase (rad), before their aperture, in its first state."""
     field = path.source * unit_phasor(phase)
     if path.modulation is not None:
-        field = field * factor_at(path.modulation, nominal_phase(path, phase))
+        field = field * factor_at(path.modulation, phase / modulation_gain(path))
     return field if path.leak is None else field + path.leak
 
 
-def nominal_phase(path: LightPath, phase: Array) -> Array:
-    """Phase (rad) that a pixel of nominal gain would have: what its modulation depends on."""
-    return phase if path.gain is None else phase / path.gain
+def modulation_gain(path: LightPath) -> Array:
+    """The gain that the phases of `modulation` are before; 1 where they are those on the panel."""
+    return 1 if path.gain is None or path.modulation_by_phase else path.gain
 
 
 def panel_spectrum(path: LightPath, phase: Array) -> Array:

@@ -19,7 +19,7 @@ from runtime.lightpath.light_path import (
     aperture_spectrum,
     filter_irradiance,
     image_field,
-    nominal_phase,
+    modulation_gain,
     panel_field,
     panel_spectrum,
     pixel_area_spectrum,
@@ -153,8 +153,9 @@ def _panel_spectrum_adjoint(path: LightPath, phase: Array, spectrum: Array, fact
         turned = xp.conj(path.source) * field_gradient
         if path.modulation is not None:
             # The derivative of m(phi) exp(j phi) is (m' + j m) exp(j phi).
-            at = nominal_phase(path, driven)
-            slope = slope_at(path.modulation, at) / (1 if path.gain is None else path.gain)
+            gain = modulation_gain(path)
+            at = driven / gain
+            slope = slope_at(path.modulation, at) / gain
             turned = xp.conj(factor_at(path.modulation, at) - 1j * slope) * turned
         return xp.cos(driven) * xp.imag(turned) - xp.sin(driven) * xp.real(turned)
 

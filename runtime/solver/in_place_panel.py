@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from runtime.lightpath.light_path import LightPath, nominal_phase, states
+from runtime.lightpath.light_path import LightPath, modulation_gain, states
 from runtime.lightpath.modulation import factor_at, slope_at
 from runtime.solver.array_backend import Backend, Room
 from runtime.solver.in_place_crosstalk import Crosstalk
@@ -196,10 +196,11 @@ class Panel:
         path = self.states[self.state]
         if path.modulation is not None:
             here = path if path.gain is None else replace(path, gain=path.gain[rows])
-            at = nominal_phase(here, phase[rows])
+            gain = modulation_gain(here)
+            at = phase[rows] / gain
             factor = factor_at(path.modulation, at)
             if slope:
-                factor = factor - 1j * slope_at(path.modulation, at) / (1 if here.gain is None else here.gain)
+                factor = factor - 1j * slope_at(path.modulation, at) / gain
             lit *= factor
 
     def _rows_forward(self, phase: Array, spectrum: Array, turned: Array | None) -> None:

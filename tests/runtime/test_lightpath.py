@@ -32,6 +32,7 @@ PATHS = {
     "no_crosstalk": random_path(crosstalk=None),
     "no_crosstalk_wide": random_path((20, 26), 1.9, crosstalk=None),
     "no_leak_no_filter": random_path(leak=None, irradiance_filter=None),
+    "by_the_panel_s_phase": replace(random_path(), modulation_by_phase=True),
     "ideal": ideal_path((24, 30), 0.005),
 }
 

@@ -36,6 +36,7 @@ PATHS = {
     "no crosstalk, wide": random_path((20, 26), 1.9, crosstalk=None),
     "no leak, no filter": random_path(leak=None, irradiance_filter=None),
     "phase alone": random_path(modulation=None),
+    "by the panel's phase": replace(random_path(), modulation_by_phase=True),
     "two states, one mode": one_mode(random_path(crosstalk=None, irradiance_filter=None)),
     "ideal": ideal_path((24, 30), 0.005),
 }

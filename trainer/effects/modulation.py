@@ -126,13 +126,14 @@ def polarisation_leak(drive: Drive, real: Tensor, imaginary: Tensor, gain: Tenso
     ----------
     Saleh and Teich 2007, Fundamentals of Photonics, section 20.3.
     """
-    turn = (gain - 1) * drive.response
-    second = torch.polar(torch.ones_like(turn), turn)
-    first = 1 + torch.complex(real, imaginary) * second
+    one, none = torch.ones_like(real), torch.zeros_like(real)
+    first = (torch.stack((one, real)), torch.stack((none, imaginary)))
+    amplitudes, turns = torch.complex(*first)[None], torch.stack((none, gain - 1))[None]
     if float(crossed.detach()) == 0:
-        return drive.modulated(first)
-    shares = torch.tensor((1.0, SELDOM), dtype=turn.dtype)
-    return drive.varying(torch.stack((first, crossed / SELDOM**0.5 * second)), shares)
+        return drive.split(amplitudes, turns, one[None])
+    second = torch.complex(torch.stack((none, crossed / SELDOM**0.5)), torch.zeros(2, dtype=real.dtype))
+    shares = torch.tensor((1.0, SELDOM), dtype=real.dtype)
+    return drive.split(torch.cat((amplitudes, second[None])), torch.cat((turns, turns)), shares)
 
 
 @effect(
@@ -198,6 +199,6 @@ def phase_ripple(drive: Drive, rms: Tensor) -> Drive:
 
     García-Márquez et al. 2012, Flicker minimization in an LCoS spatial light modulator, Opt. Express 20, 8431.
     """
-    swing = torch.tensor(SWING, dtype=rms.dtype)[:, None] * rms * drive.response
-    shares = torch.tensor(SWING_SHARES, dtype=rms.dtype)
-    return drive.varying(torch.polar(torch.ones_like(swing), swing), shares)
+    swing = torch.tensor(SWING, dtype=rms.dtype)[:, None] * rms
+    amplitudes = torch.complex(torch.ones_like(swing), torch.zeros_like(swing))
+    return drive.split(amplitudes, swing, torch.tensor(SWING_SHARES, dtype=rms.dtype))

@@ -30,7 +30,7 @@ class _Wanted:
     exact : bool
         The shape itself; otherwise whatever broadcasts to it.
     count : int
-        1 for a tensor; 2 for a pair of tensors.
+        1 for a tensor; 2 for a pair of tensors, 3 for three.
     complex : bool
         Complex numbers are allowed.
     """
@@ -71,12 +71,15 @@ def stage_faults(before: Any, after: Any) -> Iterator[Fault]:
             yield f"{name} is {_kind(new)}", f"give a value of type {type(old).__name__}"
 
 
+_COUNTED = {1: "a tensor", 2: "a pair of tensors", 3: "three tensors"}
+
+
 def _tensor_faults(name: str, value: Any, wanted: _Wanted, optional: bool) -> Iterator[Fault]:
-    what = f"a pair of tensors {wanted.text}" if wanted.count == 2 else f"a tensor {wanted.text}"
+    what = f"{_COUNTED[wanted.count]} {wanted.text}"
     if value is None and optional:
         return
-    if wanted.count == 2:
-        if not isinstance(value, tuple | list) or len(value) != 2:
+    if wanted.count > 1:
+        if not isinstance(value, tuple | list) or len(value) != wanted.count:
             yield f"{name} is {_kind(value)}", f"give {what}"
             return
         parts = list(value)
@@ -129,8 +132,8 @@ def _drive(drive: Drive) -> dict[str, _Wanted]:
         "gain": _Wanted(surface, f"[H, W] = {list(surface)}"),
         "crosstalk": _Wanted(None, "[sub-pixels, taps]", count=2),
         "offset": _Wanted(surface, f"[H, W] = {list(surface)}"),
-        "factors": _Wanted(None, "[K, levels]", complex=True),
-        "shares": _Wanted(None, "[K]"),
+        "factor": _Wanted(levels, f"[{levels[0]}], one for each gray level", exact=True, complex=True),
+        "components": _Wanted(None, "[K, C], [K, C] and [K]", count=3, complex=True),
         "persistence": _Wanted((1,), "of one number"),
     }
 

@@ -44,8 +44,8 @@ def panel_spectra(path: LightPath, phase: Tensor, scaled: bool) -> Tensor:
 
 
 def _driven(path: LightPath, scale: float) -> LightPath:
-    """The path at a scaled phase: what a pixel absorbs depends on how it is driven."""
-    if path.modulation is None or scale == 1:
+    """The path at a scaled phase: what a pixel absorbs depends on the phase that it is driven to, before the scale."""
+    if path.modulation is None or path.modulation_by_phase or scale == 1:
         return path
     return replace(path, gain=torch.tensor(scale) if path.gain is None else scale * path.gain)
 

@@ -69,24 +69,42 @@ def light_path(scene: Scene, stages: Stages) -> LightPath:
         irradiance_filter=display_filter(stages),
         far_field=_far_field(scene, stages.pupil) if scene.method == "fraunhofer" else None,
         modulation=_modulation(stages.drive),
+        modulation_by_phase=stages.drive.components is not None,
         gray_levels=panel.gray_levels,
     )
 
 
 def _modulation(drive: Drive) -> Modulation | None:
-    """Factors over gray level as factors over the phase that the level is driven to."""
-    if drive.factors is None or drive.shares is None:
+    """What the drive does besides the phase, over the phase that a level is driven to, or over that on the panel.
+
+    Components turn with the light's own phase, wherever a map scales it. A level's factor is taken at the phase that it
+    is driven to, and beside components at the phase on the panel, which is another one by the map's few percent.
+    """
+    if drive.factor is None and drive.components is None:
         return None
     phases, order = torch.sort(drive.response.detach())
-    factors = drive.factors[:, order]
-    factors = factors if factors.is_complex() else torch.complex(factors, torch.zeros_like(factors))
-    share = torch.linspace(0, 1, MODULATION_SAMPLES, dtype=phases.dtype)
-    at = phases[0] + share * (phases[-1] - phases[0])
-    above = torch.clamp(torch.searchsorted(phases, at), 1, len(phases) - 1)
-    gap = torch.clamp(phases[above] - phases[above - 1], min=1e-9)
-    way = torch.clamp((at - phases[above - 1]) / gap, 0, 1)
-    table = factors[:, above - 1] + way * (factors[:, above] - factors[:, above - 1])
-    return phases[[0, -1]], table, drive.shares
+    ends = phases[[0, -1]]
+    if drive.components is not None and drive.gain is not None:
+        scaled = ends[:, None] * torch.stack((drive.gain.detach().min(), drive.gain.detach().max()))
+        ends = torch.stack((scaled.min(), scaled.max()))
+    at = ends[0] + torch.linspace(0, 1, MODULATION_SAMPLES, dtype=phases.dtype) * (ends[1] - ends[0])
+    shares, table = (
+        torch.ones(1, dtype=phases.dtype),
+        torch.complex(
+            torch.ones((1, len(at)), dtype=phases.dtype), torch.zeros((1, len(at)), dtype=phases.dtype)
+        ),
+    )
+    if drive.components is not None:
+        amplitudes, turns, shares = drive.components
+        angle = turns[:, :, None] * at
+        table = (amplitudes[:, :, None] * torch.polar(torch.ones_like(angle), angle)).sum(1)
+    if drive.factor is not None:
+        factor = drive.factor[order]
+        above = torch.clamp(torch.searchsorted(phases, at), 1, len(phases) - 1)
+        gap = torch.clamp(phases[above] - phases[above - 1], min=1e-9)
+        way = torch.clamp((at - phases[above - 1]) / gap, 0, 1)
+        table = table * (factor[above - 1] + way * (factor[above] - factor[above - 1]))
+    return ends, table, shares
 
 
 def driven_phase(path: LightPath, stages: Stages, gray: Tensor, earlier: Tensor | None) -> Tensor:

@@ -37,10 +37,11 @@ class Drive:
         Tap tables of rows and columns, each [sub-pixels, taps].
     offset : Tensor [H, W] or None, rad
         Phase that is added whatever the pattern shows.
-    factors : complex Tensor [K, levels] or None
-        Factor on the field at each level, besides its phase, in each of K states during an exposure.
-    shares : Tensor [K] or None
-        Of each state in the exposure; their irradiances add.
+    factor : Tensor [levels] or None
+        Factor on the field at each level, besides its phase, real or complex.
+    components : (complex Tensor [K, C], Tensor [K, C], Tensor [K]) or None
+        In each of K states during an exposure, the field is that of C components: each has an amplitude, and so many
+        times the phase more. Then each state's share of the exposure; their irradiances add.
     persistence : Tensor or None
         Share of the phase shown before that is still there.
     """
@@ -56,8 +57,8 @@ class Drive:
     gain: Tensor | None = None
     crosstalk: tuple[Tensor, Tensor] | None = None
     offset: Tensor | None = None
-    factors: Tensor | None = None
-    shares: Tensor | None = None
+    factor: Tensor | None = None
+    components: tuple[Tensor, Tensor, Tensor] | None = None
     persistence: Tensor | None = None
 
     def scaled(self, factor: Tensor) -> Drive:
@@ -70,14 +71,18 @@ class Drive:
 
     def modulated(self, factor: Tensor) -> Drive:
         """The drive with the light of each level multiplied by a factor [levels], real or complex."""
-        return self.varying(factor[None, :], torch.ones(1, dtype=self.level.dtype))
+        return replace(self, factor=factor if self.factor is None else self.factor * factor)
 
-    def varying(self, factors: Tensor, shares: Tensor) -> Drive:
-        """The drive with each state of the exposure split into states with factors [K, levels] and shares [K]."""
-        if self.factors is None or self.shares is None:
-            return replace(self, factors=factors, shares=shares)
-        both = (self.factors[:, None, :] * factors[None, :, :]).reshape(-1, factors.shape[-1])
-        return replace(self, factors=both, shares=(self.shares[:, None] * shares[None, :]).reshape(-1))
+    def split(self, amplitudes: Tensor, turns: Tensor, shares: Tensor) -> Drive:
+        """The drive with each component of each state split into such components and states, as in `components`."""
+        if self.components is None:
+            return replace(self, components=(amplitudes, turns, shares))
+        amplitudes_before, turns_before, shares_before = self.components
+        states = len(shares_before) * len(shares)
+        times = amplitudes_before[:, None, :, None] * amplitudes[None, :, None, :]
+        more = turns_before[:, None, :, None] + turns[None, :, None, :]
+        both = (shares_before[:, None] * shares[None, :]).reshape(states)
+        return replace(self, components=(times.reshape(states, -1), more.reshape(states, -1), both))
 
 
 @dataclass(frozen=True)
