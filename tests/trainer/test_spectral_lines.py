@@ -70,6 +70,19 @@ def test_a_line_sees_the_panel_s_delay_at_its_own_wavelength(
     assert unscaled > 100 * off
 
 
+def test_a_wavelength_that_is_stated_wrong_leaves_the_panel_s_response() -> None:
+    """It was measured with the very laser; a line beside that one sees it scaled."""
+    wrong = present("wavelength", offset=12.0)
+    scene = scene_of()
+    (colour,) = scene.bench.channels
+    there = replace(scene, bench=replace(scene.bench, channels=(replace(colour, wavelength_nm=532.0),)))
+    beside = present("source_lines", separation=15.0, share=0.4)
+    for others in ((), (beside,)):
+        found = predicted(scene, stages_for(scene, (wrong, *others)))
+        expected = predicted(there, stages_for(there, others))
+        assert float(((found - expected) ** 2).mean() / expected.var()) < 1e-5
+
+
 def test_two_lines_far_apart_are_one_effect(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """With one panel for both lines, a third as much as nothing is left, and phase_response is named beside them."""
     bench = bench_file(tmp_path, 'kind = "source_lines"\nseparation_nm = 15\nshare = 0.4', **LARGER)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from runtime.excess import PredictionErrors
@@ -118,22 +119,22 @@ def _first_fits(
         return try_all(roles, model, wanted[:2], pool, report, 0.3, 0.6)
     if thorough:
         return try_all(roles, model, wanted, pool, report, 0.3, 0.6)
-    least = thresholds.excess
+    least, shown = thresholds.excess, -math.inf
     if complete:
         shown = SHOWS * thresholds.least(ideal_excess)
-        hopeful = [s for s in wanted if s in blind or s.removed_excess > shown]
-        return try_near(roles, model, hopeful, [], least, pool, report, 0.3, 0.6, shown)
+        promising = [s for s in promising if s.removed_excess > shown]
     if model.present and expects_the_rest(order):
         # Present effects may have taken up a part of the one that explains the rest: the screen lets them move.
         first = [s for s in promising if s.after < NEAR * order[0].after + least]
         fits = fit_with_present(roles, model, first, least, pool)
     else:
         first = [s for s in promising if s.removed_excess > RIVALS * order[0].removed_excess]
-        fits = try_near(roles, model, first, [], least, pool, report, 0.3, 0.4)
+        fits = try_near(roles, model, first, [], least, pool, report, 0.3, 0.4, shown)
     if _settled(fits, before, thresholds, ideal_excess):
         return fits
-    rest = [s for s in wanted if s not in first]
-    return fits + try_near(roles, model, rest, fits, least, pool, report, 0.4, 0.6)
+    rest = [s for s in promising if s not in first]
+    rest += [s for s in blind if s not in promising]
+    return fits + try_near(roles, model, rest, fits, least, pool, report, 0.4, 0.6, shown)
 
 
 def expects_the_rest(screened: Sequence[ScreenResult]) -> bool:

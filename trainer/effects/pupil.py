@@ -80,7 +80,8 @@ def wavelength(pupil: Pupil, offset: Tensor) -> Pupil:
     ----------
     Goodman, Introduction to Fourier Optics, section 3.10.
     """
-    return pupil.emitting(1e-9 * offset.reshape(1), torch.ones(1, dtype=offset.dtype))
+    line = pupil.emitting(1e-9 * offset.reshape(1), torch.ones(1, dtype=offset.dtype))
+    return replace(line, nominal_offset=1e-9 * offset)
 
 
 def _delayed(pupil: Pupil, waves: Tensor) -> Pupil:

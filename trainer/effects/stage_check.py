@@ -159,6 +159,7 @@ def _pupil(pupil: Pupil) -> dict[str, _Wanted]:
         "path_difference": _Wanted(band, f"[n, m] = {list(band)}"),
         "transmission": _Wanted(band, f"[n, m] = {list(band)}", complex=True),
         "lines": _Wanted(None, "[lines]", count=2),
+        "nominal_offset": number,
         "irradiance_filter": _Wanted(image, f"over (iy, ix) = {list(image)}", complex=True),
     }
 

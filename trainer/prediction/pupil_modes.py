@@ -27,11 +27,15 @@ def pupil_modes(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
 
 
 def phase_scales(scene: Scene, pupil: Pupil) -> Tensor | None:
-    """By how much each mode's line sees the panel's phase scaled, [M]; None for a source of one line.
+    """By how much each mode's line sees the panel's phase scaled, [M]; None where there is one line, the nominal one.
 
     A delay is as many waves more as the wavelength is shorter.
     """
-    return None if pupil.lines is None else scene.wavelength / (scene.wavelength + _lit(*pupil.lines)[0])
+    if pupil.lines is None or (pupil.nominal_offset is not None and len(pupil.lines[0]) == 1):
+        return None
+    offsets, _ = _lit(*pupil.lines)
+    nominal = 0.0 if pupil.nominal_offset is None else pupil.nominal_offset
+    return (scene.wavelength + nominal) / (scene.wavelength + offsets)
 
 
 @kept_by_device(16)

@@ -201,6 +201,8 @@ class Pupil:
     transmission : complex Tensor [n, m] or None
     lines : (Tensor, Tensor) or None
         Offsets of the laser's lines, m, and their weights.
+    nominal_offset : Tensor or None, m
+        Of the wavelength that the panel's response is for, where it is not the stated one.
     irradiance_filter : Tensor or None
         Transfer function of irradiance over (iy, ix).
     extent : SourceExtent or None
@@ -227,6 +229,7 @@ class Pupil:
     path_difference: Tensor | None = None
     transmission: Tensor | None = None
     lines: tuple[Tensor, Tensor] | None = None
+    nominal_offset: Tensor | None = None
     irradiance_filter: Tensor | None = None
     extent: SourceExtent | None = None
 
