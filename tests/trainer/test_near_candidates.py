@@ -11,7 +11,7 @@ from trainer.diagnosis import ranking
 from trainer.diagnosis.ranking import try_near
 
 
-def near(monkeypatch: pytest.MonkeyPatch, before: float, few: dict[str, float]) -> set[str]:
+def near(monkeypatch: pytest.MonkeyPatch, before: float, few: dict[str, float], *shown: float) -> set[str]:
     """The candidates that go on to all captures, of those that leave so much excess on few."""
     left = SimpleNamespace(excess=before)
     monkeypatch.setattr(ranking, "telling_captures", lambda *_: [])
@@ -26,7 +26,7 @@ def near(monkeypatch: pytest.MonkeyPatch, before: float, few: dict[str, float]) 
 
     roles: Any = SimpleNamespace(folder=None, fitted=(), held_out=(), captures=None)
     pool: Any = SimpleNamespace(map=fitted)
-    found = try_near(roles, None, screened, [], 2e-4, pool, lambda *_: None, 0, 1)  # type: ignore[arg-type]
+    found = try_near(roles, None, screened, [], 2e-4, pool, lambda *_: None, 0, 1, *shown)  # type: ignore[arg-type]
     return {one.effect for one in found}
 
 
@@ -46,3 +46,14 @@ def test_a_pattern_of_pixels_may_have_been_fitted_to_the_noise_of_these_captures
     few = {"best": -3.1e-4, "other": -3e-4}
     assert near(monkeypatch, before, few) == {"best", "other"}
     assert near(monkeypatch, before, {**few, "far": 1.0}) >= {"best", "other"}
+
+
+@pytest.mark.parametrize("before", [4e-4, 6e-5])
+def test_where_next_to_nothing_is_left_only_those_that_show_are_fitted_to_all(
+    monkeypatch: pytest.MonkeyPatch, before: float
+) -> None:
+    """What few captures do not show cannot be worth adding, even where none gets anywhere or only one is asked."""
+    few = {"shows": before - 6e-5, "does not": before - 4e-5}
+    assert near(monkeypatch, before, few, 5e-5) == {"shows"}
+    assert near(monkeypatch, before, {"does not": before}, 5e-5) == set()
+    assert near(monkeypatch, before, {}, 5e-5) == set()

@@ -149,14 +149,17 @@ def try_near(
     report, start, end
         As for `try_all`.
     shown : float
-        Excess that a candidate must remove on few captures to be fitted to all.
+        Excess that a candidate must remove on few captures to be fitted to all; -inf: any, and one alone is fitted to
+        all at once.
 
     Returns
     -------
     list of CandidateFit
         Of those that come near.
     """
-    if len(screened) + len(others) < 2:
+    if not screened:
+        return []
+    if len(screened) + len(others) < 2 and not math.isfinite(shown):
         return try_all(roles, model, screened, pool, report, start, end)
     telling = telling_captures(roles.captures, roles.fitted, model)
     few = ids_of(telling)
@@ -188,7 +191,7 @@ def try_near(
         return [further for (*_, further), _ in chosen if further] + try_further_all(roles, rest, False, pool)
 
     found = to_all(near(raising=left > surely_near))
-    if left <= surely_near < min(f.held_out.excess for f in (*others, *found)):
+    if left <= surely_near < min((f.held_out.excess for f in (*others, *found)), default=math.inf):
         found += to_all(set(near(raising=True)) - {f.effect for f in found})
     return found
 

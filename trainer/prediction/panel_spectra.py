@@ -7,6 +7,7 @@ the panel's nominal phase leaves 0.002 of the signal's variance.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -22,23 +23,23 @@ from runtime.lightpath.light_path import (
 )
 
 SCALE = 0.04  # by which the phase is scaled down and up: of lines 40 nm apart the parabola errs by 1e-4 of the field
+NOMINAL, BESIDE = (1.0,), (1 - SCALE, 1 + SCALE)
 
 
-def panel_spectra(path: LightPath, phase: Tensor, scaled: bool) -> Tensor:
-    """Spectra of a phase (rad) [B, H, W].
+def panel_spectra(path: LightPath, phase: Tensor, scales: Sequence[float]) -> Tensor:
+    """Spectra of a phase (rad) [B, H, W], scaled.
 
     Parameters
     ----------
-    scaled : bool
-        Whether those of the phase scaled down and up are asked for, too.
+    scales : sequence of float
+        `NOMINAL`, or `BESIDE` for those beside it that lines of another wavelength need, too.
 
     Returns
     -------
-    complex Tensor [B, states, 1 or 3, n, m]
+    complex Tensor [B, states, scales, n, m]
     """
     found = []
     for state in states(path):
-        scales = (1.0, 1 - SCALE, 1 + SCALE) if scaled else (1.0,)
         found.append(torch.stack([panel_spectrum(_driven(state, s), s * phase) for s in scales], 1))
     return torch.stack(found, 1)
 
@@ -56,7 +57,7 @@ def irradiance_of(path: LightPath, spectra: Tensor, scales: Tensor | None) -> Te
     Parameters
     ----------
     spectra : complex Tensor [B, states, 1 or 3, n, m]
-        As from `panel_spectra`.
+        Those of `NOMINAL`, or of `NOMINAL` and `BESIDE`.
     scales : Tensor [M] or None
         Of the panel's phase, for each mode of the pupil; None: 1.
     """

@@ -32,7 +32,7 @@ from trainer.kept_results import kept_by_device, kept_for_same
 from trainer.prediction.capture_gain import own_gain
 from trainer.prediction.capture_motion import blurred_spectrum, displaced_spectrum
 from trainer.prediction.panel_gradient import has_panel_gradient, image_with_panel_gradient
-from trainer.prediction.panel_spectra import irradiance_of, panel_spectra
+from trainer.prediction.panel_spectra import BESIDE, NOMINAL, irradiance_of, panel_spectra
 from trainer.prediction.pupil_modes import phase_scales, pupil_modes
 from trainer.prediction.samples_at import samples_at
 from trainer.prediction.scene import Scene, Stages, bare_stages
@@ -228,16 +228,18 @@ def trace(
     if before is not None and start == "sensor":
         return before
     path, scales = light_path(scene, stages), phase_scales(scene, stages.pupil)
-    spectra = before.spectra if before is not None and start == "pupil" else None
-    if spectra is None or spectra.shape[2] < (1 if scales is None else 3):
+    known = before.spectra if before is not None and start == "pupil" else None
+    if known is None or (scales is not None and known.shape[2] == 1):
         phase = driven_phase(path, stages, gray, earlier)
         if scales is None and has_panel_gradient(path, phase):
             return Trace(
                 torch.empty(0), _lit(scene, stages, path, lambda p: image_with_panel_gradient(p, phase))
             )
-        spectra = panel_spectra(path, phase, scales is not None)
-    found = spectra
-    return Trace(found, _lit(scene, stages, path, lambda p: irradiance_of(p, found, scales)))
+        known = panel_spectra(path, phase, NOMINAL) if known is None else known
+        if scales is not None:
+            known = torch.cat((known, panel_spectra(path, phase, BESIDE)), 2)
+    spectra = known
+    return Trace(spectra, _lit(scene, stages, path, lambda p: irradiance_of(p, spectra, scales)))
 
 
 def _lit(scene: Scene, stages: Stages, path: LightPath, image: Callable[[LightPath], Tensor]) -> Tensor:
