@@ -177,6 +177,11 @@ def load_light_path(bundle: Bundle, channel: str | None = None, plane_mm: float 
         response = response[shown_as(gray_levels, levels)]
     rows, columns = (arrays[name] for name in CROSSTALK)
     ends, factors, shares = (arrays[name] for name in MODULATION)
+    by_phase = record.get("modulation_by_phase", False)
+    if not isinstance(by_phase, bool):
+        raise InputError(
+            f"{MANIFEST}: modulation_by_phase of {where} is not true or false: export the bundle again"
+        )
     return LightPath(
         grid=grid,
         response=response,
@@ -189,7 +194,7 @@ def load_light_path(bundle: Bundle, channel: str | None = None, plane_mm: float 
         aperture=(arrays["aperture"][0], arrays["aperture"][1]),  # type: ignore[index]
         irradiance_filter=arrays["irradiance_filter"],
         modulation=None if ends is None or factors is None or shares is None else (ends, factors, shares),
-        modulation_by_phase=record.get("modulation_by_phase") is True,
+        modulation_by_phase=by_phase,
         gray_levels=gray_levels,
     )
 

@@ -8,8 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from firmware_iface.errors import InputError
 from runtime.bundle.bundle_folder import read_bundle
-from runtime.bundle.light_path_arrays import load_light_path
+from runtime.bundle.light_path_arrays import bundle_paths, load_light_path
 from runtime.lightpath.light_path import LightPath, image_field, irradiance, panel_spectrum
 from tests.trainer.hidden import LARGER, bench_file, ran
 from tests.trainer.test_effects import bench, gray, present, scene_of
@@ -66,7 +67,11 @@ def test_a_bundle_says_that_components_follow_the_panel_s_phase(tmp_path: Path) 
     ):
         folder = tmp_path / str(follows)
         export_bundle(Model(bench(), effects, {"green": 1.0}), None, folder)
-        assert load_light_path(read_bundle(folder)).modulation_by_phase is follows
+        bundle = read_bundle(folder)
+        assert load_light_path(bundle).modulation_by_phase is follows
+    bundle_paths(bundle)[0]["modulation_by_phase"] = "yes"
+    with pytest.raises(InputError, match="modulation_by_phase of light path green.*true or false"):
+        load_light_path(bundle)
 
 
 def test_a_leak_behind_an_uneven_panel_is_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

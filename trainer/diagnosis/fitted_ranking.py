@@ -132,8 +132,7 @@ def _first_fits(
         fits = try_near(roles, model, first, [], least, pool, report, 0.3, 0.4, shown)
     if _settled(fits, before, thresholds, ideal_excess):
         return fits
-    rest = [s for s in promising if s not in first]
-    rest += [s for s in blind if s not in promising]
+    rest = [s for s in wanted if s not in first and (s in promising or s in blind)]
     return fits + try_near(roles, model, rest, fits, least, pool, report, 0.4, 0.6, shown)
 
 

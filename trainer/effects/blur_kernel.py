@@ -8,6 +8,29 @@ import torch
 from torch import Tensor
 
 from trainer.effects.bessel import bessel_j0, bessel_j1_over_x
+from trainer.effects.definition import Parameter
+
+# What a core and a halo are described by, besides their widths.
+CORE_AND_HALO = (
+    Parameter(
+        "kurtosis",
+        "1",
+        scale=0.5,
+        low=-1.5,
+        high=1.5,
+        about="shape: 0 Gaussian, -1 uniform disc, -1.5 ring",
+        typical=(-1.5, 1.5),
+    ),
+    Parameter(
+        "halo",
+        "1",
+        scale=0.05,
+        low=0,
+        high=0.9,
+        about="share of the light in a wider, round part",
+        typical=(0, 0.5),
+    ),
+)
 
 
 def kernel_transfer(

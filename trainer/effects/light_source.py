@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from trainer.effects.blur_kernel import kernel_core, kernel_halo
+from trainer.effects.blur_kernel import CORE_AND_HALO, kernel_core, kernel_halo
 from trainer.effects.definition import Parameter, effect
 from trainer.prediction.stages import Pupil, SourceExtent
 
@@ -123,48 +123,22 @@ def source_lines(pupil: Pupil, separation: Tensor, share: Tensor) -> Pupil:
     acts_on="display",
     touches_iris=True,
     parameters=[
-        Parameter(
-            "extent_y",
-            "mrad",
-            scale=0.3,
-            low=0,
-            high=50,
-            even=True,
-            starts=(0.1, 0.3, 1.0),
-            about="rms angle",
-            typical=(0, 3),
-            example=1.0,
+        *(
+            Parameter(
+                f"extent_{axis}",
+                "mrad",
+                scale=0.3,
+                low=0,
+                high=50,
+                even=True,
+                starts=(0.1, 0.3, 1.0),
+                about="rms angle",
+                typical=(0, 3),
+                example=1.0,
+            )
+            for axis in "yx"
         ),
-        Parameter(
-            "extent_x",
-            "mrad",
-            scale=0.3,
-            low=0,
-            high=50,
-            even=True,
-            starts=(0.1, 0.3, 1.0),
-            about="rms angle",
-            typical=(0, 3),
-            example=1.0,
-        ),
-        Parameter(
-            "kurtosis",
-            "1",
-            scale=0.5,
-            low=-1.5,
-            high=1.5,
-            about="shape: 0 Gaussian, -1 uniform disc, -1.5 ring",
-            typical=(-1.5, 1.5),
-        ),
-        Parameter(
-            "halo",
-            "1",
-            scale=0.05,
-            low=0,
-            high=0.9,
-            about="share of the light in a wider, round part",
-            typical=(0, 0.5),
-        ),
+        *CORE_AND_HALO,
         Parameter(
             "halo_extent",
             "mrad",

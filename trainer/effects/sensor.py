@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from runtime.lightpath.legendre import legendre_count, legendre_curve, legendre_surface
-from trainer.effects.blur_kernel import kernel_transfer
+from trainer.effects.blur_kernel import CORE_AND_HALO, kernel_transfer
 from trainer.effects.definition import Parameter, effect
 from trainer.effects.free_form import FreeForm, along
 from trainer.effects.starts import gain_spread, ghost_starts, registration_starts
@@ -21,48 +21,22 @@ from trainer.prediction.stages import Sensor
     stage="sensor",
     acts_on="camera",
     parameters=[
-        Parameter(
-            "width_y",
-            "pixels",
-            scale=0.15,
-            low=0,
-            high=20,
-            even=True,
-            starts=(0.3, 0.6, 1.2),
-            about="rms",
-            typical=(0, 3),
-            example=0.8,
+        *(
+            Parameter(
+                f"width_{axis}",
+                "pixels",
+                scale=0.15,
+                low=0,
+                high=20,
+                even=True,
+                starts=(0.3, 0.6, 1.2),
+                about="rms",
+                typical=(0, 3),
+                example=0.8,
+            )
+            for axis in "yx"
         ),
-        Parameter(
-            "width_x",
-            "pixels",
-            scale=0.15,
-            low=0,
-            high=20,
-            even=True,
-            starts=(0.3, 0.6, 1.2),
-            about="rms",
-            typical=(0, 3),
-            example=0.8,
-        ),
-        Parameter(
-            "kurtosis",
-            "1",
-            scale=0.5,
-            low=-1.5,
-            high=1.5,
-            about="shape: 0 Gaussian, -1 uniform disc, -1.5 ring",
-            typical=(-1.5, 1.5),
-        ),
-        Parameter(
-            "halo",
-            "1",
-            scale=0.05,
-            low=0,
-            high=0.9,
-            about="share of the light in a wider, round part",
-            typical=(0, 0.5),
-        ),
+        *CORE_AND_HALO,
         Parameter(
             "halo_width",
             "pixels",

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from runtime.lightpath.host_arrays import unit_phasor
 from runtime.lightpath.light_path import LightPath
 from runtime.lightpath.light_path_adjoint import irradiance_and_field_pullback
 
@@ -46,7 +47,7 @@ class _Image(torch.autograd.Function):
         needs_source, needs_leak, needs_phase, _ = ctx.needs_input_grad
         with torch.no_grad():
             over_field = ctx.pullback(gradient)
-            turned = torch.complex(torch.cos(phase), -torch.sin(phase)) * over_field
+            turned = unit_phasor(-phase) * over_field
             over_source = turned.sum(0) if needs_source else None
             over_leak = over_field.sum(0) if needs_leak else None
             # d(source exp(j phi)) = j source exp(j phi) dphi.

@@ -24,6 +24,7 @@ from runtime.camera.sampling import (
 from runtime.lightpath.fft import rfft2
 from runtime.lightpath.gray_levels import shown_as
 from runtime.lightpath.grid import FINE
+from runtime.lightpath.host_arrays import unit_phasor
 from runtime.lightpath.light_path import LightPath, panel_phase
 from runtime.lightpath.modulation import Modulation
 from runtime.lightpath.propagation import far_field_matrix
@@ -88,16 +89,10 @@ def _modulation(drive: Drive) -> Modulation | None:
         scaled = ends[:, None] * torch.stack((drive.gain.detach().min(), drive.gain.detach().max()))
         ends = torch.stack((scaled.min(), scaled.max()))
     at = ends[0] + torch.linspace(0, 1, MODULATION_SAMPLES, dtype=phases.dtype) * (ends[1] - ends[0])
-    shares, table = (
-        torch.ones(1, dtype=phases.dtype),
-        torch.complex(
-            torch.ones((1, len(at)), dtype=phases.dtype), torch.zeros((1, len(at)), dtype=phases.dtype)
-        ),
-    )
-    if drive.components is not None:
-        amplitudes, turns, shares = drive.components
-        angle = turns[:, :, None] * at
-        table = (amplitudes[:, :, None] * torch.polar(torch.ones_like(angle), angle)).sum(1)
+    one = torch.ones((1, 1), dtype=phases.dtype)
+    plain = (torch.complex(one, 0 * one), 0 * one, one[0])
+    amplitudes, turns, shares = plain if drive.components is None else drive.components
+    table = (amplitudes[:, :, None] * unit_phasor(turns[:, :, None] * at)).sum(1)
     if drive.factor is not None:
         factor = drive.factor[order]
         above = torch.clamp(torch.searchsorted(phases, at), 1, len(phases) - 1)
