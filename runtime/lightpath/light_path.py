@@ -133,8 +133,7 @@ def panel_spectrum(path: LightPath, phase: Array) -> Array:
     complex array [..., n, m]
     """
     if path.crosstalk is None:
-        rows = _row_spectrum(path.grid, panel_field(path, phase))
-        return aperture_spectrum(path, phase, (1, 1)) * _column_spectrum(path.grid, rows)
+        return field_spectrum(path, panel_field(path, phase), phase)
     ky, kx = path.crosstalk
     sub = (ky.shape[0], kx.shape[0])
     down, across = (sub_pixel_offsets(path, phase, sub, axis) for axis in (0, 1))
@@ -145,6 +144,12 @@ def panel_spectrum(path: LightPath, phase: Array) -> Array:
         along_rows = xp.sum(across * _row_spectrum(path.grid, fields), axis=0)
         total = total + down[i, ...] * _column_spectrum(path.grid, along_rows)
     return aperture_spectrum(path, phase, sub) / (sub[0] * sub[1]) * total
+
+
+def field_spectrum(path: LightPath, field: Array, like: Array) -> Array:
+    """Spectrum over the band, [..., n, m], of a field [..., H, W] that is even over each pixel; `like` is real."""
+    rows = _row_spectrum(path.grid, field)
+    return aperture_spectrum(path, like, (1, 1)) * _column_spectrum(path.grid, rows)
 
 
 def image_field(path: LightPath, spectrum: Array, mode: int) -> Array:

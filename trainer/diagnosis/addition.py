@@ -172,7 +172,9 @@ def gone_on(
     if thresholds.complete(errors.excess, errors.excess):
         return None
     first, last = with_stopping(_worst_first(roles, model), FIT_CAPTURES)
-    further = with_free_form(model, name, load(roles.captures, first), load(roles.captures, last))
+    further = with_free_form(
+        model, name, load(roles.captures, first), load(roles.captures, last), thresholds.excess
+    )
     if further is None:
         return None
     after = evaluate_captures(roles.captures, roles.held_out, further)

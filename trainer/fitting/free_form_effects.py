@@ -12,7 +12,6 @@ from dataclasses import replace
 import numpy as np
 
 from runtime.lightpath.spline_maps import nodes_over, on_other_nodes
-from runtime.program.progress import Progress, no_progress
 from trainer.captures.batches import Batch, signal_variance
 from trainer.device import array_of
 from trainer.effects.free_form import grid_of, on_other_curve_nodes
@@ -43,7 +42,7 @@ def with_free_form(
     name: str,
     fitted: Sequence[Batch],
     stopping: Sequence[Batch],
-    progress: Progress | None = None,
+    enough: float,
 ) -> Model | None:
     """The model with an effect's map or curve gone on in free form, and everything else refitted with it.
 
@@ -55,25 +54,25 @@ def with_free_form(
         Of an effect with a free form.
     fitted, stopping : sequence of Batch
         Captures for the gradient, and other captures that say when to stop and how fine the map is.
-    progress : callable, optional
-        Called with the share that is done.
+    enough : float
+        Excess from which on no finer map is tried.
 
     Returns
     -------
     Model or None
         None where coarse nodes do not remove a quarter of the error: the polynomials have not ended.
     """
-    report = progress or no_progress
     best, least = model, excess_on(model, stopping)
     shapes = _node_shapes(model, name, fitted[0])
     for level, shape in enumerate(shapes):
-        report(level / len(shapes))
         trial = _descended(best, name, shape, fitted, stopping)
         trial = fit(trial, trial.names, fitted, iterations=REFIT_ITERATIONS).model
         excess = excess_on(trial, stopping)
         if least - excess < (FIRST_GAIN if level == 0 else FINER_GAIN) * abs(least):
             break
         best, least = trial, excess
+        if least < enough:
+            break
     return None if best is model else best
 
 

@@ -86,7 +86,7 @@ def columns(
 
     def of_number(key: tuple[str, str, int]) -> Tensor:
         step, effect = column_step(model, key), model.instance(key[0]).effect
-        moved = predictor.predict(stepped(model, key, step), effect.stage, point)
+        moved = predictor.predict_nearby(stepped(model, key, step), effect.stage, point)
         return slope(moved, step, effect.parameter(key[1]).scale)
 
     result = side_by_side(of_number, keys, base[0].numel())

@@ -104,7 +104,7 @@ class ManySlopes:
         rows = []
         with torch.no_grad():
             for q, point, base in zip(self.predictors, self.points, self._base, strict=True):
-                slope = (q.predict(there, self.first, point) - base) / step
+                slope = (q.predict_nearby(there, self.first, point) - base) / step
                 rows.append((q.batch.mask * slope).reshape(-1))
         return rows
 

@@ -36,7 +36,9 @@ class Predictor:
             return [(slice(None), self.stages(model))]
         return [(slice(k, k + 1), self.stages(model, k)) for k in range(len(self.batch.ids))]
 
-    def trace(self, model: Model, start: str = "drive", before: Trace | None = None) -> Trace:
+    def trace(
+        self, model: Model, start: str = "drive", before: Trace | None = None, nearby: bool = False
+    ) -> Trace:
         """Spectrum and irradiance of the batch, a capture at a time to stay in the processor's cache.
 
         Parameters
@@ -45,6 +47,8 @@ class Predictor:
             The first stage that `model` changes.
         before : Trace, optional
             Of a model that is equal before that stage; without it everything is computed.
+        nearby : bool
+            The model is a small step from that of `before`, as in `trainer.prediction.predict.trace`.
         """
         if before is not None and start == "sensor":
             return before
@@ -54,10 +58,11 @@ class Predictor:
             stages = shared or self.stages(model, k)
             one = None if before is None else before.of(k)
             gray, earlier = self.batch.gray[k : k + 1], self.earlier(stages, k)
-            return trace(self.scene, stages, gray, start, one, earlier)
+            return trace(self.scene, stages, gray, start, one, earlier, nearby)
 
         parts = side_by_side(part, range(self.batch.gray.shape[0]), self.batch.gray[0].numel())
-        return Trace(torch.cat([p.spectra for p in parts]), torch.cat([p.image for p in parts]))
+        paths = tuple(path for p in parts for path in p.paths)
+        return Trace(torch.cat([p.spectra for p in parts]), torch.cat([p.image for p in parts]), paths)
 
     def earlier(self, stages: Stages, k: int) -> Tensor | None:
         """Patterns shown before capture k [1, n, H, W], where the panel still shows something of them."""
@@ -82,9 +87,13 @@ class Predictor:
         ]
         return batch.as_compared(found[0] if len(found) == 1 else torch.cat(found))
 
-    def predict(self, model: Model, start: str = "drive", before: Trace | None = None) -> Tensor:
-        """Counts above black [B, h, w], from stage `start` on."""
-        return self.counts(model, self.light(model, self.trace(model, start, before)))
+    def predict(self, model: Model) -> Tensor:
+        """Counts above black [B, h, w]."""
+        return self.counts(model, self.light(model, self.trace(model)))
+
+    def predict_nearby(self, model: Model, start: str, before: Trace) -> Tensor:
+        """Counts above black [B, h, w] of a model that is a small step away from stage `start` on."""
+        return self.counts(model, self.light(model, self.trace(model, start, before, nearby=True)))
 
 
 def lights_of(model: Model, predictors: Sequence[Predictor], points: Sequence[Trace]) -> list[Tensor]:

@@ -32,6 +32,7 @@ from trainer.device import array_of
 from trainer.kept_results import kept_by_device, kept_for_same
 from trainer.prediction.capture_gain import own_gain
 from trainer.prediction.capture_motion import blurred_spectrum, displaced_spectrum
+from trainer.prediction.other_beam import spectra_of_other_beam
 from trainer.prediction.panel_gradient import has_panel_gradient, image_with_panel_gradient
 from trainer.prediction.panel_spectra import BESIDE, NOMINAL, irradiance_of, panel_spectra
 from trainer.prediction.pupil_modes import phase_scales, pupil_modes
@@ -183,14 +184,17 @@ class Trace:
         The panel's, as from `panel_spectra`; empty where only what happens at the panel has a gradient.
     image : Tensor
         Irradiance before filters, of the source with its extent.
+    paths : tuple of LightPath
+        Of each capture.
     """
 
     spectra: Tensor
     image: Tensor
+    paths: tuple[LightPath, ...]
 
     def of(self, k: int) -> Trace:
         """The results of capture k alone."""
-        return Trace(self.spectra[k : k + 1], self.image[k : k + 1])
+        return Trace(self.spectra[k : k + 1], self.image[k : k + 1], self.paths[k : k + 1])
 
 
 def trace(
@@ -200,6 +204,7 @@ def trace(
     start: str = "drive",
     before: Trace | None = None,
     earlier: Tensor | None = None,
+    nearby: bool = False,
 ) -> Trace:
     """Spectrum and irradiance of patterns.
 
@@ -215,6 +220,9 @@ def trace(
         What earlier stages gave.
     earlier : int Tensor [B, n, H, W], optional
         Patterns shown before, as in `driven_phase`.
+    nearby : bool
+        The stages are a small step from those of `before`, for a derivative: a changed beam may be taken so roughly as
+        `spectra_of_other_beam` does.
 
     Returns
     -------
@@ -224,17 +232,19 @@ def trace(
         return before
     path, scales = light_path(scene, stages), phase_scales(scene, stages.pupil)
     known = before.spectra if before is not None and start == "pupil" else None
+    if nearby and before is not None and start == "panel":
+        known = spectra_of_other_beam(before.paths[0], path, before.spectra)
     if known is None or (scales is not None and known.shape[2] == 1):
         phase = driven_phase(path, stages, gray, earlier)
         if scales is None and has_panel_gradient(path, phase):
-            return Trace(
-                torch.empty(0), _lit(scene, stages, path, lambda p: image_with_panel_gradient(p, phase))
-            )
+            image = _lit(scene, stages, path, lambda p: image_with_panel_gradient(p, phase))
+            return Trace(torch.empty(0), image, (path,) * len(gray))
         known = panel_spectra(path, phase, NOMINAL) if known is None else known
         if scales is not None:
             known = torch.cat((known, panel_spectra(path, phase, BESIDE)), 2)
     spectra = known
-    return Trace(spectra, _lit(scene, stages, path, lambda p: irradiance_of(p, spectra, scales)))
+    image = _lit(scene, stages, path, lambda p: irradiance_of(p, spectra, scales))
+    return Trace(spectra, image, (path,) * len(gray))
 
 
 def _lit(scene: Scene, stages: Stages, path: LightPath, image: Callable[[LightPath], Tensor]) -> Tensor:
