@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import torch
@@ -212,10 +213,25 @@ def panel_wavefront(panel: Panel, wavefront: Tensor) -> Panel:
         ),
         Parameter("shift_y", "pixels", scale=0.2, low=-200, high=200, typical=(-30, 30), example=3.0),
         Parameter("shift_x", "pixels", scale=0.2, low=-200, high=200, typical=(-30, 30), example=6.0),
+        Parameter(
+            "path_difference",
+            "nm",
+            scale=10.0,
+            low=-1e5,
+            high=1e5,
+            about="by which the copy's phase in other colours differs from that in the first; nothing in one colour",
+            typical=(-1000, 1000),
+        ),
     ],
-    formula=r"u'(\mathbf{r}) = u(\mathbf{r}) + (a_\mathrm{r} + j\,a_\mathrm{i})\,u(\mathbf{r} - \mathbf{s})",
+    formula=(
+        r"u'(\mathbf{r}) = u(\mathbf{r}) + (a_\mathrm{r} + j\,a_\mathrm{i})\,"
+        r"\exp\Bigl[2\pi j\,\Delta\Bigl(\dfrac{1}{\lambda} - \dfrac{1}{\lambda_1}\Bigr)\Bigr]\,"
+        r"u(\mathbf{r} - \mathbf{s})"
+    ),
 )
-def coherent_ghost(panel: Panel, real: Tensor, imaginary: Tensor, shift_y: Tensor, shift_x: Tensor) -> Panel:
+def coherent_ghost(
+    panel: Panel, real: Tensor, imaginary: Tensor, shift_y: Tensor, shift_x: Tensor, path_difference: Tensor
+) -> Panel:
     """A second path of the light, displaced and delayed, interferes with the first.
 
     Light that is reflected twice inside a thin window arrives displaced and a little later, within the laser's
@@ -225,4 +241,6 @@ def coherent_ghost(panel: Panel, real: Tensor, imaginary: Tensor, shift_y: Tenso
     ----------
     Born and Wolf 1999, Principles of Optics, section 7.6.
     """
-    return panel.copied(torch.complex(real, imaginary), shift_y, shift_x)
+    waves = 1e-9 * path_difference * (1 / panel.wavelength - 1 / panel.reference_wavelength)
+    turned = torch.complex(real, imaginary) * torch.polar(torch.ones_like(waves), 2 * math.pi * waves)
+    return panel.copied(turned, shift_y, shift_x)

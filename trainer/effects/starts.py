@@ -31,6 +31,9 @@ _DISTANCES: dict[
     tuple[Any, ...], float | None
 ] = {}  # found before in this process: every diagnosis asks again
 TILE = 64
+PATH_REACH_NM = (
+    4000.0  # of a coherent ghost: within it three colours of a display tell path differences apart
+)
 
 
 def distance_starts(evidence: Sequence[Evidence]) -> Starts:
@@ -177,17 +180,53 @@ def ghost_starts(evidence: Sequence[Evidence], most: int = 3) -> Starts:
 
 
 def coherent_ghost_starts(evidence: Sequence[Evidence], most: int = 2) -> Starts:
-    """Displacements (panel pixels) and amplitudes of a second field that interferes with the first.
+    """Displacements (panel pixels), amplitudes and path differences of a second field that interferes with the first.
 
     A copy a u(r - s) changes irradiance by 2 Re[a* u(r) u*(r - s)]. So the correlation of the residual times the
-    field with the field has its peak at the displacement, and the peak's phase is the copy's.
+    field with the field has its peak at the displacement, and the peak's phase is the copy's. From colour to colour
+    that phase turns with the path difference.
     """
-    one = evidence[0]
+    first = evidence[0]
+    found = _copies(first)
+    others = {one.scene.channel: one for one in evidence if one.scene.plane_mm == first.scene.plane_mm}
+    copies = [(first, found)] + [(o, _copies(o)) for c, o in others.items() if c != first.scene.channel]
+    size = np.abs(found)
+    starts = []
+    for _ in range(most):
+        for a, b in _near(0, 0, size.shape):
+            size[a, b] = 0
+        i, j = (int(n) for n in np.unravel_index(int(size.argmax()), size.shape))
+        shift = [n - full if n > full / 2 else n for n, full in zip((i, j), size.shape, strict=True)]
+        amplitudes = []
+        for one, copy in copies:
+            # `image_field` leaves out a linear phase, by the band's first frequency.
+            grid = one.scene.grid
+            turn = sum(b * n / p for b, n, p in zip(grid.band, shift, grid.padded, strict=True))
+            amplitudes.append(complex(copy[i, j] * np.exp(-2j * np.pi * turn)))
+        reference = first.scene.bench.channels[0].wavelength_nm
+        path = _path_difference(amplitudes, [1e9 * one.scene.wavelength for one, _ in copies])
+        waves = path * (1e-9 / first.scene.wavelength - 1 / reference)
+        at_reference = amplitudes[0] * np.exp(-2j * np.pi * waves)
+        starts.append(
+            {
+                "real": float(np.clip(at_reference.real, -0.5, 0.5)),
+                "imaginary": float(np.clip(at_reference.imag, -0.5, 0.5)),
+                "shift_y": float(shift[0]),
+                "shift_x": float(shift[1]),
+                "path_difference": path,
+            }
+        )
+        for a, b in _near(i, j, size.shape):
+            size[a, b] = 0
+    return starts
+
+
+def _copies(one: Evidence) -> NDArray:
+    """Complex amplitude of a copy of the field at each displacement, on the first captures of a colour and plane."""
     scene, batch = one.scene, one.batch
     with torch.no_grad():
-        stages = bare_stages(scene)
-        path = light_path(scene, stages)
-        total = None
+        path = light_path(scene, bare_stages(scene))
+        total: NDArray | float = 0.0
         for k in range(min(SEARCHED, len(batch.ids))):
             spectrum = panel_spectrum(path, panel_phase(path, batch.gray[k : k + 1]))
             field = array_of(at_pixels(scene.grid, image_field(path, spectrum, 0))[0])
@@ -196,31 +235,21 @@ def coherent_ghost_starts(evidence: Sequence[Evidence], most: int = 2) -> Starts
             scale = float(one.prediction[k].sum()) / max(power, 1e-30)
             shape = [2 * n for n in field.shape]
             cross = np.fft.fft2(residual * field, shape) * np.conj(np.fft.fft2(field, shape))
-            found = np.fft.ifft2(cross) / max(scale * power**2 / field.size, 1e-30)
-            total = found if total is None else total + found
-    assert total is not None
-    total = total / min(SEARCHED, len(batch.ids))
-    size = np.abs(total)
-    starts = []
-    for _ in range(most):
-        for a, b in _near(0, 0, size.shape):
-            size[a, b] = 0
-        i, j = (int(n) for n in np.unravel_index(int(size.argmax()), size.shape))
-        shift = [n - full if n > full / 2 else n for n, full in zip((i, j), size.shape, strict=True)]
-        # `image_field` leaves out a linear phase, by the band's first frequency.
-        turn = sum(b * n / p for b, n, p in zip(scene.grid.band, shift, scene.grid.padded, strict=True))
-        amplitude = complex(total[i, j] * np.exp(-2j * np.pi * turn))
-        starts.append(
-            {
-                "real": float(np.clip(amplitude.real, -0.5, 0.5)),
-                "imaginary": float(np.clip(amplitude.imag, -0.5, 0.5)),
-                "shift_y": float(shift[0]),
-                "shift_x": float(shift[1]),
-            }
-        )
-        for a, b in _near(i, j, size.shape):
-            size[a, b] = 0
-    return starts
+            total = total + np.fft.ifft2(cross) / max(scale * power**2 / field.size, 1e-30)
+    return np.asarray(total / min(SEARCHED, len(batch.ids)))
+
+
+def _path_difference(amplitudes: Sequence[complex], wavelengths_nm: Sequence[float]) -> float:
+    """The path difference (nm) by which a copy's phases differ from the first colour's: of several, the least."""
+    if len(amplitudes) < 2:
+        return 0.0
+    paths = np.arange(-PATH_REACH_NM, PATH_REACH_NM + 1, 10.0)
+    fit = np.zeros(len(paths))
+    for amplitude, wavelength in zip(amplitudes[1:], wavelengths_nm[1:], strict=True):
+        turned = np.exp(2j * np.pi * paths * (1 / wavelength - 1 / wavelengths_nm[0]))
+        fit += (np.conj(amplitude) * amplitudes[0] * turned).real
+    alike = np.flatnonzero(fit >= fit.max() - 0.02 * abs(fit.max()))
+    return float(paths[alike[np.abs(paths[alike]).argmin()]])
 
 
 def _near(i: int, j: int, shape: tuple[int, ...]) -> list[tuple[int, int]]:
