@@ -172,9 +172,9 @@ def gone_on(
     if thresholds.complete(errors.excess, errors.excess):
         return None
     first, last = with_stopping(_worst_first(roles, model), FIT_CAPTURES)
-    further = with_free_form(
-        model, name, load(roles.captures, first), load(roles.captures, last), thresholds.excess
-    )
+    # A finer map costs much, and says nothing where no more is left than is worth adding; a finer curve costs little.
+    enough = 0.0 if present.effect.free_form.curve else thresholds.excess
+    further = with_free_form(model, name, load(roles.captures, first), load(roles.captures, last), enough)
     if further is None:
         return None
     after = evaluate_captures(roles.captures, roles.held_out, further)
