@@ -10,8 +10,9 @@ import pytest
 from tests.trainer.hidden import bench_file, ran, with_few_effects
 
 GREEN = '[[channel]]\nname = "green"\nwavelength_nm = 520\n'
-RED_FIRST = '[[channel]]\nname = "red"\nwavelength_nm = 638\n' + GREEN
-THREE = RED_FIRST + '[[channel]]\nname = "blue"\nwavelength_nm = 450\n'
+RED, BLUE = (
+    GREEN.replace("green", name).replace("520", nm) for name, nm in (("red", "638"), ("blue", "450"))
+)
 
 
 @pytest.mark.parametrize("phase_deg", [120, -200])
@@ -22,7 +23,7 @@ def test_a_coherent_ghost_is_late_by_one_path_for_all_colours(
     with_few_effects(monkeypatch, "coherent_ghost", "distance")
     ghost = f'kind = "coherent_ghost"\namplitude = 0.2\nphase_deg = {phase_deg}'
     bench = bench_file(tmp_path, ghost, width=128, height=96)
-    bench.write_text(bench.read_text().replace(GREEN, THREE))
+    bench.write_text(bench.read_text().replace(GREEN, RED + GREEN + BLUE))
     captures = tmp_path / "captures"
     ran(capsys, "capture", "--bench", bench, "--out", captures, "--patterns", 4)
     found = ran(capsys, "explain", captures, "--out", tmp_path / "model.toml")

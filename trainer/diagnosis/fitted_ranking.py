@@ -27,9 +27,10 @@ from trainer.model.model import Model
 
 FITTED_FIRST = 5  # candidates fitted after the screen; all of them when none of these explains anything
 # Where it is not thorough, no other candidate is asked for where one leaves at most this share of the excess: either
-# nothing that is worth adding, or enough for another look at all of them; in between only where it leaves at most so
-# much less. At first those are fitted that the screen expects to remove at least this share of what the best one does.
-SETTLES, SURELY_SETTLES, RIVALS = 0.1, 0.002, 0.5
+# nothing that is worth adding, or enough for another look at all of them.
+SETTLES = 0.1
+SURELY_SETTLES = 0.002  # share of the excess for what lies between the two
+RIVALS = 0.5  # at first those are fitted that the screen expects to remove so much of what the best one does
 # Of the least that is worth adding: a candidate of which few captures show less than this share, where the model is
 # complete and all that is left is not much more than that least, is not fitted to all.
 SHOWS = 0.25

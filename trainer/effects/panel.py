@@ -219,7 +219,7 @@ def panel_wavefront(panel: Panel, wavefront: Tensor) -> Panel:
             scale=10.0,
             low=-1e5,
             high=1e5,
-            about="by which the copy's phase in other colours differs from that in the first; nothing in one colour",
+            about="turns the copy's phase from colour to colour, from the first on; nothing in one colour",
             typical=(-1000, 1000),
         ),
     ],

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -31,9 +31,8 @@ _DISTANCES: dict[
     tuple[Any, ...], float | None
 ] = {}  # found before in this process: every diagnosis asks again
 TILE = 64
-PATH_REACH_NM = (
-    4000.0  # of a coherent ghost: within it three colours of a display tell path differences apart
-)
+# Of a coherent ghost: within it three colours of a display tell path differences apart.
+PATH_REACH_NM = 4000.0
 
 
 def distance_starts(evidence: Sequence[Evidence]) -> Starts:
@@ -165,17 +164,10 @@ def ghost_starts(evidence: Sequence[Evidence], most: int = 3) -> Starts:
     starts = []
     for sharp in (False, True):  # the sharp one parts a far copy from what is wrong near by
         correlation = np.abs(_correlation(residual, expected, taper, whiten=False, sharp=sharp))
-        for i, j in _near(0, 0, correlation.shape):
-            correlation[i, j] = 0
-        for _ in range(most):
-            i, j = (int(n) for n in np.unravel_index(int(correlation.argmax()), correlation.shape))
-            dy, dx = (k - n if k > n / 2 else k for k, n in ((i, height), (j, width)))
-            _, shift, _ = _on_panel(
-                one.scene.bench, np.zeros((1, 2)), np.array([[dy, dx]], float), np.ones(1)
-            )
+        for _, displacement in _peaks(correlation, most):
+            moved = np.array([displacement], float)
+            _, shift, _ = _on_panel(one.scene.bench, np.zeros((1, 2)), moved, np.ones(1))
             starts.append({"amplitude": 0.02, "shift_y": shift[0, 0], "shift_x": shift[0, 1]})
-            for a, b in _near(i, j, correlation.shape):
-                correlation[a, b] = 0
     return starts
 
 
@@ -186,26 +178,21 @@ def coherent_ghost_starts(evidence: Sequence[Evidence], most: int = 2) -> Starts
     field with the field has its peak at the displacement, and the peak's phase is the copy's. From colour to colour
     that phase turns with the path difference.
     """
-    first = evidence[0]
-    found = _copies(first)
-    others = {one.scene.channel: one for one in evidence if one.scene.plane_mm == first.scene.plane_mm}
-    copies = [(first, found)] + [(o, _copies(o)) for c, o in others.items() if c != first.scene.channel]
-    size = np.abs(found)
+    first = evidence[0].scene
+    others = (o for o in evidence if o.scene.plane_mm == first.plane_mm and o.scene.channel != first.channel)
+    colours = [evidence[0], *others]
+    copies = [_copies(one) for one in colours]
+    wavelengths_nm = [1e9 * one.scene.wavelength for one in colours]
     starts = []
-    for _ in range(most):
-        for a, b in _near(0, 0, size.shape):
-            size[a, b] = 0
-        i, j = (int(n) for n in np.unravel_index(int(size.argmax()), size.shape))
-        shift = [n - full if n > full / 2 else n for n, full in zip((i, j), size.shape, strict=True)]
+    for place, shift in _peaks(np.abs(copies[0]), most):
         amplitudes = []
-        for one, copy in copies:
+        for one, copy in zip(colours, copies, strict=True):
             # `image_field` leaves out a linear phase, by the band's first frequency.
             grid = one.scene.grid
             turn = sum(b * n / p for b, n, p in zip(grid.band, shift, grid.padded, strict=True))
-            amplitudes.append(complex(copy[i, j] * np.exp(-2j * np.pi * turn)))
-        reference = first.scene.bench.channels[0].wavelength_nm
-        path = _path_difference(amplitudes, [1e9 * one.scene.wavelength for one, _ in copies])
-        waves = path * (1e-9 / first.scene.wavelength - 1 / reference)
+            amplitudes.append(complex(copy[place] * np.exp(-2j * np.pi * turn)))
+        path = _path_difference(amplitudes, wavelengths_nm)
+        waves = path * (1 / wavelengths_nm[0] - 1 / first.bench.channels[0].wavelength_nm)
         at_reference = amplitudes[0] * np.exp(-2j * np.pi * waves)
         starts.append(
             {
@@ -216,8 +203,6 @@ def coherent_ghost_starts(evidence: Sequence[Evidence], most: int = 2) -> Starts
                 "path_difference": path,
             }
         )
-        for a, b in _near(i, j, size.shape):
-            size[a, b] = 0
     return starts
 
 
@@ -241,8 +226,6 @@ def _copies(one: Evidence) -> NDArray:
 
 def _path_difference(amplitudes: Sequence[complex], wavelengths_nm: Sequence[float]) -> float:
     """The path difference (nm) by which a copy's phases differ from the first colour's: of several, the least."""
-    if len(amplitudes) < 2:
-        return 0.0
     paths = np.arange(-PATH_REACH_NM, PATH_REACH_NM + 1, 10.0)
     fit = np.zeros(len(paths))
     for amplitude, wavelength in zip(amplitudes[1:], wavelengths_nm[1:], strict=True):
@@ -250,6 +233,18 @@ def _path_difference(amplitudes: Sequence[complex], wavelengths_nm: Sequence[flo
         fit += (np.conj(amplitude) * amplitudes[0] * turned).real
     alike = np.flatnonzero(fit >= fit.max() - 0.02 * abs(fit.max()))
     return float(paths[alike[np.abs(paths[alike]).argmin()]])
+
+
+def _peaks(size: NDArray, most: int) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
+    """The highest places of a periodic map away from its first sample, and the displacement of each; cleared."""
+    for place in _near(0, 0, size.shape):
+        size[place] = 0
+    for _ in range(most):
+        i, j = (int(n) for n in np.unravel_index(int(size.argmax()), size.shape))
+        dy, dx = (n - full if n > full / 2 else n for n, full in zip((i, j), size.shape, strict=True))
+        yield (i, j), (dy, dx)
+        for place in _near(i, j, size.shape):
+            size[place] = 0
 
 
 def _near(i: int, j: int, shape: tuple[int, ...]) -> list[tuple[int, int]]:

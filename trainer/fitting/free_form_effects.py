@@ -55,7 +55,7 @@ def with_free_form(
     fitted, stopping : sequence of Batch
         Captures for the gradient, and other captures that say when to stop and how fine the map is.
     enough : float
-        Excess from which on no finer map is tried.
+        Excess on `stopping` below which no finer map is tried.
 
     Returns
     -------
