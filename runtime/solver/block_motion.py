@@ -75,11 +75,15 @@ def block_motions(
     return motions[0], _parts(choice, motions, after.shape)
 
 
-def follow(phase: Array, found: Array, fresh: Array, part: Part) -> None:
-    """Fill a part of a phase [H, W] with a fresh start, and add what was found before if it moves by an even number."""
+def follow(phase: Array, found: Array, fresh: Array, part: Part, whole: tuple[int, int]) -> None:
+    """Fill a part of a phase [H, W] with a fresh start, and add what was found before if that fits its chequerboard.
+
+    The start's chequerboard has moved as the whole picture (down, right), so it fits what has moved by an even number
+    beside that.
+    """
     to = (part.rows, part.columns)
     phase[to] = fresh[to]
-    if part.motion is None or sum(part.motion) % 2:
+    if part.motion is None or (sum(part.motion) - sum(whole)) % 2:
         return
     spans = []
     for span, step, count in zip(to, part.motion, phase.shape, strict=True):

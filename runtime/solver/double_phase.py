@@ -23,7 +23,8 @@ LIT = 0.1  # of the amplitude of the brightest pixels
 EDGES = 3  # times as far in as the panel's end darkens an even image, edges of a frame get a new start
 TILT = 0.4  # of the way from the middle of the pupil's opening to its edge; less where that is beyond half of the band
 RISE = 8  # times as far as tilted light comes from the side: over this the tilt rises along an edge
-RISE_MOST = 0.3  # of the panel
+RISE_MOST = 0.3  # of the panel: at large distances the tilt rises over this
+RISE_LEAST = 3  # as RISE, of a still picture: a tilt that rises over less crowds the light, and there is none
 WIDE = 0.9  # of the panel's band: with a wider iris double phase errs by more than its edges
 
 
@@ -52,6 +53,8 @@ class Start:
         None where the start is not double phase, and where the iris is open (WIDE).
     edges : (int, int), pixels
         How far in that goes: rows, columns.
+    rising : (slice, slice)
+        Rows and columns over which the tilt rises.
     lit : bool array [H, W]
         Where the last double phase has so much amplitude that its phase means something.
     """
@@ -77,21 +80,47 @@ class Start:
         leak = self.optics.panel.leak
         self.unmodulated = None if leak is None else leak * self.over_source
         half_open = doubled and path.grid.band_share < WIDE
-        tilt = tilted(path) if half_open and planes == 1 else middle(path)
-        self.turned = [2 * math.pi * (np.cumsum(cycles) - cycles[0]) for cycles in tilt]
-        self.ramp = [np.exp(1j * turned).astype(pair) for turned in self.turned]
+        self.turned: list[np.ndarray] = []
+        self.ramp: list[np.ndarray] = []
+        self.rising = slice(0), slice(0)
         self.lift: Array = None
         self.edges = 0, 0
-        if half_open:
-            self._find_edges()
+        self.tilts: list[tuple[Any, ...]] = []
+        for least in (RISE_LEAST, RISE):
+            tilt = tilted(path, least) if half_open and planes == 1 else middle(path)
+            turned = [2 * math.pi * (np.cumsum(cycles) - cycles[0]) for cycles in tilt]
+            if self.tilts and all(map(np.array_equal, turned, self.turned)):
+                self.tilts *= 2
+                break
+            self.turned, self.ramp = turned, [np.exp(1j * one).astype(pair) for one in turned]
+            self.rising = _rising(tilt[0]), _rising(tilt[1])
+            self.lift = None
+            if half_open:
+                self._find_edges()
+            self.tilts.append((self.turned, self.ramp, self.rising, self.lift, self.edges))
 
-    def double_phase(self, amplitude: np.ndarray, phase: Array, others: Sequence[Array] = ()) -> None:
+    def tilt(self, moves: bool) -> None:
+        """Take the tilt for a still picture or for one that moves.
+
+        Where a tilt rises fast, a still picture gains most, and the frames of a video are farther from it.
+        """
+        self.turned, self.ramp, self.rising, self.lift, self.edges = self.tilts[moves]
+
+    def double_phase(
+        self,
+        amplitude: np.ndarray,
+        phase: Array,
+        others: Sequence[Array] = (),
+        moved: tuple[int, int] = (0, 0),
+    ) -> None:
         """Fill `phase` (rad) [H, W] with a pattern that shows an amplitude [H, W] at once, without iterations.
 
         The amplitude with flat phase goes back to the panel; there a pixel's complex amplitude a exp(j t),
         a <= 1, is the mean of exp(j (t + acos a)) and exp(j (t - acos a)), which alternate as on a chequerboard.
 
         Up to BOARDS - 1 `others` get patterns that show it as well and differ: their pixels alternate otherwise.
+
+        The chequerboard is `moved` by (down, right) pixels, except along the panel's edges.
 
         References
         ----------
@@ -118,9 +147,11 @@ class Start:
             odd = rows.start % 2
             half[odd::2, 1::2] *= -1
             half[1 - odd :: 2, ::2] *= -1
+            if sum(moved) % 2:
+                half[self._inside(rows)] *= -1
             angle_into(xp, here.imag, here.real, new, (one, two, part))
             for number, other in enumerate(others, 1):
-                other[rows] = new + self._alternating(number, rows) * half
+                other[rows] = new + self._alternating(number, rows, moved) * half
             new += half
 
         self.backend.over_rows(len(phase), self.objective.strip, work)
@@ -134,13 +165,26 @@ class Start:
         phase += down[:, None]
         phase += right
 
-    def _alternating(self, number: int, rows: slice) -> Array:
+    def _alternating(self, number: int, rows: slice, moved: tuple[int, int]) -> Array:
         """Signs of a pattern's pixels in these rows, over those of the first pattern's chequerboard."""
         xp, width = self.backend.xp, self.wave.shape[1]
+
+        def signs(y: Array, x: Array) -> Array:
+            board = y + x
+            along = (board, y + 0 * x, x + 0 * y, y // 2 + x)[number // 2]
+            return (1 - 2 * ((board + along + number) % 2)).astype(np.int8)
+
         y, x = xp.arange(rows.start, rows.stop)[:, None], xp.arange(width)
-        board = y + x
-        along = (board, y + 0 * x, x + 0 * y, y // 2 + x)[number // 2]
-        return (1 - 2 * ((board + along + number) % 2)).astype(np.int8)
+        found, inside = signs(y, x), self._inside(rows)
+        found[inside] = signs(y - moved[0], x - moved[1])[inside]
+        return found
+
+    def _inside(self, rows: slice) -> tuple[slice, slice]:
+        """The part of these rows that is not along the panel's edges, counted from the first of them."""
+        (edge, side), (height, width) = self.edges, self.wave.shape
+        first = max(edge, rows.start)
+        last = max(min(height - edge, rows.stop), first)
+        return slice(first - rows.start, last - rows.start), slice(side, width - side)
 
     def flat_phase(self, amplitude: np.ndarray, phase: Array) -> None:
         """Fill `phase` with that of the amplitude with flat phase, back at the panel; its amplitude there is lost.
@@ -204,16 +248,17 @@ def middle(path: LightPath) -> list[np.ndarray]:
     return [np.full(n, opening(path, axis)[0]) for axis, n in enumerate(path.grid.shape)]
 
 
-def tilted(path: LightPath) -> list[np.ndarray]:
+def tilted(path: LightPath, least: float) -> list[np.ndarray]:
     """Frequency of the light at each row and each column of an image that keeps more detail than one without a tilt.
 
     A picture's amplitude has frequencies of either sign, and those of one sign alone have all of its detail. So light
     whose middle frequency is aside of the middle of the pupil's opening carries more detail on that side. Without a
     tilt the descent does not find this: where the image's phase is flat, the gradient of what the pupil stops is zero.
 
-    Tilted light comes from the side: along the edge where that is beyond the panel's end, the tilt rises slowly. Where
-    that takes too much of the panel (RISE_MOST), as at large distances, there is none; and none for an opening off the
-    axis, whose pattern has a ramp that keeps the zero order out.
+    Tilted light comes from the side: along the edge where that is beyond the panel's end, the tilt rises slowly, over
+    as much of the panel as there is (RISE_MOST). Along an axis on which that is less than `least` times as far as the
+    light comes from, as at large distances, there is none; and none for an opening off the axis, whose pattern has a
+    ramp that keeps the zero order out.
 
     Returns
     -------
@@ -226,12 +271,18 @@ def tilted(path: LightPath) -> list[np.ndarray]:
         at, half_width = openings[axis]
         aside = TILT * max(min(half_width, 1 - 3 * half_width), 0.0)
         pixels = shift(path, axis, at + aside) - shift(path, axis, at)
-        rise = RISE * abs(pixels)
-        if rise > RISE_MOST * n or not on_axis:
+        rise = min(RISE * abs(pixels), RISE_MOST * n)
+        if rise < least * abs(pixels) or not on_axis:
             aside = 0.0
         along = np.clip(np.arange(n) / max(rise, 1.0), 0, 1)
         found.append(at + math.copysign(aside, pixels) * along**2 * (3 - 2 * along))
     return found
+
+
+def _rising(cycles: np.ndarray) -> slice:
+    """From the first to the last place at which a row of values changes; empty where it does not."""
+    places = np.flatnonzero(np.diff(cycles))
+    return slice(int(places[0]), int(places[-1]) + 2) if len(places) else slice(0)
 
 
 def opening(path: LightPath, axis: int) -> tuple[float, float]:

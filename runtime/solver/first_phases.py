@@ -49,8 +49,10 @@ class FirstPhases:
     ----------
     fits : bool
         Whether the last start was made for the picture that the solver has solved last.
-    aligned : bool
-        Whether the pattern stands on the same chequerboard as that start.
+    moved : (int, int), pixels
+        How far the pattern's content, and so its chequerboard, has moved since the first start: down, right.
+    moves : bool
+        Whether the light has the tilt of a picture that moves.
     """
 
     def __init__(
@@ -77,18 +79,27 @@ class FirstPhases:
         self.amplitude = np.zeros(self.shape, stacks[0][0].response.dtype)
         self.made = objective.backend.xp.zeros(objective.shape, stacks[0][0].response.dtype)
         self.on_fresh = objective.backend.xp.zeros_like(self.made[0])
-        self.fits, self.aligned = False, True
+        self.fits = False
+        self.moved = 0, 0
+        self.tilt(moves=False)
 
     def cold(self, targets: np.ndarray, phases: Array, soon: bool = False) -> None:
         """Fill `phases` (rad), a pattern each, from targets [C, K, H, W] alone, not from the picture before.
 
-        With `soon`, for few iterations.
+        With `soon`, for few iterations, and for a picture that will move.
         """
+        self.moved = 0, 0
+        self.tilt(moves=soon)
         self._make(targets, phases, soon)
         self.made[...] = phases
-        self.aligned = True
         # several patterns of a video are made `soon`, and others are not like them
         self.fits = soon or self.frames == 1
+
+    def tilt(self, moves: bool) -> None:
+        """Take the tilt of a still picture's light or of a moving one's, for the starts after this."""
+        self.moves = moves
+        for start in self.starts:
+            start.tilt(moves)
 
     def _make(self, targets: np.ndarray, phases: Array, soon: bool) -> None:
         for c, (drive, start) in enumerate(zip(self.drives, self.starts, strict=True)):
@@ -102,7 +113,7 @@ class FirstPhases:
             if network is None or network.corrects:
                 if drive.gapless:
                     alike = others[: BOARDS - 1] if soon and network is None else ()
-                    start.double_phase(self.amplitude, phase, alike)
+                    start.double_phase(self.amplitude, phase, alike, self.moved)
                 else:
                     start.flat_phase(self.amplitude, phase)
             if network is not None:
@@ -135,14 +146,17 @@ class FirstPhases:
     ) -> None:
         """Fill `phases` with those of the frame before, moved as its content has moved.
 
-        A pattern is a start, double phase, and what the descent has found since. Double phase stands on a chequerboard.
-        Moved by an even number of pixels it stays on it: then what was found moves to the new frame's start. Where that
-        is dark its phase means nothing and changes from frame to frame, so there the pattern itself moves. Along the
-        edges what was found stays in its place, as it compensates for the panel's end. Moved by an odd number, or where
-        the edges do not count, the pattern itself moves, with its chequerboard, except along the edges.
+        A pattern is a start, double phase, and what the descent has found since. Double phase stands on a chequerboard,
+        which moves with the content. So what was found moves to the new frame's start, on the moved chequerboard. Where
+        that start is dark its phase means nothing and changes from frame to frame, so there the pattern itself moves,
+        and where the edges do not count it does so everywhere. Along the edges what was found stays in its place, as it
+        compensates for the panel's end, and so does the chequerboard.
 
-        Patterns on different chequerboards do not go together. So parts that move by themselves follow only by even
-        numbers and begin anew otherwise, and where the whole is off the chequerboard, all begins anew.
+        Where the tilt of the light rises, the content of a pattern that moves as it is comes to a wrong place, as the
+        tilt stays. So there what was found moves to the new start, also where the edges do not count.
+
+        Patterns on different chequerboards do not go together. So parts that move by themselves follow only by an even
+        number beside the whole, and begin anew otherwise.
 
         Parameters
         ----------
@@ -163,7 +177,7 @@ class FirstPhases:
             phases[...] = before
             self.fits = self.fits and still
             return
-        even = sum(motion) % 2 == 0
+        self.moved = self.moved[0] + motion[0], self.moved[1] + motion[1]
         self._make(targets, room, soon=True)
         self.made *= -1
         self.made += before  # what the descent has found since the start
@@ -171,22 +185,27 @@ class FirstPhases:
             drive, start = self.drives[n // self.frames], self.starts[n // self.frames]
             edges = start.edges
             adds = self.fits and not drive.bounded  # the sum may lie out of a bounded panel's range
-            if parts and not (adds and even and self.aligned):
+            if parts and not adds:
                 phase[...] = fresh
                 continue
             shifted(before[n], motion, phase)
             start.retilt(motion, phase)
-            if adds and even and (parts or self.edges_count):
+            down, right = start.rising
+            rising = [(down, slice(None))] * bool(motion[0]) + [(slice(None), right)] * bool(motion[1])
+            if adds:
                 shifted(found, motion, self.on_fresh)
                 self.on_fresh += fresh
-                self.backend.xp.copyto(phase, self.on_fresh, where=start.lit)
+                for part in [...] if parts or self.edges_count else rising:
+                    self.backend.xp.copyto(phase[part], self.on_fresh[part], where=start.lit[part])
+            elif not self.fits:
+                for part in rising:
+                    phase[part] = fresh[part]
             for one in parts:
-                follow(phase, found, fresh, one)
+                follow(phase, found, fresh, one, motion)
             near = all(2 * abs(step) <= edge for step, edge in zip(motion, edges, strict=True))
             for part in renewed(motion, edges, self.shape) if any(motion) else ():
                 phase[part] = fresh[part]
                 if adds and near:
                     phase[part] += found[part]
-        self.aligned = bool(parts) or self.aligned == even
         self.made[...] = room
         self.fits = True

@@ -196,6 +196,7 @@ class Solver:
             self.first.cold(optics_targets, phase)
         else:
             phase[...] = self.on.xp.asarray(np.reshape(start, phase.shape))
+            self.first.tilt(moves=False)
             self.first.fits = self.first.fits and self._is_still(targets)
         return self._improve(targets, begun, iterations, deadline_ms, progress)
 
@@ -246,7 +247,7 @@ class Solver:
         """
         targets = self._checked(np.ones(self.shape) if target is None else target)
         before, best, follows = self.before.copy(), self.best.copy(), self.follows
-        least = list(self.objective.least)
+        least, moves = list(self.objective.least), self.first.moves
         for _ in range(2):  # the first touches memory for the first time and is not counted
             self.begin, self.step, self.finish = Pace(), Pace(), Pace()
             begun = time.perf_counter()
@@ -255,6 +256,7 @@ class Solver:
             solution = self._improve(targets, begun, 3, None, None)
         self.before, self.best[...], self.follows = before, best, follows
         self.objective.least = least
+        self.first.tilt(moves)
         self.first.fits = False
         return solution
 

@@ -73,14 +73,17 @@ def test_what_was_not_there_is_new() -> None:
 def test_what_was_found_follows_a_part_by_even_numbers_and_where_it_was_before() -> None:
     found, fresh = np.random.default_rng(3).random((2, 40, 50))
     phase = np.zeros((40, 50))
-    follow(phase, found, fresh, Part(slice(0, 16), slice(32, 50), (5, -3)))
+    follow(phase, found, fresh, Part(slice(0, 16), slice(32, 50), (5, -3)), (0, 0))
     np.testing.assert_array_equal(phase[5:16, 32:47], fresh[5:16, 32:47] + found[0:11, 35:50])
     np.testing.assert_array_equal(phase[:5, 32:], fresh[:5, 32:])
     np.testing.assert_array_equal(phase[5:16, 47:], fresh[5:16, 47:])
     assert not phase[16:].any() and not phase[:, :32].any()
     for motion in ((40, 0), (2, 1), None):  # from beyond the panel, off the chequerboard, new
-        follow(phase, found, fresh, Part(slice(16, 32), slice(0, 16), motion))
+        follow(phase, found, fresh, Part(slice(16, 32), slice(0, 16), motion), (0, 0))
         np.testing.assert_array_equal(phase[16:32, :16], fresh[16:32, :16])
+    # the chequerboard of the start has moved with the whole
+    follow(phase, found, fresh, Part(slice(16, 32), slice(4, 16), (2, 1)), (1, 0))
+    np.testing.assert_array_equal(phase[16:32, 4:16], fresh[16:32, 4:16] + found[14:30, 3:15])
 
 
 @pytest.mark.parametrize(("background", "thing"), [((0, 0), (2, 5)), ((1, -3), (2, 4))])
