@@ -214,7 +214,7 @@ def _convergence(
 
 
 def _video(path: LightPath) -> dict[str, Any]:
-    """A moving picture: one warm iteration for each frame against ten cold ones, with and without a border."""
+    """A moving picture: one warm iteration for each frame against ten of a cold one, with and without a border."""
     height, width = path.grid.shape
     whole = picture(PICTURES[0], (height + FRAMES * STEP[0], width + FRAMES * STEP[1]))
     border = BORDER * height // SHAPES[0][0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,32 @@ RISE_LEAST = 3  # as RISE, of a still picture: a tilt that rises over less crowd
 WIDE = 0.9  # of the panel's band: with a wider iris double phase errs by more than its edges
 
 
+@dataclass(frozen=True)
+class Tilt:
+    """How the light in an image is tilted, and what the panel's end does to it.
+
+    Attributes
+    ----------
+    turned : list of float array [H], [W], rad
+        Phase of the light in the image, of rows and of columns (see `tilted`).
+    ramp : list of complex array [H], [W]
+        The same, as factors.
+    rising : (slice, slice)
+        Rows and columns over which the tilt rises.
+    lift : float array [H, W] or None
+        What an amplitude is multiplied by: the panel ends, so the edges of an image get only part of their light.
+        None where the start is not double phase, and where the iris is open (WIDE).
+    edges : (int, int), pixels
+        How far in that goes: rows, columns.
+    """
+
+    turned: list[np.ndarray]
+    ramp: list[np.ndarray]
+    rising: tuple[slice, slice]
+    lift: Array = None
+    edges: tuple[int, int] = (0, 0)
+
+
 class Start:
     """First phases for one colour of an objective, in place.
 
@@ -44,17 +71,10 @@ class Start:
 
     Attributes
     ----------
-    turned : list of float array [H], [W], rad
-        Phase of the light in the image, of rows and of columns (see `tilted`).
-    ramp : list of complex array [H], [W]
-        The same, as factors.
-    lift : float array [H, W] or None
-        What an amplitude is multiplied by: the panel ends, so the edges of an image get only part of their light.
-        None where the start is not double phase, and where the iris is open (WIDE).
-    edges : (int, int), pixels
-        How far in that goes: rows, columns.
-    rising : (slice, slice)
-        Rows and columns over which the tilt rises.
+    still, moving : Tilt
+        The light in the image of a still picture and of one that moves; the same one where there is no difference.
+    light : Tilt
+        Which of them starts have now.
     lit : bool array [H, W]
         Where the last double phase has so much amplitude that its phase means something.
     """
@@ -80,31 +100,20 @@ class Start:
         leak = self.optics.panel.leak
         self.unmodulated = None if leak is None else leak * self.over_source
         half_open = doubled and path.grid.band_share < WIDE
-        self.turned: list[np.ndarray] = []
-        self.ramp: list[np.ndarray] = []
-        self.rising = slice(0), slice(0)
-        self.lift: Array = None
-        self.edges = 0, 0
-        self.tilts: list[tuple[Any, ...]] = []
-        for least in (RISE_LEAST, RISE):
-            tilt = tilted(path, least) if half_open and planes == 1 else middle(path)
-            turned = [2 * math.pi * (np.cumsum(cycles) - cycles[0]) for cycles in tilt]
-            if self.tilts and all(map(np.array_equal, turned, self.turned)):
-                self.tilts *= 2
-                break
-            self.turned, self.ramp = turned, [np.exp(1j * one).astype(pair) for one in turned]
-            self.rising = _rising(tilt[0]), _rising(tilt[1])
-            self.lift = None
-            if half_open:
-                self._find_edges()
-            self.tilts.append((self.turned, self.ramp, self.rising, self.lift, self.edges))
+        tilts = [
+            tilted(path, least) if half_open and planes == 1 else middle(path) for least in (RISE_LEAST, RISE)
+        ]
+        self.still = self.moving = self._tilt(tilts[0], half_open)
+        if not all(map(np.array_equal, *tilts)):
+            self.moving = self._tilt(tilts[1], half_open)
+        self.light = self.still
 
     def tilt(self, moves: bool) -> None:
         """Take the tilt for a still picture or for one that moves.
 
         Where a tilt rises fast, a still picture gains most, and the frames of a video are farther from it.
         """
-        self.turned, self.ramp, self.rising, self.lift, self.edges = self.tilts[moves]
+        self.light = self.moving if moves else self.still
 
     def double_phase(
         self,
@@ -126,7 +135,7 @@ class Start:
         ----------
         Hsueh and Sawchuk 1978; Maimone et al. 2017.
         """
-        self._wave(amplitude)
+        self._wave(amplitude, self.light)
         xp, wave = self.backend.xp, self.wave
         some = xp.abs(wave[::SAMPLED, ::SAMPLED]).ravel()
         rank = min(some.size - 1, int(LOUD * some.size))
@@ -160,7 +169,7 @@ class Start:
         """Give a pattern's phase (rad) [H, W] that has been moved (down, right) the tilt of its new place."""
         down, right = (
             self.backend.xp.asarray((turned - np.roll(turned, step)).astype(phase.dtype))
-            for turned, step in zip(self.turned, motion, strict=True)
+            for turned, step in zip(self.light.turned, motion, strict=True)
         )
         phase += down[:, None]
         phase += right
@@ -181,7 +190,7 @@ class Start:
 
     def _inside(self, rows: slice) -> tuple[slice, slice]:
         """The part of these rows that is not along the panel's edges, counted from the first of them."""
-        (edge, side), (height, width) = self.edges, self.wave.shape
+        (edge, side), (height, width) = self.light.edges, self.wave.shape
         first = max(edge, rows.start)
         last = max(min(height - edge, rows.stop), first)
         return slice(first - rows.start, last - rows.start), slice(side, width - side)
@@ -191,7 +200,7 @@ class Start:
 
         A better start than double phase where the panel does not reach a whole turn.
         """
-        self._wave(amplitude)
+        self._wave(amplitude, self.light)
         xp, wave = self.backend.xp, self.wave
 
         def work(worker: int, rows: slice) -> None:
@@ -200,13 +209,23 @@ class Start:
 
         self.backend.over_rows(len(phase), self.objective.strip, work)
 
-    def _find_edges(self) -> None:
-        """Find `lift` and `edges` from an even image that goes back to the panel and forward again.
+    def _tilt(self, cycles: list[np.ndarray], half_open: bool) -> Tilt:
+        """The tilt of light with these frequencies, cycles a pixel, at each row and each column of the image."""
+        turned = [2 * math.pi * (np.cumsum(along) - along[0]) for along in cycles]
+        ramp = [np.exp(1j * one).astype(self.wave.dtype) for one in turned]
+        tilt = Tilt(turned, ramp, (_rising(cycles[0]), _rising(cycles[1])))
+        if not half_open:
+            return tilt
+        lift, edges = self._ends(tilt)
+        return replace(tilt, lift=lift, edges=edges)
+
+    def _ends(self, tilt: Tilt) -> tuple[Array, tuple[int, int]]:
+        """`lift` and `edges` of a tilt, from an even image that goes back to the panel and forward again.
 
         The field that goes forward is complex: the mean of the fields of the two phases that double phase is made of.
         """
         xp, optics, wave = self.backend.xp, self.optics, self.wave
-        self._wave(np.ones(wave.shape, np.float32))
+        self._wave(np.ones(wave.shape, np.float32), tilt)
         size, angle = xp.abs(wave), xp.arctan2(wave.imag, wave.real)
         size /= size.max()
         xp.arccos(size, out=size)
@@ -219,18 +238,18 @@ class Start:
         reached /= max(float(xp.median(reached[::SAMPLED, ::SAMPLED])), 1e-30)
         down, across = (n // 2 for n in wave.shape)
         whole = (int(xp.argmax(along >= 1)) for along in (reached[:, across], reached[down]))
-        self.edges = tuple(min(EDGES * n, middle) for n, middle in zip(whole, (down, across), strict=True))
+        rows, columns = (min(EDGES * n, middle) for n, middle in zip(whole, (down, across), strict=True))
         xp.clip(reached, FAINTEST, 1 / FAINTEST, out=reached)
-        self.lift = 1 / reached
+        return 1 / reached, (rows, columns)
 
-    def _wave(self, amplitude: np.ndarray) -> None:
+    def _wave(self, amplitude: np.ndarray, light: Tilt) -> None:
         """Fill `wave` with the factor on the beam that each pixel would need, of any scale."""
         xp, wave, over = self.backend.xp, self.wave, self.over_source
-        given, lift = xp.asarray(amplitude), self.lift
+        given, lift = xp.asarray(amplitude), light.lift
 
         def tilt(worker: int, rows: slice) -> None:
-            xp.multiply(given[rows], self.ramp[0][rows, None], out=wave[rows])
-            wave[rows] *= self.ramp[1]
+            xp.multiply(given[rows], light.ramp[0][rows, None], out=wave[rows])
+            wave[rows] *= light.ramp[1]
             if lift is not None:
                 wave[rows] *= lift[rows]
 

@@ -183,14 +183,14 @@ class FirstPhases:
         self.made += before  # what the descent has found since the start
         for n, (phase, fresh, found) in enumerate(zip(phases, room, self.made, strict=True)):
             drive, start = self.drives[n // self.frames], self.starts[n // self.frames]
-            edges = start.edges
+            edges = start.light.edges
             adds = self.fits and not drive.bounded  # the sum may lie out of a bounded panel's range
             if parts and not adds:
                 phase[...] = fresh
                 continue
             shifted(before[n], motion, phase)
             start.retilt(motion, phase)
-            down, right = start.rising
+            down, right = start.light.rising
             rising = [(down, slice(None))] * bool(motion[0]) + [(slice(None), right)] * bool(motion[1])
             if adds:
                 shifted(found, motion, self.on_fresh)

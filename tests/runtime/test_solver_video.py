@@ -137,7 +137,7 @@ def test_double_phase_moves_with_its_chequerboard() -> None:
     shape, motion = (160, 200), (1, 2)
     start = Solver(ideal_path(shape, 0.03, 0.5, np.float32)).first.starts[0]
     start.tilt(moves=True)
-    assert not any(turned.any() for turned in start.turned)
+    assert not any(turned.any() for turned in start.light.turned)
     whole = np.sqrt(scene((shape[0] + 10, shape[1] + 10), 7)).astype(np.float32)
     before, after, old = (np.zeros(shape, np.float32) for _ in range(3))
     start.double_phase(np.ascontiguousarray(whole[1 : 1 + shape[0], 2 : 2 + shape[1]]), before)
