@@ -25,8 +25,8 @@ wavelength_nm = 520
 [propagation]
 distance_mm = {distance_mm}
 [iris]
-shape = "square"
-half_width = 1.0
+shape = "{iris[0]}"
+half_width = {iris[1]}
 [camera]
 width = {width}
 height = {height}
@@ -44,11 +44,16 @@ LARGER = {"width": 160, "height": 128, "distance_mm": 15}
 
 
 def bench_file(
-    folder: Path, *defects: str, width: int = 96, height: int = 80, distance_mm: float = 9
+    folder: Path,
+    *defects: str,
+    width: int = 96,
+    height: int = 80,
+    distance_mm: float = 9,
+    iris: tuple[str, float] = ("square", 1.0),
 ) -> Path:
     """A virtual bench's TOML file with defects given as TOML lines after [[defect]]."""
     path = folder / "bench-with-secrets.toml"
-    text = BENCH.format(width=width, height=height, distance_mm=distance_mm)
+    text = BENCH.format(width=width, height=height, distance_mm=distance_mm, iris=iris)
     path.write_text(text + "".join(f"\n[[defect]]\n{d}\n" for d in defects))
     return path
 

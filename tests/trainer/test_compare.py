@@ -13,6 +13,7 @@ from scipy.ndimage import gaussian_filter
 
 from firmware_iface.errors import InputError
 from runtime.excess import joined
+from tests.trainer.hidden import LARGER, captured, ran
 from tests.trainer.made_sets import write_captures
 from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet, read_captures
@@ -259,3 +260,8 @@ def test_pictures_show_every_colour_first(result: Comparison) -> None:
     for p in pictures:
         assert p.measured.shape == p.predicted.shape == (HEIGHT, WIDTH)
         np.testing.assert_allclose(p.difference, p.measured - p.predicted, atol=1e-3)
+
+
+def test_a_round_iris_that_the_bench_file_states_is_in_the_model(tmp_path, capsys) -> None:
+    captures = captured(capsys, tmp_path, options=("--patterns", 6), iris=("circle", 0.7), **LARGER)
+    assert ran(capsys, "compare", captures)["heldout"]["excess"] < 0.0005

@@ -28,7 +28,7 @@ from trainer.prediction.stages import Sensor
             high=20,
             even=True,
             starts=(0.3, 0.8),
-            about="of the motion during a usual exposure; each capture has its own, up to twice as much",
+            about="of the motion during a usual exposure; each capture has its own",
             typical=(0, 3),
             example=1.2,
         ),

@@ -12,7 +12,8 @@ from trainer.prediction.stages import Sensor
 
 STEPS = 3  # of Gauss-Newton; displacements are a small part of a speckle
 MOST = 1.0  # panel pixels that one step may move
-MOST_BLUR, TRIED_BLURS = 2.1, 8  # widest blur of a capture over the usual one, and widths that are tried
+BLUR_STEP, TRIED_BLURS = 0.3, 8  # between widths that are tried, as shares of the usual one; how many at once
+WIDEST_BLURS = 4  # times as many are tried where the widest of them fits best
 
 
 def displaced_spectrum(
@@ -53,21 +54,23 @@ def blurred_spectrum(
     assert blur is not None
     with torch.no_grad():
         observed, weight = _flat(sensor, measured)
-        ratio = torch.linspace(0, MOST_BLUR, TRIED_BLURS, dtype=sensor.iy.dtype)
-        scores = []
-        for r in ratio:
-            picture = _on_sensor(sensor, read(spectrum * blur(r**2))).flatten(1).double()
-            # With the best brightness, the misfit falls by (m . p)^2 / (p . p).
-            power = (weight * picture**2).sum(1).clamp(min=1e-30)
-            scores.append((weight * picture * observed).sum(1) ** 2 / power)
-        score = torch.stack(scores, 1)
-        best = score.argmax(1).clamp(1, TRIED_BLURS - 2)
+        scores: list[Tensor] = []
+        while len(scores) < WIDEST_BLURS * TRIED_BLURS:
+            for _ in range(TRIED_BLURS):
+                ratio = torch.tensor(BLUR_STEP * len(scores), dtype=sensor.iy.dtype)
+                picture = _on_sensor(sensor, read(spectrum * blur(ratio**2))).flatten(1).double()
+                # With the best brightness, the misfit falls by (m . p)^2 / (p . p).
+                power = (weight * picture**2).sum(1).clamp(min=1e-30)
+                scores.append((weight * picture * observed).sum(1) ** 2 / power)
+            score = torch.stack(scores, 1)
+            if bool((score.argmax(1) < len(scores) - 1).all()):
+                break
+        best = score.argmax(1).clamp(1, len(scores) - 2)
         before, here, after = (score.gather(1, best[:, None] + k)[:, 0] for k in (-1, 0, 1))
         bend = before - 2 * here + after
         part = torch.where(bend < 0, 0.5 * (before - after) / torch.where(bend < 0, bend, -1.0), 0.0)
         part = torch.where(bend < 0, part, torch.sign(after - before))
-        step = MOST_BLUR / (TRIED_BLURS - 1)
-        amount = ((best + part.clamp(-1, 1)).to(ratio.dtype) * step) ** 2
+        amount = ((best + part.clamp(-1, 1)).to(ratio.dtype) * BLUR_STEP) ** 2
     return spectrum * torch.stack([blur(a) for a in amount])
 
 

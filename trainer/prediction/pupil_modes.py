@@ -106,8 +106,8 @@ def iris_opening(scene: Scene, pupil: Pupil) -> Tensor:
     """What the iris passes of each frequency.
 
     A frequency sample passes by the share of its width that lies inside. So the iris's size and place have gradients,
-    and the result does not depend on the padding. The edge lies half a frequency sample of the doubled panel,
-    1 / (4 N pitch), beyond the nominal one: a frequency on the edge passes.
+    and the result does not depend on the padding. A rectangle's edge lies half a frequency sample of the doubled
+    panel, 1 / (4 N pitch), beyond the nominal one: a frequency on the edge passes. A round edge lies between samples.
 
     Returns
     -------
@@ -115,7 +115,7 @@ def iris_opening(scene: Scene, pupil: Pupil) -> Tensor:
         0 to 1.
     """
     panel = scene.bench.panel.shape
-    beyond = [1 / (2 * n) for n in panel]  # share of the band
+    beyond = [(1 - pupil.roundness) / (2 * n) for n in panel]  # share of the band
     bins = [2 / n for n in scene.grid.padded]  # width of a frequency sample, share of the band
     v, u = pupil.v - pupil.centre[0], pupil.u - pupil.centre[1]
     rows = pupil.half_width * (1 - pupil.stretch) + beyond[0]
