@@ -47,7 +47,7 @@ class PropagationDescription:
 
 @dataclass(frozen=True)
 class IrisDescription:
-    """The filter in the Fourier plane; both edges pass."""
+    """The filter in the Fourier plane; what lies on the edges of a square passes."""
 
     shape: str = parameter("square", "outline", choices=("square", "circle"))
     half_width: float = parameter(1.0, "share of the panel's band 1 / (2 pitch)", 0.02, 2)

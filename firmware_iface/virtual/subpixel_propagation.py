@@ -74,15 +74,16 @@ class Band:
     border_px : float, pixels
         Least number of empty pixels added to each axis.
     half_band : float
-        The band's half width, cycles a pixel (0.5 is the panel's own); its edges are included.
+        The band's half width, cycles a pixel (0.5 is the panel's own); frequencies that its edges cut are included.
     """
 
     def __init__(self, shape: tuple[int, int], q: int, border_px: float, half_band: float) -> None:
         self.shape, self.q = shape, q
         self.padded = tuple(smooth_size(int(np.ceil(n + border_px))) for n in shape)
-        self.reach = tuple(min(int(np.floor(half_band * n * (1 + 1e-9))), q * n // 2) for n in self.padded)
+        self.reach = tuple(min(int(np.floor(half_band * n + 0.5)), q * n // 2) for n in self.padded)
         # irradiance has twice the field's bandwidth: two samples a pixel hold the panel's own band
-        self.oversampling = max(2, int(np.ceil(4 * half_band * (1 - 1e-9))))
+        widest = max(k / n for k, n in zip(self.reach, self.padded, strict=True))
+        self.oversampling = max(2, int(np.ceil(4 * widest * (1 - 1e-9))))
         self.fy, self.fx = (np.arange(-k, k + 1) / n for k, n in zip(self.reach, self.padded, strict=True))
         self._env_y, self._env_x = (self._envelope(f) for f in (self.fy, self.fx))
         bins = [np.arange(-k, k + 1) for k in self.reach]

@@ -262,6 +262,7 @@ def test_pictures_show_every_colour_first(result: Comparison) -> None:
         np.testing.assert_allclose(p.difference, p.measured - p.predicted, atol=1e-3)
 
 
-def test_a_round_iris_that_the_bench_file_states_is_in_the_model(tmp_path, capsys) -> None:
-    captures = captured(capsys, tmp_path, options=("--patterns", 6), iris=("circle", 0.7), **LARGER)
+@pytest.mark.parametrize("iris", [("circle", 0.7), ("square", 0.837)])
+def test_an_iris_that_the_bench_file_states_is_in_the_model(iris, tmp_path, capsys) -> None:
+    captures = captured(capsys, tmp_path, options=("--patterns", 6), iris=iris, **LARGER)
     assert ran(capsys, "compare", captures)["heldout"]["excess"] < 0.0005
