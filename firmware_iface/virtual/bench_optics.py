@@ -33,6 +33,8 @@ Single = NDArray[np.float32]
 Complex = NDArray[np.complex64]
 Pullback = Callable[[Single], NDArray[np.float64]]
 
+FIGURE_PERIODS = 24  # of the highest frequency that passes, as border for the tails of the iris's own figure
+
 
 @dataclass(frozen=True)
 class SpectralLine:
@@ -66,6 +68,7 @@ class OpticalPath:
         ghost = bench.defect(CoherentGhost)
         q, pitch = bench.simulation.subpixels, bench.panel.pitch_um
         border = 16 + bench.simulation.padding * walk_px(wavelength, pitch, distance, half_band)
+        border = max(border, FIGURE_PERIODS / half_band)
         if ghost:
             border += max(abs(ghost.shift_y_px), abs(ghost.shift_x_px))
         self.band = Band((bench.panel.height, bench.panel.width), q, border, half_band)

@@ -89,10 +89,23 @@ def _blocks(height: int, width: int, multiple: int = 1) -> Iterator[slice]:
 
 
 def active_area(fill_factor: float, q: int) -> Array:
-    """Share of each sub-pixel's area that is active, [q, q]: a centred square of side sqrt(fill_factor)."""
+    """Share of each sub-pixel's area that is active, [q, q]: a centred square of side sqrt(fill_factor).
+
+    A sub-pixel that the square's edge cuts lights up as a whole, so the square would come out too wide (of a fill
+    factor of 0.7, 0.006 of the picture's variance with four sub-pixels). These weights leave its second moment right,
+    too, and so its diffraction within the panel's band (0.00003). Sub-pixels in the middle have a little more than 1.
+    """
     side = np.sqrt(fill_factor)
     edges = np.linspace(-0.5, 0.5, q + 1)
     covered = np.clip(np.minimum(edges[1:], side / 2) - np.maximum(edges[:-1], -side / 2), 0, None) * q
+    square = ((edges[1:] + edges[:-1]) / 2) ** 2
+    if (
+        fill_factor < 1 and np.ptp(square[covered > 0]) > 1e-9
+    ):  # not where all centres are as far from the middle
+        moments = np.array([covered, covered * square]) @ np.array([np.ones(q), square]).T
+        wanted = q * side * np.array([1, side**2 / 12 - 1 / (12 * q**2)])
+        constant, bend = np.linalg.solve(moments, wanted)
+        covered = covered * (constant + bend * square)
     return covered[:, None] * covered[None, :]
 
 

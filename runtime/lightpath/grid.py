@@ -73,7 +73,8 @@ def grid_for(
     A ray at the edge of the iris moves sideways by lambda z half_width / (2 pitch) on its way. Six tenths more
     hold the tails of the aperture's own diffraction. (On a 240 x 320 panel at 30 mm the ideal model's held-out
     excess is 2.6e-4, 1.7e-4, 1.2e-4 and 0.9e-4 at 1.1, 1.25, 1.4 and 1.6 times that distance. 1.1 would be enough
-    for a solver alone: 0.01 dB less at 540 x 960. It would not be enough for calibration.)
+    for a solver alone: 0.01 dB less at 540 x 960. It would not be enough for calibration.) Near the panel, the tails of
+    the iris's own figure matter more, and these are the wider the smaller the iris is.
 
     Parameters
     ----------
@@ -89,11 +90,19 @@ def grid_for(
     Grid
     """
     walk = wavelength * abs(distance) * half_width / (2 * pitch**2)
-    room = max(math.ceil(1.6 * walk), 2 * margin)
+    room = math.ceil(max(1.6 * walk, 2 * margin / min(half_width, 1)))
     rows, columns = (_even_fast_size(n + room) for n in shape)
-    # One bin more than the iris, so that an edge bin always passes whole.
-    band = tuple(min(math.ceil(half_width * n / 2), n - 1) for n in (rows, columns))
+    band = tuple(_band_edge(half_width, n, padded) for n, padded in zip(shape, (rows, columns), strict=True))
     return Grid(shape, (rows, columns), margin, (band[0], band[1]), pitch)
+
+
+def _band_edge(half_width: float, count: int, padded: int) -> int:
+    """The highest frequency index of which the iris passes a part.
+
+    Its edge may lie half a frequency sample of the doubled panel beyond the nominal one, as frequencies on it pass.
+    """
+    edge = half_width * padded / 2 + max(padded / (4 * count) - 0.5, 0.0)
+    return min(math.ceil(edge), padded // 2 if half_width <= 1 else padded - 1)
 
 
 def band_frequencies(grid: Grid, like: Array) -> tuple[Array, Array]:

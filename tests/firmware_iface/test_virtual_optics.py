@@ -104,6 +104,21 @@ def test_the_number_of_sub_pixels_does_not_matter_without_sub_pixel_structure():
     np.testing.assert_allclose(coarse, fine, atol=2e-5)
 
 
+@pytest.mark.parametrize("fill_factor", [0.9, 0.7, 0.4])
+def test_dead_space_is_as_wide_whatever_the_number_of_sub_pixels(fill_factor):
+    gray = random_gray(5)
+    bench = small()
+    panel = replace(bench.panel, fill_factor=fill_factor)
+    coarse, fine = (
+        VirtualHeadset(
+            replace(bench, panel=panel, simulation=SimulationDescription(subpixels=q))
+        ).true_irradiance(gray, "green")
+        for q in (4, 16)
+    )
+    # Weighted by the covered area alone, these would be 0.0007, 0.0064 and 0.0086.
+    assert np.mean((coarse - fine) ** 2) < 0.0001 * fine.var()
+
+
 def test_iris_edges_pass_and_an_offset_moves_the_window():
     bench = small(make_defect("iris", half_width=0.5, centre_x_share=0.25, centre_y_share=0))
     optics = BenchOptics(bench)

@@ -41,6 +41,8 @@ def random_path(
 ) -> LightPath:
     """All that a path may have at once, with three modes and two states, without what `without` names."""
     rng = np.random.default_rng(3)
+    # Drawn first: whatever the grid, the panel's phases then lie as far from the kinks of the modulation's curves.
+    crosstalk = (_taps(rng, 3, 5), _taps(rng, 2, 3))
     path = ideal_path(shape, 0.005, half_width)
     grid = path.grid
 
@@ -54,7 +56,7 @@ def random_path(
         leak=0.2 * noise(*shape),
         transfers=path.transfers * (1 + 0.3 * noise(3, *path.transfers.shape[1:])),
         weights=np.array([0.5, 0.3, 0.2]),
-        crosstalk=(_taps(rng, 3, 5), _taps(rng, 2, 3)),
+        crosstalk=crosstalk,
         aperture=(0.9, 0.8),
         irradiance_filter=np.fft.rfft2(rng.normal(size=grid.image_shape) / grid.image_shape[0]),
         modulation=_modulation(),

@@ -18,7 +18,7 @@ width = {width}
 height = {height}
 pitch_um = 8
 levels = 256
-fill_factor = 1.0
+fill_factor = {fill_factor}
 [[channel]]
 name = "green"
 wavelength_nm = 520
@@ -50,10 +50,13 @@ def bench_file(
     height: int = 80,
     distance_mm: float = 9,
     iris: tuple[str, float] = ("square", 1.0),
+    fill_factor: float = 1.0,
 ) -> Path:
     """A virtual bench's TOML file with defects given as TOML lines after [[defect]]."""
     path = folder / "bench-with-secrets.toml"
-    text = BENCH.format(width=width, height=height, distance_mm=distance_mm, iris=iris)
+    text = BENCH.format(
+        width=width, height=height, distance_mm=distance_mm, iris=iris, fill_factor=fill_factor
+    )
     path.write_text(text + "".join(f"\n[[defect]]\n{d}\n" for d in defects))
     return path
 

@@ -22,8 +22,10 @@ from trainer.prediction.predict import light_on_camera, light_path, trace
 def bench(side: int, distance_mm: float) -> Bench:
     import tomllib
 
-    tables = tomllib.loads("schema = 1\n" + BENCH.format(width=side, height=side, distance_mm=distance_mm))
-    return read_bench(tables)
+    text = BENCH.format(
+        width=side, height=side, distance_mm=distance_mm, iris=("square", 1.0), fill_factor=1.0
+    )
+    return read_bench(tomllib.loads("schema = 1\n" + text))
 
 
 def seen(model: Model, gray: np.ndarray) -> torch.Tensor:
