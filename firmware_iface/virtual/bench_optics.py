@@ -33,7 +33,9 @@ Single = NDArray[np.float32]
 Complex = NDArray[np.complex64]
 Pullback = Callable[[Single], NDArray[np.float64]]
 
-FIGURE_PERIODS = 24  # of the highest frequency that passes, as border for the tails of the iris's own figure
+# The tails of the iris's own figure need more border the smaller it is: so many periods of the highest frequency that
+# passes, beyond those of an open iris.
+FIGURE_PERIODS = 24
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ class OpticalPath:
         ghost = bench.defect(CoherentGhost)
         q, pitch = bench.simulation.subpixels, bench.panel.pitch_um
         border = 16 + bench.simulation.padding * walk_px(wavelength, pitch, distance, half_band)
-        border = max(border, FIGURE_PERIODS / half_band)
+        border += max(FIGURE_PERIODS * (1 / half_band - 2), 0.0)
         if ghost:
             border += max(abs(ghost.shift_y_px), abs(ghost.shift_x_px))
         self.band = Band((bench.panel.height, bench.panel.width), q, border, half_band)
