@@ -18,6 +18,7 @@ from trainer.model.model import EffectInstance, Model, raised
 POLYNOMIALS = 6
 SEARCH_PIXELS = 2 * 240 * 320  # of a scene, at least one capture: a pattern search need only come near
 SEARCH_SCENES = 3
+RUGGED_STEPS = 3  # times as many: an iris's edge goes one frequency sample a step
 # Of the excess that an order must remove: where a straight line expects less, it is not fitted.
 LEAST_EXPECTED = 0.5
 # Orders are raised at once where each expects this share of what the one that expects most does: what others expect may
@@ -33,8 +34,9 @@ def settled(model: Model, batches: Sequence[Batch]) -> FitResult:
 def fit_from(
     model: Model, start: EffectInstance, batches: Sequence[Batch], iterations: int = 12
 ) -> FitResult:
-    """Fit one effect from a start; where derivatives do not reach far, after a pattern search."""
+    """Fit one effect from a start; where derivatives do not reach far, after a pattern search and in more steps."""
     if start.effect.rugged:
+        iterations *= RUGGED_STEPS
         with torch.no_grad():
             few = [
                 telling(model, b, max(1, SEARCH_PIXELS // b.signal[0].numel()))
