@@ -99,9 +99,8 @@ def active_area(fill_factor: float, q: int) -> Array:
     edges = np.linspace(-0.5, 0.5, q + 1)
     covered = np.clip(np.minimum(edges[1:], side / 2) - np.maximum(edges[:-1], -side / 2), 0, None) * q
     square = ((edges[1:] + edges[:-1]) / 2) ** 2
-    if (
-        fill_factor < 1 and np.ptp(square[covered > 0]) > 1e-9
-    ):  # not where all centres are as far from the middle
+    bendable = np.ptp(square[covered > 0]) > 1e-9  # not where all centres are as far from the middle
+    if fill_factor < 1 and bendable:
         moments = np.array([covered, covered * square]) @ np.array([np.ones(q), square]).T
         wanted = q * side * np.array([1, side**2 / 12 - 1 / (12 * q**2)])
         constant, bend = np.linalg.solve(moments, wanted)

@@ -67,6 +67,7 @@ def grid_for(
     distance: float,
     half_width: float,
     margin: int = MARGIN,
+    narrowest: float | None = None,
 ) -> Grid:
     """The smallest grid that keeps the light path linear.
 
@@ -84,13 +85,15 @@ def grid_for(
     half_width : float
         Of the iris, as a share of the panel's band 1 / (2 pitch).
     margin : int, pixels
+    narrowest : float or None
+        Half width that the iris may be closed to; None: `half_width`.
 
     Returns
     -------
     Grid
     """
     walk = wavelength * abs(distance) * half_width / (2 * pitch**2)
-    room = math.ceil(max(1.6 * walk, 2 * margin / min(half_width, 1)))
+    room = math.ceil(max(1.6 * walk, 2 * margin / min(narrowest or half_width, 1)))
     rows, columns = (_even_fast_size(n + room) for n in shape)
     band = tuple(_band_edge(half_width, n, padded) for n, padded in zip(shape, (rows, columns), strict=True))
     return Grid(shape, (rows, columns), margin, (band[0], band[1]), pitch)

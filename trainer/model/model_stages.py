@@ -35,14 +35,21 @@ def scene_for(model: Model, channel: str, plane_mm: float, dtype: torch.dtype = 
     opened = IRIS_ROOM if any(p.effect.touches_iris for p in model.present) else 1.0
     scene = scene_at(model.bench, channel, plane_mm, model.method, opened, dtype)
     pupil_effects = tuple(p for p in model.present if p.effect.stage == "pupil")
-    reach_mm = 1e3 * abs(float(stages_for(scene, pupil_effects).pupil.distance))
-    if reach_mm <= REACH_ROOM * abs(plane_mm):
+    pupil = stages_for(scene, pupil_effects).pupil
+    # In steps, so that fits whose distance or iris varies a little share their grids.
+    farther = _steps(1e3 * abs(float(pupil.distance)) / abs(plane_mm), REACH_ROOM)
+    closer = _steps(model.bench.iris.half_width / max(float(pupil.half_width), 0.02), IRIS_ROOM)
+    if farther == closer == 0:
         return scene
-    # In steps, so that fits whose distance varies a little share their grids.
-    steps = math.ceil(math.log(reach_mm / abs(plane_mm), REACH_ROOM))
-    return scene_at(
-        model.bench, channel, plane_mm, model.method, opened, dtype, abs(plane_mm) * REACH_ROOM**steps
-    )
+    reach_mm = abs(plane_mm) * REACH_ROOM**farther if farther else None
+    return scene_at(model.bench, channel, plane_mm, model.method, opened, dtype, reach_mm, IRIS_ROOM**-closer)
+
+
+def _steps(ratio: float, step: float) -> int:
+    """How many steps beyond the first, each a factor, reach a ratio."""
+    if ratio <= step:
+        return 0
+    return math.ceil(math.log(ratio, step))
 
 
 def stages_for(

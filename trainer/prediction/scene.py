@@ -63,6 +63,7 @@ def scene_at(
     opened: float,
     dtype: torch.dtype,
     reach_mm: float | None = None,
+    closed: float = 1.0,
 ) -> Scene:
     """The scene of a bench at one colour and plane.
 
@@ -72,6 +73,8 @@ def scene_at(
         Room for effects that open or move the iris, as a factor on what the bench states.
     reach_mm : float, optional, mm
         Room for light that goes farther than to the stated plane.
+    closed : float
+        Room for the wider figure of an iris that effects close to this share of what the bench states.
 
     Raises
     ------
@@ -84,7 +87,8 @@ def scene_at(
     distance = plane_mm * 1e-3
     # In the far field nothing walks out of the grid: the image has its own, and the panel needs no room.
     spread = 0.0 if method == "fraunhofer" else max(abs(distance), 1e-3 * (reach_mm or 0.0))
-    grid = grid_for(panel.shape, panel.pitch, wavelength, spread, half_width)
+    narrowest = min(bench.iris.half_width * closed, half_width)
+    grid = grid_for(panel.shape, panel.pitch, wavelength, spread, half_width, narrowest=narrowest)
     check_sampling(
         method,
         Aperture(panel.shape, grid.padded, panel.pitch),
