@@ -47,12 +47,15 @@ class FitResult:
         Of the fitted numbers, then of the logarithms of the gains.
     keys : tuple
         (effect, parameter, index into its values) of each fitted number.
+    settled : bool
+        Whether further steps would have changed little; False where their number was at its end.
     """
 
     model: Model
     errors: PredictionErrors
     covariance: np.ndarray
     keys: tuple[tuple[str, str, int], ...]
+    settled: bool
 
 
 def fit(
@@ -112,7 +115,7 @@ def _fit(
     channels = list(dict.fromkeys(b.channel for b in batches))
     slopes = slopes_of(model, keys, channels, predictors, points)
     residuals, errors = weighted_residuals(model, predictors, points)
-    damping, fresh = 1e-3, True
+    damping, fresh, settled = 1e-3, True, False
     for iteration in range(iterations):
         if progress:
             progress(iteration / iterations)
@@ -138,9 +141,11 @@ def _fit(
             residuals, errors = trial_residuals, trial_errors
             damping = max(damping / 10, 1e-7)
         elif fresh:
+            settled = True
             break
         removed_excess = before - errors.excess
         if fresh and removed_excess < max(tolerance * abs(errors.excess), 2e-6):
+            settled = True
             break
         # Secants are costly: they are used again while a step still removes more than half of what is left.
         fresh = not removed_excess > 0.5 * before
@@ -151,7 +156,7 @@ def _fit(
     inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
     covariance = inverse @ scatter @ inverse
     spread = _spread(keys, covariance, normal)
-    return FitResult(_with_errors(model, keys, spread), errors, covariance, keys)
+    return FitResult(_with_errors(model, keys, spread), errors, covariance, keys, settled)
 
 
 def _fit_many(
@@ -173,6 +178,7 @@ def _fit_many(
         model = with_gain(model, predictors, lights_of(model, predictors, points))
     channels = list(dict.fromkeys(b.channel for b in batches))
     residuals, errors = weighted_residuals(model, predictors, points)
+    settled = False
     for iteration in range(iterations):
         if progress:
             progress(iteration / iterations)
@@ -192,9 +198,11 @@ def _fit_many(
                 accepted = True
                 break
         if not accepted:
+            settled = True
             break
         model, points, residuals, errors = trial, trial_points, trial_residuals, trial_errors
         if before - errors.excess < max(tolerance * abs(errors.excess), 2e-6):
+            settled = True
             break
     table = slopes_of(model, keys, channels, predictors, points)
     slopes = ManySlopes(model, many, predictors, points, table)
@@ -210,7 +218,7 @@ def _fit_many(
     inner = np.arange(len(keys), len(every))
     whole[inner, inner] = spread_of_many**2
     spread = np.concatenate([_spread(keys, covariance, normal), spread_of_many])
-    return FitResult(_with_errors(model, every, spread), errors, whole, every)
+    return FitResult(_with_errors(model, every, spread), errors, whole, every, settled)
 
 
 @torch.no_grad()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Sequence
 
 import torch
@@ -18,7 +19,8 @@ from trainer.model.model import EffectInstance, Model, raised
 POLYNOMIALS = 6
 SEARCH_PIXELS = 2 * 240 * 320  # of a scene, at least one capture: a pattern search need only come near
 SEARCH_SCENES = 3
-RUGGED_STEPS = 3  # times as many: an iris's edge goes one frequency sample a step
+# An iris's edge goes one frequency sample a step: its fit goes on while each turn leaves less than this share.
+RUGGED_TURNS, RUGGED_LEFT = 3, 0.8
 # Of the excess that an order must remove: where a straight line expects less, it is not fitted.
 LEAST_EXPECTED = 0.5
 # Orders are raised at once where each expects this share of what the one that expects most does: what others expect may
@@ -34,9 +36,8 @@ def settled(model: Model, batches: Sequence[Batch]) -> FitResult:
 def fit_from(
     model: Model, start: EffectInstance, batches: Sequence[Batch], iterations: int = 12
 ) -> FitResult:
-    """Fit one effect from a start; where derivatives do not reach far, after a pattern search and in more steps."""
+    """Fit one effect from a start; where derivatives do not reach far, after a pattern search and in turns."""
     if start.effect.rugged:
-        iterations *= RUGGED_STEPS
         with torch.no_grad():
             few = [
                 telling(model, b, max(1, SEARCH_PIXELS // b.signal[0].numel()))
@@ -45,7 +46,13 @@ def fit_from(
             predictors = [Predictor(model.having(start), b) for b in few]
             points = [p.trace(model) for p in predictors]
             start = pattern_search(model, predictors, points, start)
-    return fit(model.having(start), [start.effect.name], batches, iterations)
+    fitted = fit(model.having(start), [start.effect.name], batches, iterations)
+    turns = RUGGED_TURNS if start.effect.rugged else 1
+    before = math.inf
+    while not fitted.settled and turns > 1 and fitted.errors.excess < RUGGED_LEFT * before:
+        before, turns = fitted.errors.excess, turns - 1
+        fitted = fit(fitted.model, [start.effect.name], batches, iterations)
+    return fitted
 
 
 def least_for_order(excess: float) -> float:
