@@ -34,8 +34,8 @@ Complex = NDArray[np.complex64]
 Pullback = Callable[[Single], NDArray[np.float64]]
 
 # The tails of the iris's own figure need more border the smaller it is: so many periods of the frequency at its edge,
-# beyond those of an open iris.
-FIGURE_PERIODS = 24
+# beyond those of an open iris. A slit may be of no width; its border ends with that of the least half width.
+FIGURE_PERIODS, LEAST_HALF = 24, 0.02
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class OpticalPath:
         ghost = bench.defect(CoherentGhost)
         q, pitch = bench.simulation.subpixels, bench.panel.pitch_um
         border = 16 + bench.simulation.padding * walk_px(wavelength, pitch, distance, half_band)
-        border += max(FIGURE_PERIODS * 2 * (1 / min(opening.half) - 1), 0.0)
+        border += max(FIGURE_PERIODS * 2 * (1 / max(min(opening.half), LEAST_HALF) - 1), 0.0)
         if ghost:
             border += max(abs(ghost.shift_y_px), abs(ghost.shift_x_px))
         self.band = Band((bench.panel.height, bench.panel.width), q, border, half_band)

@@ -102,9 +102,8 @@ def iris_opening(bench: BenchDescription) -> IrisOpening:
     A rectangle with sharp edges passes the frequencies on them whole: those of the panel padded to twice its size.
     """
     d = bench.defect(Iris)
-    nominal = bench.iris.shape, (bench.iris.half_width, bench.iris.half_width)
     if d is None:
-        opening = IrisOpening(*nominal)
+        opening = IrisOpening(bench.iris.shape, (bench.iris.half_width, bench.iris.half_width))
     else:
         opening = IrisOpening(
             d.shape or bench.iris.shape,

@@ -99,12 +99,17 @@ def grid_for(
     return Grid(shape, (rows, columns), margin, (band[0], band[1]), pitch)
 
 
-def _band_edge(half_width: float, count: int, padded: int) -> int:
-    """The highest frequency index of which the iris passes a part.
+def beyond_edge(count: int) -> float:
+    """How far beyond its half width a rectangular iris passes, as a share of the panel's band.
 
-    Its edge may lie half a frequency sample of the doubled panel beyond the nominal one, as frequencies on it pass.
+    Half a frequency sample of the panel, `count` pixels padded to twice as many: a frequency on the edge passes.
     """
-    edge = half_width * padded / 2 + max(padded / (4 * count) - 0.5, 0.0)
+    return 1 / (2 * count)
+
+
+def _band_edge(half_width: float, count: int, padded: int) -> int:
+    """The highest frequency index of which the iris passes a part."""
+    edge = half_width * padded / 2 + max(beyond_edge(count) * padded / 2 - 0.5, 0.0)
     return min(math.ceil(edge), padded // 2 if half_width <= 1 else padded - 1)
 
 

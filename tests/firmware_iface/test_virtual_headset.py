@@ -157,15 +157,18 @@ IN_ORDER = ("laser_drift", "slow_response", "frame_motion")
 @pytest.mark.parametrize("name", [n for n in named_benches() if n not in ("ideal", *IN_ORDER)])
 def test_every_named_bench_differs_from_the_ideal_by_more_than_noise(name):
     noise = np.random.default_rng(3).integers(0, 256, (H, W), dtype=np.uint8)
+    finest = picture_gray() + 128 * (np.arange(W) % 2).astype(np.uint8)  # most light at the end of the band
     bench = load_bench(f"virtual:{name}").resized(H, W, 30.0)
     channel = bench.channels[0].name
     ideal, seen = (
-        np.array([VirtualHeadset(b).expected_counts(g, channel) - 64 for g in (picture_gray(), noise)])
+        np.array(
+            [VirtualHeadset(b).expected_counts(g, channel) - 64 for g in (picture_gray(), noise, finest)]
+        )
         for b in (replace(bench, defects=()), bench)
     )
     scale = (seen * ideal).sum((1, 2)) / (ideal * ideal).sum((1, 2))
     excess = ((seen - scale[:, None, None] * ideal) ** 2).mean((1, 2)) / seen.var((1, 2))
-    assert excess.max() > 0.008  # an iris or a line width shows only where there is fine structure
+    assert excess.max() > 0.01  # an iris or a line width shows only where there is fine structure
 
 
 def test_laser_drift_moves_the_power():

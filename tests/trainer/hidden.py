@@ -43,21 +43,23 @@ read_noise_e = 5
 LARGER = {"width": 160, "height": 128, "distance_mm": 15}
 
 
-def bench_file(
-    folder: Path,
-    *defects: str,
+def bench_text(
     width: int = 96,
     height: int = 80,
     distance_mm: float = 9,
     iris: tuple[str, float] = ("square", 1.0),
     fill_factor: float = 1.0,
-) -> Path:
-    """A virtual bench's TOML file with defects given as TOML lines after [[defect]]."""
-    path = folder / "bench-with-secrets.toml"
-    text = BENCH.format(
+) -> str:
+    """The TOML tables of a bench as its data sheet has it; of the iris, shape and half width."""
+    return BENCH.format(
         width=width, height=height, distance_mm=distance_mm, iris=iris, fill_factor=fill_factor
     )
-    path.write_text(text + "".join(f"\n[[defect]]\n{d}\n" for d in defects))
+
+
+def bench_file(folder: Path, *defects: str, **sizes: Any) -> Path:
+    """A virtual bench's TOML file with defects given as TOML lines after [[defect]]; `sizes` go to `bench_text`."""
+    path = folder / "bench-with-secrets.toml"
+    path.write_text(bench_text(**sizes) + "".join(f"\n[[defect]]\n{d}\n" for d in defects))
     return path
 
 
@@ -77,7 +79,7 @@ def captured(
     options: tuple[object, ...] = (),
     **sizes: Any,
 ) -> Path:
-    """A capture set taken from a bench with these defects; `sizes` go to `bench_file`."""
+    """A capture set taken from a bench with these defects; `sizes` go to `bench_text`."""
     where = folder / "captures"
     ran(capsys, "capture", "--bench", bench_file(folder, *defects, **sizes), "--out", where, *options)
     return where

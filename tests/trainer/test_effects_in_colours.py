@@ -21,6 +21,16 @@ RED, BLUE = (
 )
 
 
+def in_three_colours(
+    capsys: pytest.CaptureFixture[str], folder: Path, defect: str, distance_mm: float = 9
+) -> Path:
+    """A capture set of a bench of three colours with a defect."""
+    bench = bench_file(folder, defect, width=128, height=96, distance_mm=distance_mm)
+    bench.write_text(bench.read_text().replace(GREEN, RED + GREEN + BLUE))
+    ran(capsys, "capture", "--bench", bench, "--out", folder / "captures", "--patterns", 4)
+    return folder / "captures"
+
+
 @pytest.mark.parametrize("phase_deg", [120, -200])
 def test_a_coherent_ghost_is_late_by_one_path_for_all_colours(
     phase_deg: float, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -28,10 +38,7 @@ def test_a_coherent_ghost_is_late_by_one_path_for_all_colours(
     """With one phase for all colours, a tenth of what the ghost makes is left, outside the catalogue."""
     with_few_effects(monkeypatch, "coherent_ghost", "distance")
     ghost = f'kind = "coherent_ghost"\namplitude = 0.2\nphase_deg = {phase_deg}'
-    bench = bench_file(tmp_path, ghost, width=128, height=96)
-    bench.write_text(bench.read_text().replace(GREEN, RED + GREEN + BLUE))
-    captures = tmp_path / "captures"
-    ran(capsys, "capture", "--bench", bench, "--out", captures, "--patterns", 4)
+    captures = in_three_colours(capsys, tmp_path, ghost)
     found = ran(capsys, "explain", captures, "--out", tmp_path / "model.toml")
     assert [s["added"] for s in found["steps"]] == [None, "coherent_ghost"]
     assert found["steps"][-1]["excess"] < 3e-4
@@ -46,10 +53,7 @@ def test_a_fit_of_the_iris_goes_on_until_every_edge_is_in_its_place(
 ) -> None:
     """An edge goes one frequency sample a step, and the colours' samples differ: after 12 steps, 0.0023 is left."""
     iris = 'kind = "iris"\nhalf_width = 0.84\ncentre_x_share = 0.064\ncentre_y_share = -0.04'
-    bench = bench_file(tmp_path, iris, width=128, height=96, distance_mm=12)
-    bench.write_text(bench.read_text().replace(GREEN, RED + GREEN + BLUE))
-    ran(capsys, "capture", "--bench", bench, "--out", tmp_path / "captures", "--patterns", 4)
-    captures = read_captures(tmp_path / "captures")
+    captures = read_captures(in_three_colours(capsys, tmp_path, iris, distance_mm=12))
     batches = load(captures, captures.captures)
     ideal = fit(Model(captures.bench), [], batches).model
     values = {

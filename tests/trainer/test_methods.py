@@ -11,7 +11,7 @@ import torch
 from firmware_iface.errors import InputError
 from runtime.lightpath.light_path import irradiance
 from runtime.lightpath.light_path_adjoint import irradiance_and_pullback
-from tests.trainer.hidden import BENCH
+from tests.trainer.hidden import bench_text
 from trainer.captures.bench_file import Bench, read_bench
 from trainer.model.bundle_export import export_bundle
 from trainer.model.model import Model
@@ -22,9 +22,7 @@ from trainer.prediction.predict import light_on_camera, light_path, trace
 def bench(side: int, distance_mm: float) -> Bench:
     import tomllib
 
-    text = BENCH.format(
-        width=side, height=side, distance_mm=distance_mm, iris=("square", 1.0), fill_factor=1.0
-    )
+    text = bench_text(width=side, height=side, distance_mm=distance_mm)
     return read_bench(tomllib.loads("schema = 1\n" + text))
 
 

@@ -115,7 +115,7 @@ def _fit(
     channels = list(dict.fromkeys(b.channel for b in batches))
     slopes = slopes_of(model, keys, channels, predictors, points)
     residuals, errors = weighted_residuals(model, predictors, points)
-    damping, fresh, settled = 1e-3, True, False
+    damping, fresh, settled = 1e-3, True, True
     for iteration in range(iterations):
         if progress:
             progress(iteration / iterations)
@@ -141,16 +141,16 @@ def _fit(
             residuals, errors = trial_residuals, trial_errors
             damping = max(damping / 10, 1e-7)
         elif fresh:
-            settled = True
             break
         removed_excess = before - errors.excess
         if fresh and removed_excess < max(tolerance * abs(errors.excess), 2e-6):
-            settled = True
             break
         # Secants are costly: they are used again while a step still removes more than half of what is left.
         fresh = not removed_excess > 0.5 * before
         if fresh and iteration + 1 < iterations:
             slopes = slopes_of(model, keys, channels, predictors, points)
+    else:
+        settled = False
     normal, scatter = _normal(slopes), _scatter(slopes, residuals)
     model = with_measured_values(model, free, batches)
     inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
@@ -178,7 +178,7 @@ def _fit_many(
         model = with_gain(model, predictors, lights_of(model, predictors, points))
     channels = list(dict.fromkeys(b.channel for b in batches))
     residuals, errors = weighted_residuals(model, predictors, points)
-    settled = False
+    settled = True
     for iteration in range(iterations):
         if progress:
             progress(iteration / iterations)
@@ -198,12 +198,12 @@ def _fit_many(
                 accepted = True
                 break
         if not accepted:
-            settled = True
             break
         model, points, residuals, errors = trial, trial_points, trial_residuals, trial_errors
         if before - errors.excess < max(tolerance * abs(errors.excess), 2e-6):
-            settled = True
             break
+    else:
+        settled = False
     table = slopes_of(model, keys, channels, predictors, points)
     slopes = ManySlopes(model, many, predictors, points, table)
     spread_of_many = slopes.errors(residuals)

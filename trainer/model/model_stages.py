@@ -21,6 +21,7 @@ from trainer.prediction.predict import bare_irradiance
 from trainer.prediction.scene import Scene, Stages, bare_stages, scene_at
 
 REACH_ROOM = 1.05  # how far beyond the stated plane the grid's own room suffices
+LEAST_IRIS = 0.02  # half width whose figure still gets room: an effect of one's own may give none
 IRIS_ROOM = 1.25  # how far an effect may open or move the iris, in units of what the bench says
 
 
@@ -38,7 +39,7 @@ def scene_for(model: Model, channel: str, plane_mm: float, dtype: torch.dtype = 
     pupil = stages_for(scene, pupil_effects).pupil
     # In steps, so that fits whose distance or iris varies a little share their grids.
     farther = _steps(1e3 * abs(float(pupil.distance)) / abs(plane_mm), REACH_ROOM)
-    closer = _steps(model.bench.iris.half_width / max(float(pupil.half_width), 0.02), IRIS_ROOM)
+    closer = _steps(model.bench.iris.half_width / max(float(pupil.half_width), LEAST_IRIS), IRIS_ROOM)
     if farther == closer == 0:
         return scene
     reach_mm = abs(plane_mm) * REACH_ROOM**farther if farther else None

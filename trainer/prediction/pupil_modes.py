@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from runtime.lightpath.grid import beyond_edge
 from runtime.lightpath.propagation import band_limit, transfer_function
 from trainer.kept_results import kept_by_device, kept_for_same
 from trainer.prediction.scene import Scene, bare_stages
@@ -106,8 +107,8 @@ def iris_opening(scene: Scene, pupil: Pupil) -> Tensor:
     """What the iris passes of each frequency.
 
     A frequency sample passes by the share of its width that lies inside. So the iris's size and place have gradients,
-    and the result does not depend on the padding. A rectangle's edge lies half a frequency sample of the doubled
-    panel, 1 / (4 N pitch), beyond the nominal one: a frequency on the edge passes. A round edge lies between samples.
+    and the result does not depend on the padding. A rectangle passes a little more than its half widths
+    (`beyond_edge`), an ellipse what they say.
 
     Returns
     -------
@@ -115,7 +116,7 @@ def iris_opening(scene: Scene, pupil: Pupil) -> Tensor:
         0 to 1.
     """
     panel = scene.bench.panel.shape
-    beyond = [(1 - pupil.roundness) / (2 * n) for n in panel]  # share of the band
+    beyond = [(1 - pupil.roundness) * beyond_edge(n) for n in panel]
     bins = [2 / n for n in scene.grid.padded]  # width of a frequency sample, share of the band
     v, u = pupil.v - pupil.centre[0], pupil.u - pupil.centre[1]
     rows = pupil.half_width * (1 - pupil.stretch) + beyond[0]
