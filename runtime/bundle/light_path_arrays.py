@@ -3,9 +3,10 @@
 `bundle.json`'s description holds, besides the panel, one record a colour and plane:
 
     {"channel", "plane_mm", "wavelength_nm",
-     "grid": {"shape", "padded", "margin", "band", "pitch_m"},
+     "grid": {"shape", "padded", "margin", "band", "pitch_m", "samples_a_pixel"},
      "arrays": {field of LightPath: name of an array}}
 
+`samples_a_pixel` (along an axis, of irradiance) is there where it is not 2.
 Fields that are None in a LightPath are not listed; `crosstalk` is two arrays, crosstalk_rows and
 crosstalk_columns, and `modulation` three: modulation_ends, modulation_factors and modulation_shares. A modulation over
 the phase on the panel, after the gain, has "modulation_by_phase": true beside the arrays.
@@ -26,7 +27,7 @@ import numpy as np
 from firmware_iface.errors import InputError, nearest
 from runtime.bundle.bundle_folder import ARRAYS, MANIFEST, Bundle
 from runtime.lightpath.gray_levels import checked_gray_levels, shown_as
-from runtime.lightpath.grid import FINE, Grid
+from runtime.lightpath.grid import FINE, FINEST, Grid
 from runtime.lightpath.light_path import LightPath
 
 COMPLEX, REAL = np.dtype(np.complex64), np.dtype(np.float32)
@@ -85,6 +86,7 @@ def pack_light_paths(
                     "margin": grid.margin,
                     "band": list(grid.band),
                     "pitch_m": grid.pitch,
+                    **({} if grid.fine == FINE else {"samples_a_pixel": grid.fine}),
                 },
                 **({"modulation_by_phase": True} if path.modulation_by_phase else {}),
                 "arrays": names,
@@ -274,13 +276,16 @@ def _grid(given: Any, where: str) -> Grid:
 
     shape, padded, band = pair("shape"), pair("padded"), pair("band")
     margin: Any = given.get("margin")
+    fine: Any = given.get("samples_a_pixel", FINE)
     pitch: Any = given.get("pitch_m")
     if type(margin) is not int or margin < 0 or not _is_number(pitch) or not 0 < pitch < 1:
+        raise wrong
+    if type(fine) is not int or fine not in (FINE, FINEST):
         raise wrong
     for n, room, edge in zip(shape, padded, band, strict=True):
         if not (n >= 1 and n + 2 * margin <= room <= LARGEST and 0 <= edge < room):
             raise wrong
-    return Grid(shape, padded, margin, band, float(pitch))
+    return Grid(shape, padded, margin, band, float(pitch), fine)
 
 
 def _array(bundle: Bundle, name: Any, field: str, where: str) -> np.ndarray | None:

@@ -16,7 +16,6 @@ from runtime.calibration.estimate import ColourLightPath, Estimate, Shot
 from runtime.calibration.parameter_layout import ParameterLayout
 from runtime.calibration.prediction import Predictor
 from runtime.camera.view import SENSITIVITY_ORDER, TERMS
-from runtime.lightpath.grid import FINE
 from runtime.lightpath.legendre import legendre_map_by_map
 from runtime.solver.in_place_path import Optics
 
@@ -68,7 +67,7 @@ class Columns:
 
         if channel not in self.moved:
             self.moved.clear()  # a colour's buffers at a time
-            self.moved[channel] = Optics(path, FINE, True, predictor.backend)
+            self.moved[channel] = Optics(path, path.grid.fine, True, predictor.backend)
         moved = self.moved[channel]
         moved.take(path)
         turned = moved.in_band_order(1j * axial_phase(path, wavelength)[None], path.grid)[0]

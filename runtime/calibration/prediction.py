@@ -16,7 +16,7 @@ from runtime.calibration.estimate import ColourLightPath, Estimate, Shot, with_s
 from runtime.camera.reading import Reading
 from runtime.camera.view import View
 from runtime.lightpath import fft
-from runtime.lightpath.grid import FINE, Grid
+from runtime.lightpath.grid import Grid
 from runtime.lightpath.light_path import LightPath, panel_phase
 from runtime.solver.array_backend import Backend, Room
 from runtime.solver.in_place_path import Optics
@@ -51,7 +51,9 @@ class Predictor:
         size = max(b.path.grid.shape[0] * b.path.grid.shape[1] for b in bases.values())
         self.backend = Backend(fft.THREADS if size > SMALL else 1)
         room = Room(self.backend)
-        self.optics = {c: Optics(b.path, FINE, True, self.backend, room) for c, b in bases.items()}
+        self.optics = {
+            c: Optics(b.path, b.path.grid.fine, True, self.backend, room) for c, b in bases.items()
+        }
         self.paths: dict[str, LightPath] = {}
         self.readings: dict[str, Reading] = {}
         self.images: dict[Grid, np.ndarray] = {}
@@ -75,7 +77,7 @@ class Predictor:
         made: dict[object, Reading] = {}
         for name, path in self.paths.items():
             # Colours differ in their room for light to spread, which no camera sees.
-            seen = (path.grid.shape, path.grid.margin, path.grid.pitch)
+            seen = (path.grid.shape, path.grid.margin, path.grid.pitch, path.grid.fine)
             key = (seen, None if path.irradiance_filter is None else name)
             if key not in made:
                 made[key] = Reading(

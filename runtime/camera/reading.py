@@ -12,7 +12,7 @@ import numpy as np
 from runtime.camera.sampling import pixel_area, sample_places, spline_filter, spline_matrices
 from runtime.camera.view import View
 from runtime.lightpath import fft
-from runtime.lightpath.grid import FINE, Grid, image_frequencies
+from runtime.lightpath.grid import Grid, image_frequencies
 
 
 class Reading:
@@ -45,7 +45,7 @@ class Reading:
         y, x = view.positions(grid.shape)
         fy, fx = image_frequencies(grid, np.zeros((), np.float64))
         self.fy, self.fx = fy[:, None] * grid.pitch, fx[None, :] * grid.pitch  # cycles a panel pixel
-        transfer = pixel_area(self.fy, self.fx, y, x) / spline_filter(self.fy, self.fx, finer)
+        transfer = pixel_area(self.fy, self.fx, y, x) / spline_filter(self.fy, self.fx, grid.fine * finer)
         for variance, f in ((view.blur_y_px2, self.fy), (view.blur_x_px2, self.fx)):
             transfer = transfer * np.exp(-2 * np.pi**2 * variance * f**2)
         if own_filter is not None:
@@ -105,7 +105,7 @@ class Reading:
 
     def motion(self) -> tuple[np.ndarray, np.ndarray]:
         """How what was last read changes where each pixel looks a panel pixel farther down, and right: two [h, w]."""
-        scale = np.float32(FINE * self.finer)
+        scale = np.float32(self.grid.fine * self.finer)
         down, right = (
             scale * (one @ self.fine.reshape(-1)).reshape(self.view.shape) for one in self.matrices[1:]
         )

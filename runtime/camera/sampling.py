@@ -17,7 +17,7 @@ from scipy.sparse import csr_matrix
 
 from runtime.camera.registration import panel_points
 from runtime.lightpath.fft import ifft, irfft, irfft2
-from runtime.lightpath.grid import FINE, Grid
+from runtime.lightpath.grid import Grid
 
 Array = Any
 PLACES = 1 << 16  # whose splines are worked out at a time: what is between stays in a core's cache
@@ -47,7 +47,8 @@ def pixel_area(iy: Array, ix: Array, y: Array, x: Array) -> Array:
 def registered_samples(grid: Grid, spectrum: Array) -> Array:
     """The picture of a spectrum at the centres of the panel's pixels.
 
-    To read every second sample of a picture is to fold its spectrum: the inverse transform is a quarter as large.
+    To read every second sample of a picture is to fold its spectrum: the inverse transform is a quarter as large, and
+    where pixels have four samples an axis, a sixteenth.
 
     Parameters
     ----------
@@ -59,33 +60,40 @@ def registered_samples(grid: Grid, spectrum: Array) -> Array:
     -------
     real array [..., H, W]
     """
+    (rows, columns), samples = grid.image_shape, grid.fine
+    while samples > 1:
+        rows, columns, samples = rows // 2, columns // 2, samples // 2
+        spectrum = _folded(spectrum, rows, columns)
+    picture, margin = irfft2(spectrum, (rows, columns)), grid.margin
+    return picture[..., margin : margin + grid.shape[0], margin : margin + grid.shape[1]]
+
+
+def _folded(spectrum: Array, rows: int, columns: int) -> Array:
+    """Half spectrum of every second sample of a picture, which has that many rows and columns of them."""
     xp = array_namespace(spectrum)
-    rows, columns = (n // FINE for n in grid.image_shape)
     folded = spectrum[..., :rows, :] + spectrum[..., rows:, :]
     last = columns // 2 + 1
     # The columns beyond the half spectrum are those of the negative frequencies: reversed, conjugated.
     mirrored = xp.flip(folded[..., columns - last + 1 :], axis=-1)
     mirrored = xp.conj(xp.roll(xp.flip(mirrored, axis=-2), 1, axis=-2))
-    picture = irfft2((folded[..., :last] + mirrored) / FINE**2, (rows, columns))
-    margin = grid.margin
-    return picture[..., margin : margin + grid.shape[0], margin : margin + grid.shape[1]]
+    return (folded[..., :last] + mirrored) / 4
 
 
-def spline_filter(iy: Array, ix: Array, finer: int) -> Array:
+def spline_filter(iy: Array, ix: Array, samples: int) -> Array:
     """Transfer function to divide by, so that `spline_samples` passes through the samples.
 
     Parameters
     ----------
     iy, ix : arrays [n, 1] and [1, m], cycles a panel pixel
-    finer : int
-        How many times as fine as the light path's own fine grid the splines' samples are.
+    samples : int
+        Of the splines, a panel pixel, an axis.
 
     Returns
     -------
     real array [n, m]
     """
     xp = array_namespace(iy)
-    rows, columns = ((2 + xp.cos(2 * math.pi * f / (FINE * finer))) / 3 for f in (iy, ix))
+    rows, columns = ((2 + xp.cos(2 * math.pi * f / samples)) / 3 for f in (iy, ix))
     return rows * columns
 
 
@@ -163,7 +171,7 @@ def sample_places(grid: Grid, y: Array, x: Array, finer: int) -> tuple[Array, Ar
     -------
     (y, x), arrays [h, w], samples
     """
-    samples = FINE * finer
+    samples = grid.fine * finer
     return samples * (y + grid.margin), samples * (x + grid.margin)
 
 

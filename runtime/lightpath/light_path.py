@@ -24,7 +24,6 @@ from array_api_compat import array_namespace
 from runtime.lightpath.crosstalk import mix_neighbours
 from runtime.lightpath.fft import fft, ifft, irfft2, rfft2
 from runtime.lightpath.grid import (
-    FINE,
     Grid,
     at_pixels,
     band_frequencies,
@@ -160,9 +159,10 @@ def image_field(path: LightPath, spectrum: Array, mode: int) -> Array:
         return onto_rows @ (spectrum * path.transfers[mode, ...]) @ xp.matrix_transpose(onto_columns)
     grid = path.grid
     rows, columns = image_window(grid)
-    z = ifft(spectrum * path.transfers[mode, ...], axis=-1, n=FINE * grid.padded[1])
-    z = ifft(take(z, columns, -1), axis=-2, n=FINE * grid.padded[0])
-    return FINE**2 * take(z, rows, -2)
+    height, width = grid.image_period
+    z = ifft(spectrum * path.transfers[mode, ...], axis=-1, n=width)
+    z = ifft(take(z, columns, -1), axis=-2, n=height)
+    return grid.fine**2 * take(z, rows, -2)
 
 
 def irradiance(path: LightPath, phase: Array) -> Array:

@@ -13,7 +13,7 @@ from array_api_compat import array_namespace
 
 from runtime.lightpath.crosstalk import mix_neighbours, mix_neighbours_adjoint
 from runtime.lightpath.fft import fft, ifft, irfft2, rfft2
-from runtime.lightpath.grid import FINE, Grid, band_window, image_window, pixel_slices
+from runtime.lightpath.grid import Grid, band_window, image_window, pixel_slices
 from runtime.lightpath.light_path import (
     LightPath,
     aperture_spectrum,
@@ -137,10 +137,10 @@ def _image_field_adjoint(path: LightPath, z: Array, mode: int) -> Array:
         return xp.conj(path.transfers[mode, ...]) * back
     grid = path.grid
     rows, columns = image_window(grid)
-    height, width = (FINE * n for n in grid.padded)
+    height, width = grid.image_period
     spectrum = fft(put(z, rows, -2, height), axis=-2)[..., : 2 * grid.band[0] + 1, :]
     spectrum = fft(put(spectrum, columns, -1, width), axis=-1)[..., :, : 2 * grid.band[1] + 1]
-    return xp.conj(path.transfers[mode, ...]) * spectrum * (FINE**2 / (height * width))
+    return xp.conj(path.transfers[mode, ...]) * spectrum * (grid.fine**2 / (height * width))
 
 
 def _panel_spectrum_adjoint(path: LightPath, phase: Array, spectrum: Array, factor: bool = False) -> Array:

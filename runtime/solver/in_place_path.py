@@ -7,8 +7,8 @@ irradiance and gradient of the two equal to 1e-9 in double precision (`tests/run
 
 The panel's side is in `in_place_panel`, the image's in `in_place_image`, and the pupil between them is here.
 
-The image is sampled once a panel pixel (fine = 1) or twice (fine = 2), an axis. |z|^2 has twice the bandwidth
-of z: once a pixel carries it where the iris passes no more than half of the panel's band.
+The image is sampled once a panel pixel (fine = 1) or as finely as the path's grid, an axis. |z|^2 has twice the
+bandwidth of z: once a pixel carries it where the iris passes no more than half of the panel's band.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Optics:
     ----------
     path : LightPath
     fine : int
-        Samples a panel pixel, an axis: 1 or 2.
+        Samples a panel pixel, an axis: 1, or those of the path's grid.
     integrate : bool
         Whether pixels integrate light over their area and the path's own irradiance filter is applied, which takes
         two more real transforms each way. Without it, `forward` gives irradiance at their centres, which the fine

@@ -36,8 +36,8 @@ class Objective:
     ----------
     stacks : list of list of LightPath
         Colours of planes.
-    fine : int
-        Samples a pixel, an axis (see `Optics`).
+    fine : bool
+        Whether irradiance is computed on the light paths' fine grid; else once a pixel.
     penalty : str
         One of PENALTIES.
     weight : array [H, W] or None
@@ -59,7 +59,7 @@ class Objective:
     def __init__(
         self,
         stacks: Sequence[Sequence[LightPath]],
-        fine: int,
+        fine: bool,
         penalty: str,
         weight: np.ndarray | None,
         approximator: Approximator | None,
@@ -67,16 +67,18 @@ class Objective:
         frames: int = 1,
     ) -> None:
         xp, path = backend.xp, stacks[0][0]
-        self.backend, self.stacks, self.fine, self.frames = backend, stacks, fine, frames
+        self.backend, self.stacks, self.frames = backend, stacks, frames
         self.approximator = approximator
         self.rounding: SoftLevels | None = None
         self.penalty = PENALTIES[penalty](xp)
         # On the panel's own grid light is taken at pixel centres: integrating it there took longer and gained nothing.
         filtered = any(p.irradiance_filter is not None for stack in stacks for p in stack)
-        integrate = fine > 1 or filtered or approximator is not None
+        integrate = fine or filtered or approximator is not None
         # A pattern's fields are kept from `look` to `gradient`, so each has optics of its own.
         self.optics = [
-            [Optics(p, fine, integrate, backend) for p in stack] for stack in stacks for _ in range(frames)
+            [Optics(p, p.grid.fine if fine else 1, integrate, backend) for p in stack]
+            for stack in stacks
+            for _ in range(frames)
         ]
         real = path.response.dtype
         self.shape = (len(stacks) * frames, *path.grid.shape)

@@ -34,7 +34,7 @@ class Quality:
 def shown(path: LightPath, gray: np.ndarray) -> np.ndarray:
     """What pixels of the panel's size integrate when gray levels [H, W] are shown: [H, W].
 
-    Zero-padded so that nothing wraps around, and on a grid twice as fine as the panel's, which irradiance needs.
+    Zero-padded so that nothing wraps around, and on a grid finer than the panel's, which irradiance needs.
     """
     phase = panel_phase(path, gray.astype(np.int64))
     return pixel_irradiance(path, irradiance(path, phase))

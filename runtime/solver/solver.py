@@ -65,7 +65,8 @@ class Solver:
     penalty : str
         One of PENALTIES.
     grid : str or None
-        "panel" computes irradiance once a pixel. "fine" computes it twice an axis, for about four times the work;
+        "panel" computes irradiance once a pixel. "fine" computes it twice an axis (behind an
+        iris that is wider than the panel's band, four times), for about four times the work;
         that is worth it where the iris passes more than three quarters of the panel's band and there is time, and for
         several frames, which come nearer to the picture. None decides by these.
     region : array [H, W] or None
@@ -126,9 +127,7 @@ class Solver:
         self.on = on or backend()
         fine = frames > 1 or needs_fine_grid(self.stacks) if grid is None else grid == "fine"
         in_the_loop = approximator if through == "gradient" else None
-        self.objective = Objective(
-            self.stacks, 2 if fine else 1, penalty, self.region, in_the_loop, self.on, frames
-        )
+        self.objective = Objective(self.stacks, fine, penalty, self.region, in_the_loop, self.on, frames)
         stages = stages_of(self.drives, frames) if method in DESCENTS else ()
         if stages:
             on, objective = self.on, self.objective

@@ -110,28 +110,30 @@ def test_energy_is_conserved_where_nothing_is_lost() -> None:
     np.testing.assert_allclose(seen, (np.abs(z) ** 2)[np.ix_(*index)], atol=1e-12 * seen.max())
 
 
-def test_irradiance_needs_no_finer_grid() -> None:
+@pytest.mark.parametrize("half_width", [1.0, 1.5, 1.95])
+def test_irradiance_needs_no_finer_grid(half_width: float) -> None:
     """Four times finer samples of the same field, taken directly: equal where they coincide, and
     band-limited.
     """
-    path = random_path((20, 24), irradiance_filter=None)
+    path = random_path((20, 24), half_width, irradiance_filter=None)
     grid, phase = path.grid, phases(random_path((20, 24)))
+    fine = grid.fine
     spectrum = panel_spectrum(path, phase)
     coarse = mode_irradiance(path, spectrum)
     finer = 0
     for weight, transfer in zip(path.weights, path.transfers, strict=True):
-        z = np.fft.ifft2(spectrum * transfer, s=tuple(4 * FINE * n for n in grid.padded)) * (4 * FINE) ** 2
+        z = np.fft.ifft2(spectrum * transfer, s=tuple(4 * fine * n for n in grid.padded)) * (4 * fine) ** 2
         finer = finer + weight * np.abs(z) ** 2
-    first = -FINE * grid.margin
+    first = -fine * grid.margin
     index = [
-        (4 * (first + np.arange(n))) % (4 * FINE * p)
+        (4 * (first + np.arange(n))) % (4 * fine * p)
         for n, p in zip(grid.image_shape, grid.padded, strict=True)
     ]
     np.testing.assert_allclose(coarse, finer[np.ix_(*index)], atol=1e-12 * coarse.max())
     light = np.abs(np.fft.fft2(finer))
     kept = [np.abs(np.fft.fftfreq(n, 1 / n)) <= 2 * b for n, b in zip(finer.shape, grid.band, strict=True)]
     assert light[~np.logical_and.outer(*kept)].max() < 1e-12 * light.max()
-    assert all(2 * b < FINE * n for b, n in zip(grid.band, grid.padded, strict=True))
+    assert all(2 * b < fine * n for b, n in zip(grid.band, grid.padded, strict=True))
 
 
 def test_pixels_integrate_irradiance_over_their_area() -> None:

@@ -54,7 +54,7 @@ def drawn(path: LightPath) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def test_the_fine_grid_is_what_pixels_integrate(name: str, threads: int) -> None:
     path = PATHS[name]
     phase, _, light = drawn(path)
-    Optics(path, 2, True, Backend(threads)).forward(phase, light)
+    Optics(path, path.grid.fine, True, Backend(threads)).forward(phase, light)
     np.testing.assert_allclose(light, pixel_irradiance(path, irradiance(path, phase)), rtol=1e-9, atol=1e-12)
 
 
@@ -74,7 +74,7 @@ def test_once_a_pixel_is_the_fine_grid_at_their_centres(name: str) -> None:
 def test_the_adjoint_is_the_other_copys(name: str) -> None:
     path = PATHS[name]
     phase, slope, light = drawn(path)
-    optics, gradient = Optics(path, 2, True, Backend(2)), np.zeros_like(phase)
+    optics, gradient = Optics(path, path.grid.fine, True, Backend(2)), np.zeros_like(phase)
     optics.forward(phase, light)
     optics.adjoint(phase, slope, gradient)
     expected = irradiance_and_pullback(path, phase)[1](pixel_irradiance_adjoint(path, slope))
@@ -86,7 +86,7 @@ def test_the_adjoint_is_torchs_gradient(name: str) -> None:
     torch = pytest.importorskip("torch")
     path = PATHS[name]
     phase, slope, light = drawn(path)
-    optics, gradient = Optics(path, 2, True, Backend(2)), np.zeros_like(phase)
+    optics, gradient = Optics(path, path.grid.fine, True, Backend(2)), np.zeros_like(phase)
     optics.forward(phase, light)
     optics.adjoint(phase, slope, gradient)
     x = torch.tensor(phase, requires_grad=True)
@@ -143,7 +143,7 @@ def test_scipy_does_what_ducc_does(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(fft, "_ducc", library)
         monkeypatch.setattr(fft, "_scipy", scipy.fft, raising=False)
         light, gradient = np.zeros_like(phase), np.zeros_like(phase)
-        optics = Optics(path, 2, True, Backend(2))
+        optics = Optics(path, path.grid.fine, True, Backend(2))
         optics.forward(phase, light)
         optics.adjoint(phase, slope, gradient)
         results.append((light, gradient))

@@ -270,6 +270,8 @@ def test_pictures_show_every_colour_first(result: Comparison) -> None:
         (("square", 0.837), 1.0),
         (("square", 0.3), 1.0),
         (("square", 1.0), 0.8),
+        (("square", 1.5), 0.9),
+        (("circle", 1.9), 0.9),
     ],
 )
 def test_what_the_bench_file_states_is_in_the_model(iris, fill_factor, tmp_path, capsys) -> None:

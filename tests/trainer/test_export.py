@@ -68,9 +68,11 @@ def headset_irradiance(bundle: Bundle, channel: str, plane: float) -> np.ndarray
     return irradiance(path, panel_phase(path, gray().numpy()))
 
 
-def test_the_headset_computes_what_the_trainer_does(tmp_path: Path) -> None:
+@pytest.mark.parametrize("half_width", [1.0, 1.5])
+def test_the_headset_computes_what_the_trainer_does(half_width: float, tmp_path: Path) -> None:
     """With every effect of the catalogue present: irradiance to single precision, for each colour."""
-    model = Model(bench(True), every_effect(True))
+    ours = bench(True)
+    model = Model(replace(ours, iris=replace(ours.iris, half_width=half_width)), every_effect(True))
     export_bundle(model, None, tmp_path / "b")
     bundle = read_bundle(tmp_path / "b")
     assert bundle_channels(bundle) == ["red", "green"]
@@ -225,7 +227,7 @@ def test_a_bundle_that_does_not_fit_together_is_refused_with_a_reason(folder: Pa
     for bad in (
         grid(shape=[0, WIDTH]), grid(shape=[HEIGHT]), grid(padded=[10, 10]), grid(band=[10**6, 3]),
         grid(margin=-1), grid(pitch_m=0), grid(pitch_m="8 um"), grid(padded=[1e9, 1e9]), {"grid": None},
-        grid(padded=[1 << 20, 1 << 20]),
+        grid(padded=[1 << 20, 1 << 20]), grid(samples_a_pixel=3), grid(samples_a_pixel="4"),
     ):  # fmt: skip
         assert "the grid of light path red, 6 mm cannot be computed" in refusal(**bad)
     assert "transfers of light path red, 6 mm has the shape" in refusal(**grid(band=[4, 4]))

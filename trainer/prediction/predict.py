@@ -23,7 +23,6 @@ from runtime.camera.sampling import (
 )
 from runtime.lightpath.fft import rfft2
 from runtime.lightpath.gray_levels import shown_as
-from runtime.lightpath.grid import FINE
 from runtime.lightpath.host_arrays import unit_phasor
 from runtime.lightpath.light_path import LightPath, panel_phase
 from runtime.lightpath.modulation import Modulation
@@ -131,7 +130,7 @@ def _far_field(scene: Scene, pupil: Pupil) -> tuple[Tensor, Tensor]:
     matrices = []
     for axis in (0, 1):
         count = grid.shape[axis]
-        sample = torch.arange(grid.image_shape[axis], dtype=scene.dtype) / FINE - grid.margin
+        sample = torch.arange(grid.image_shape[axis], dtype=scene.dtype) / grid.fine - grid.margin
         position = (sample - (count - 1) / 2) * grid.pitch
         band = grid.frequency_index(axis)
         matrices.append(
@@ -290,7 +289,7 @@ def light_on_camera(
     def read(spectrum: Tensor) -> Tensor:
         if places is None:
             return registered_samples(grid, spectrum)
-        finer = spectrum / spline_filter(sensor.iy, sensor.ix, FINER)
+        finer = spectrum / spline_filter(sensor.iy, sensor.ix, grid.fine * FINER)
         fine = finer_picture(finer, grid.image_shape, FINER)
         return samples_at(fine, *sample_places(grid, *places, FINER))
 
