@@ -61,6 +61,7 @@ class OpticalPath:
 
     def __init__(self, bench: BenchDescription, channel: str, plane_mm: float) -> None:
         wavelength = bench.channel(channel).wavelength_nm
+        laser = [c.name for c in bench.channels].index(channel)
         offset, convention = bench.defect(Distance), bench.defect(Convention)
         distance = plane_mm + (offset.offset_mm if offset else 0.0)
         if convention:
@@ -87,8 +88,8 @@ class OpticalPath:
                     * second_path(ghost, self.band, wl)
                 ).astype(np.complex64),
             )
-            for centre, of_power in source_lines(wavelength, bench.defect(SourceLines))
-            for wl, share in spectral_lines(centre, bench.defect(TemporalCoherence), of_power)
+            for centre, of_power in source_lines(wavelength, bench.defect(SourceLines), laser)
+            for wl, share in spectral_lines(centre, bench.defect(TemporalCoherence), of_power, laser)
         ]
         to_cycles = pitch / wavelength  # 1 mrad in cycles a pixel
         points = source_points(bench.defect(SpatialCoherence))
@@ -121,22 +122,22 @@ def relay_path_nm(d: PupilAberration | None, band: Band) -> NDArray[np.float64]:
     )
 
 
-def source_lines(wavelength_nm: float, d: SourceLines | None) -> list[tuple[float, float]]:
-    """(wavelength nm, share of the power) of the source's lines, the nominal one first."""
+def source_lines(wavelength_nm: float, d: SourceLines | None, laser: int) -> list[tuple[float, float]]:
+    """(wavelength nm, share of the power) of a laser's lines, the nominal one first; `laser` is its number."""
     if d is None:
         return [(wavelength_nm, 1.0)]
-    others = ((d.separation_nm, d.share), (d.third_separation_nm, d.third_share))
-    lines = [(wavelength_nm + apart, share) for apart, share in others if share > 0]
+    others, wider = ((d.separation_nm, d.share), (d.third_separation_nm, d.third_share)), 1 + laser * d.spread
+    lines = [(wavelength_nm + wider * apart, share) for apart, share in others if share > 0]
     return [(wavelength_nm, 1 - d.share - d.third_share), *lines]
 
 
 def spectral_lines(
-    wavelength_nm: float, d: TemporalCoherence | None, power: float = 1.0
+    wavelength_nm: float, d: TemporalCoherence | None, power: float, laser: int
 ) -> list[tuple[float, float]]:
-    """(wavelength nm, share) of the lines that approximate a Gaussian line of this power, out to 2.5 sigma."""
+    """(wavelength nm, share) of the lines that approximate a laser's Gaussian line of this power, out to 2.5 sigma."""
     if d is None or d.lines == 1 or d.linewidth_nm == 0:
         return [(wavelength_nm, power)]
-    sigma = d.linewidth_nm / 2.3548
+    sigma = d.linewidth_nm * (1 + laser * d.spread) / 2.3548
     at = np.linspace(-2.5, 2.5, d.lines)
     shares = np.exp(-0.5 * at**2)
     shares /= shares.sum()

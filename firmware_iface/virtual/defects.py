@@ -172,6 +172,9 @@ class TemporalCoherence(Defect):
     kind = "temporal_coherence"
     stage = "pupil"
     linewidth_nm: float = parameter(18.0, "full width at half maximum", 0, 50)
+    spread: float = parameter(
+        0.0, "how much wider each further colour's line is, share of the first's", -0.3, 2
+    )
     lines: int = parameter(13, "spectral lines summed", 1, 101)
 
 

@@ -88,6 +88,9 @@ class SourceLines(Defect):
     share: float = parameter(0.3, "share of the second line in the power", 0, 0.5)
     third_separation_nm: float = parameter(-4.0, "third line less the nominal one", -50, 50)
     third_share: float = parameter(0.0, "share of the third line in the power", 0, 0.5)
+    spread: float = parameter(
+        0.0, "how much farther apart each further colour's lines are, share of the first's", -2, 2
+    )
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,14 @@ from pathlib import Path
 import pytest
 
 from tests.trainer.hidden import bench_file, ran, with_few_effects
+from tests.trainer.test_effects import bench
 from trainer.captures.batches import load
 from trainer.captures.capture_set import read_captures
 from trainer.effects import catalogue
 from trainer.fitting import refit
 from trainer.fitting.gauss_newton import fit
 from trainer.model.model import Model, instance_with
+from trainer.model.model_file import read_model, write_model
 
 GREEN = '[[channel]]\nname = "green"\nwavelength_nm = 520\n'
 RED, BLUE = (
@@ -25,9 +27,9 @@ def in_three_colours(
     capsys: pytest.CaptureFixture[str], folder: Path, defect: str, distance_mm: float = 9
 ) -> Path:
     """A capture set of a bench of three colours with a defect."""
-    bench = bench_file(folder, defect, width=128, height=96, distance_mm=distance_mm)
-    bench.write_text(bench.read_text().replace(GREEN, RED + GREEN + BLUE))
-    ran(capsys, "capture", "--bench", bench, "--out", folder / "captures", "--patterns", 4)
+    file = bench_file(folder, defect, width=128, height=96, distance_mm=distance_mm)
+    file.write_text(file.read_text().replace(GREEN, RED + GREEN + BLUE))
+    ran(capsys, "capture", "--bench", file, "--out", folder / "captures", "--patterns", 4)
     return folder / "captures"
 
 
@@ -46,6 +48,49 @@ def test_a_coherent_ghost_is_late_by_one_path_for_all_colours(
     value = {name: p["value"] for name, p in effect["parameters"].items()}
     assert math.hypot(value["real"], value["imaginary"]) == pytest.approx(0.2, abs=0.002)
     assert value["path_difference_nm"] == pytest.approx(phase_deg / 360 * 520, abs=3)
+
+
+def test_each_laser_has_a_line_width_of_its_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """4, 7.2 and 10.4 nm: with one width for all, 0.0006 of 0.002 is left, outside the catalogue."""
+    with_few_effects(monkeypatch, "temporal_coherence", "wavelength", "spatial_coherence")
+    line = 'kind = "temporal_coherence"\nlinewidth_nm = 4\nspread = 0.8'
+    captures = in_three_colours(capsys, tmp_path, line, distance_mm=12)
+    found = ran(capsys, "explain", captures, "--out", tmp_path / "model.toml")
+    assert [s["added"] for s in found["steps"]] == [None, "temporal_coherence"]
+    assert found["steps"][-1]["excess"] < 2e-4
+    (effect,) = found["effects"]
+    width = effect["parameters"]["line_width_nm"]
+    for name, expected in (("red", 4.0), ("green", 7.2), ("blue", 10.4)):
+        assert abs(width["value"][name] - expected) < 4 * width["error"][name] + 0.1
+
+
+def test_each_laser_has_lines_of_its_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Apart by 6, 2.4 and -1.2 nm, so that no start serves all: with one separation, a wavelength is named."""
+    with_few_effects(monkeypatch, "source_lines", "wavelength", "temporal_coherence")
+    captures = in_three_colours(capsys, tmp_path, 'kind = "source_lines"\nspread = -0.6', distance_mm=12)
+    found = ran(capsys, "explain", captures, "--out", tmp_path / "model.toml")
+    assert [s["added"] for s in found["steps"]] == [None, "source_lines"]
+    assert found["steps"][-1]["excess"] < 2e-4
+    (effect,) = found["effects"]
+    apart, share = (effect["parameters"][name]["value"] for name in ("separation_nm", "share"))
+    for name, expected in (("red", 6.0), ("green", 2.4), ("blue", -1.2)):
+        # Of lines that are near together, only the mean and its distance from the nominal line are certain.
+        assert apart[name][0] * share[name][0] == pytest.approx(0.3 * expected, abs=0.15)
+
+
+def test_a_model_file_with_one_line_width_for_all_lasers_is_read(tmp_path: Path) -> None:
+    of_two, file = bench(True), tmp_path / "model.toml"
+    effect = instance_with(catalogue()["temporal_coherence"], of_two, {"line_width": [2.0, 3.0]})
+    write_model(file, Model(of_two).having(effect))
+    text, rows = file.read_text(), "value.red = 2.0\nvalue.green = 3.0"
+    assert rows in text
+    file.write_text(text.replace(rows, "value = 2.5"))
+    (read,) = read_model(file, catalogue()).present
+    assert read.values["line_width"].tolist() == [2.5, 2.5]
 
 
 def test_a_fit_of_the_iris_goes_on_until_every_edge_is_in_its_place(

@@ -52,6 +52,7 @@ def _described(effect: Effect) -> Result:
                 "high": p.high,
                 "about": p.about,
                 "per_channel": p.per_channel,
+                "per_laser": p.per_laser,
                 "terms": [p.count(o) if callable(p.count) else p.count for o in effect.orders],
             }
             for p in effect.parameters
@@ -78,9 +79,8 @@ def show(result: Result, args: Namespace, screen: Screen) -> None:
     for p in one["parameters"]:
         low, high = plain(p["low"]), plain(p["high"])
         count = " or ".join(str(t) for t in dict.fromkeys(p["terms"])) if any(p["terms"]) else "1"
-        rows.append(
-            (p["name"], p["unit"], low, high, count + (" a channel" if p["per_channel"] else ""), p["about"])
-        )
+        count += " a channel" if p["per_channel"] or p["per_laser"] else ""
+        rows.append((p["name"], p["unit"], low, high, count, p["about"]))
     screen.table(("parameter", "unit", "lowest", "highest", "numbers", "what it is"), rows)
     screen.next(command_line("add", one["name"], "captures/", "--out", f"with_{one['name']}.toml", args=args))
 

@@ -136,14 +136,39 @@ def _start(effect: Effect, model: Model, predictors: list[Predictor], points: li
         starts += [instance_with(effect, model.bench, values) for values in starts_of(effect, evidence)]
     if len(starts) == 1:
         return starts[0]
-    # A start need only be near: one colour and plane are enough.
-    few, there = predictors[:1], points[:1]
+    # A start need only be near: one colour and plane are enough, and of what each laser has of its own, one of each.
+    best = _best_start(effect, model, predictors[:1], points[:1], starts)
+    lasers = [p for p in effect.parameters if p.per_laser and p.has_rows(model.bench)]
+    if not lasers:
+        return best
+    values = {p.name: best.values[p.name].copy() for p in lasers}
+    done = {predictors[0].scene.channel}
+    for predictor, point in zip(predictors[1:], points[1:], strict=True):
+        if predictor.scene.channel not in done:
+            done.add(predictor.scene.channel)
+            row = predictor.scene.channel_row()
+            own = _best_start(effect, model, [predictor], [point], starts)
+            for name, rows in values.items():
+                rows[row] = own.values[name][row]
+    return best.with_values({**best.values, **values})
+
+
+def _best_start(
+    effect: Effect,
+    model: Model,
+    predictors: list[Predictor],
+    points: list[Trace],
+    starts: Sequence[EffectInstance],
+) -> EffectInstance:
+    """The start that a fit would go on from with least error."""
     if effect.stage == "pupil":  # what the panel sends to other wavelengths is the same for all starts
-        there = [p.trace(model.having(starts[0]), "pupil", t) for p, t in zip(few, there, strict=True)]
-    costs = [start_cost(model, few, there, start) for start in starts]
+        points = [
+            p.trace(model.having(starts[0]), "pupil", t) for p, t in zip(predictors, points, strict=True)
+        ]
+    costs = [start_cost(model, predictors, points, start) for start in starts]
     if max(costs) - min(costs) < 1e-9 * max(costs) and not any(has_many(start) for start in starts):
         # A period or a place changes nothing while the amplitude is zero: compare one step ahead.
-        costs = [_one_step_ahead(model, few, there, start) for start in starts]
+        costs = [_one_step_ahead(model, predictors, points, start) for start in starts]
     return starts[costs.index(min(costs))]
 
 

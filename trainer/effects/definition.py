@@ -43,6 +43,8 @@ class Parameter:
         0 for a single number; otherwise how many numbers, or a function of the effect's order.
     per_channel : bool
         One value (or row of values) for each colour.
+    per_laser : bool
+        The same on a bench of several colours; on a bench of one, the value alone.
     even : bool
         The effect depends on the square of this parameter, so its derivative at `absent` is zero.
     starts : tuple of float
@@ -69,6 +71,7 @@ class Parameter:
     high: float = np.inf
     count: int | Callable[[int], int] = 0
     per_channel: bool = False
+    per_laser: bool = False
     even: bool = False
     starts: tuple[float, ...] = ()
     about: str = ""
@@ -87,7 +90,11 @@ class Parameter:
         if self.per_pixel:
             return bench.camera.shape
         row = (self.count(order),) if callable(self.count) else (self.count,) if self.count else ()
-        return (*((len(bench.channels),) if self.per_channel else ()), *row)
+        return (*((len(bench.channels),) if self.has_rows(bench) else ()), *row)
+
+    def has_rows(self, bench: Bench) -> bool:
+        """Whether the parameter has a row for each colour, on a bench."""
+        return self.per_channel or (self.per_laser and len(bench.channels) > 1)
 
     @property
     def key(self) -> str:

@@ -169,7 +169,7 @@ def _is_new(key: tuple[str, str, int], trial: Model, lower: Model) -> bool:
     """Whether a number is one that its effect did not have at the lower order."""
     name, parameter, index = key
     p = trial.instance(name).effect.parameter(parameter)
-    rows = (len(trial.bench.channels) if p.per_channel else 1) * p.blocks
+    rows = (len(trial.bench.channels) if p.has_rows(trial.bench) else 1) * p.blocks
     before = lower.instance(name).values[parameter].size // rows
     now = trial.instance(name).values[parameter].size // rows
     return index % now >= before if now else False

@@ -153,7 +153,7 @@ def raised(present: EffectInstance, bench: Bench, order: int) -> EffectInstance:
     for p in present.effect.parameters:
         old, new = present.values[p.name], higher.values[p.name].copy()
         source, target = old.reshape(-1), new.reshape(-1)
-        rows = (len(bench.channels) if p.per_channel else 1) * p.blocks
+        rows = (len(bench.channels) if p.has_rows(bench) else 1) * p.blocks
         if new.ndim == 0 or p.per_pixel:
             new = old.copy()
         elif source.size:

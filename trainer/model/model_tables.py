@@ -222,8 +222,10 @@ def _numbers(
                 f"{where} has shape {array.shape} in the arrays' file: order {order} has {shape}"
             )
         array = array.astype(np.float64)
-    elif parameter.per_channel:
+    elif parameter.has_rows(bench):
         names = [c.name for c in bench.channels]
+        if parameter.per_laser and not isinstance(given, Mapping):
+            given = dict.fromkeys(names, given)  # one for all lasers, as older files have it
         if not isinstance(given, Mapping):
             raise InputError(
                 f"{where} is {shown(given)}: write one a channel, as {where.split('.')[-1]}.{names[0]} = ..."

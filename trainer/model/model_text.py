@@ -118,7 +118,7 @@ def comment(text: str) -> list[str]:
 
 def per_channel_rows(parameter: Parameter, array: np.ndarray, bench: Bench) -> list[tuple[str, np.ndarray]]:
     """What an array's rows are called in the file: one "" where the parameter is not a colour's own."""
-    if not parameter.per_channel:
+    if not parameter.has_rows(bench):
         return [("", array)]
     return [(c.name, row) for c, row in zip(bench.channels, array, strict=True)]
 
