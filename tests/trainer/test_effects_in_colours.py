@@ -88,9 +88,10 @@ def test_a_model_file_with_one_line_width_for_all_lasers_is_read(tmp_path: Path)
     write_model(file, Model(of_two).having(effect))
     text, rows = file.read_text(), "value.red = 2.0\nvalue.green = 3.0"
     assert rows in text
-    file.write_text(text.replace(rows, "value = 2.5"))
+    older = [line for line in text.replace(rows, "value = 2.5").splitlines() if not line.startswith("apart")]
+    file.write_text("\n".join(older))
     (read,) = read_model(file, catalogue()).present
-    assert read.values["line_width"].tolist() == [2.5, 2.5]
+    assert read.values["line_width"].tolist() == 2.5
 
 
 def test_a_fit_of_the_iris_goes_on_until_every_edge_is_in_its_place(

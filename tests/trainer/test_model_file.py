@@ -64,7 +64,7 @@ def filled(effect: Effect, on: Bench, rng: np.random.Generator, order: int | Non
         low, high = (max(p.low, -50.0), min(p.high, 50.0))
         values[p.name] = rng.uniform(low, high, base.values[p.name].shape)
         errors[p.name] = np.abs(rng.standard_normal(values[p.name].shape)) * 1e-7
-    return EffectInstance(effect, base.order, values, errors)
+    return EffectInstance(base.effect, base.order, values, errors)
 
 
 def whole_model(on: Bench, seed: int = 0) -> Model:

@@ -42,6 +42,7 @@ def _described(effect: Effect) -> Result:
         "formula": effect.formula,
         "references": list(effect.references),
         "orders": list(effect.orders),
+        "colours": effect.colours,
         "source": "built in" if effect in BUILT_IN else effect.source,
         "parameters": [
             {
@@ -52,7 +53,6 @@ def _described(effect: Effect) -> Result:
                 "high": p.high,
                 "about": p.about,
                 "per_channel": p.per_channel,
-                "per_laser": p.per_laser,
                 "terms": [p.count(o) if callable(p.count) else p.count for o in effect.orders],
             }
             for p in effect.parameters
@@ -79,7 +79,7 @@ def show(result: Result, args: Namespace, screen: Screen) -> None:
     for p in one["parameters"]:
         low, high = plain(p["low"]), plain(p["high"])
         count = " or ".join(str(t) for t in dict.fromkeys(p["terms"])) if any(p["terms"]) else "1"
-        count += " a channel" if p["per_channel"] or p["per_laser"] else ""
+        count += " a channel" if p["per_channel"] or one["colours"] == "apart" else ""
         rows.append((p["name"], p["unit"], low, high, count, p["about"]))
     screen.table(("parameter", "unit", "lowest", "highest", "numbers", "what it is"), rows)
     screen.next(command_line("add", one["name"], "captures/", "--out", f"with_{one['name']}.toml", args=args))

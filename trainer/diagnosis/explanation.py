@@ -13,6 +13,7 @@ from runtime.program.progress import Progress, forward_only, no_progress, part_o
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import CaptureRoles, capture_roles
 from trainer.diagnosis.addition import all_raised, all_refitted, gone_on, with_maps_again
+from trainer.diagnosis.colours_in_common import one_in_common
 from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors, screen_candidates
 from trainer.diagnosis.exchange import CLEARLY, exchanged, one_for_two
 from trainer.diagnosis.fitted_ranking import expects_the_rest
@@ -28,7 +29,7 @@ from trainer.fitting.gains import with_gains
 from trainer.fitting.pool import Pool
 from trainer.fitting.predictor import evaluate_captures
 from trainer.fitting.refit import next_order
-from trainer.model.history import form_of, recorded
+from trainer.model.history import IN_COMMON, form_of, recorded
 from trainer.model.model import EffectInstance, Model
 
 MOST_EFFECTS = 8  # an explanation longer than this explains nothing
@@ -51,9 +52,9 @@ class ExplanationStep:
     removed : str or None
         The effect that was taken out; with `added`, exchanged for that one.
     refined : str or None
-        The effect of an earlier step whose map or curve went on in free form.
+        The effect of an earlier step whose map or curve went on in free form, or whose colours were put together again.
     form : mapping
-        The key `form`, where it is a curve.
+        The key `form`, where it is a curve, or the colours' values are in common again.
     """
 
     added: str | None
@@ -67,7 +68,8 @@ class ExplanationStep:
         """A row of the key `steps` of `explain --json`.
 
         Keys `added`, `nrmse`, `excess` and `indistinguishable_from`; `removed` only where an effect was taken out,
-        `refined` only where the map or curve of an earlier one went on in free form, and `form` where that is a curve.
+        `refined` only where the map or curve of an earlier one went on in free form, or its colours were put together,
+        and `form` where it is no map.
         """
         record: dict[str, Any] = {
             "added": self.added,
@@ -234,8 +236,9 @@ def explain(
             if went_on is None:
                 break
             name, model, errors = went_on
-            model = recorded(model, None, errors, refined=name)
-            steps.append(ExplanationStep(None, errors, refined=name, form=form_of(model, name)))
+            form = form_of(model, name)
+            model = recorded(model, None, errors, refined=name, form=form)
+            steps.append(ExplanationStep(None, errors, refined=name, form=form))
             if save:
                 save(model)
             continue
@@ -271,7 +274,15 @@ def explain(
     # A last pass: of every effect but the newest it is known already that the rest cannot do without it.
     if len(model.names) > 1:
         model, errors = without_unnecessary(model, errors, [steps[-1].added] if steps[-1].added else [])
-    if model.names != kept:
+    while (
+        common := one_in_common(roles, model, errors, diagnoses[-1].thresholds, ideal.excess, pool)
+    ) is not None:
+        name, model, errors = common
+        model = recorded(model, None, errors, refined=name, form=IN_COMMON)
+        steps.append(ExplanationStep(None, errors, refined=name, form=IN_COMMON))
+        if save:
+            save(model)
+    if model.names != kept or steps[-1].form == IN_COMMON:
         found = diagnose(captures, model, known, pool, thresholds, None, ideal, thorough=False)
         diagnoses.append(found)
     rest = None

@@ -24,8 +24,13 @@ from trainer.fitting.least_squares_gain import with_gain
 from trainer.fitting.many_numbers import ManySlopes, has_many
 from trainer.fitting.predictor import Predictor, lights_of
 from trainer.fitting.start_points import start_cost, start_points
+from trainer.model.colours_apart import come_apart, may_come_apart
 from trainer.model.model import EffectInstance, Model, absent, instance_with
 from trainer.prediction.predict import Trace
+
+# A candidate starts with values for each colour where these are expected to remove this share of what common ones
+# leave, and this share of what is there.
+OWN, LEAST_OWN = 0.7, 0.01
 
 
 @dataclass(frozen=True)
@@ -88,18 +93,28 @@ def screen_batches(batches: list[Batch], model: Model, effects: tuple[Effect, ..
         if effect.touches_iris:
             wide = wide or _with_wider_band(model, effect, batches)
             predictors, points = wide
-        start = _start(effect, model, predictors, points)
-        trial = model.having(start)
-        moved = [p.trace(trial, effect.stage, t) for p, t in zip(predictors, points, strict=True)]
-        trial = with_gain(trial, predictors, lights_of(trial, predictors, moved))
-        if has_many(start):
-            left = _remaining_of_many(trial, effect.name, predictors, moved, present)
-        else:
-            residual_there, slopes = stacked(trial, keys_of(trial, [effect.name]), predictors, moved)
-            left = remaining(residual_there, torch.cat([slopes, present]))
-        after = (left - noise) / scale
+        expected = [
+            (start, (_left(model, start, predictors, points, present) - noise) / scale)
+            for start in _starts(effect, model, predictors, points)
+        ]
+        start, after = expected[0]
+        if len(expected) > 1 and after - expected[1][1] > max(OWN * after, LEAST_OWN * before):
+            start, after = expected[1]
         results.append(ScreenResult(effect.name, start, before, after))
     return results
+
+
+def _left(
+    model: Model, start: EffectInstance, predictors: list[Predictor], points: list[Trace], present: Tensor
+) -> float:
+    """Squared error that a straight-line step from an effect's start would leave."""
+    trial = model.having(start)
+    moved = [p.trace(trial, start.effect.stage, t) for p, t in zip(predictors, points, strict=True)]
+    trial = with_gain(trial, predictors, lights_of(trial, predictors, moved))
+    if has_many(start):
+        return _remaining_of_many(trial, start.effect.name, predictors, moved, present)
+    residual, slopes = stacked(trial, keys_of(trial, [start.effect.name]), predictors, moved)
+    return remaining(residual, torch.cat([slopes, present]))
 
 
 def _with_wider_band(
@@ -126,6 +141,30 @@ def _numbers(effect: Effect, model: Model) -> tuple[tuple[str, str, int], ...]:
     return keys_of(model.having(absent(effect, model.bench)), [effect.name])
 
 
+def _starts(
+    effect: Effect, model: Model, predictors: list[Predictor], points: list[Trace]
+) -> list[EffectInstance]:
+    """Where a fit of an effect may start: with values in common, and with each colour's own where it may have these."""
+    colours = list(dict.fromkeys(p.scene.channel for p in predictors))
+    if len(colours) < 2 or effect.colours == "alike":
+        return [_start(effect, model, predictors, points)]
+    own = absent(effect, model.bench)
+    own = come_apart(own, model.bench) if may_come_apart(own, model.bench) else own
+    values = {name: rows.copy() for name, rows in own.values.items()}
+    for colour in colours:
+        pairs = [(p, t) for p, t in zip(predictors, points, strict=True) if p.scene.channel == colour]
+        found = _start(effect, model, [p for p, _ in pairs], [t for _, t in pairs])
+        rows = found if found.effect.in_common else come_apart(found, model.bench)
+        row = pairs[0][0].scene.channel_row()
+        for name, of_colours in values.items():
+            of_colours[row] = rows.values[name][row]
+    own = own.with_values(values)
+    if effect.colours == "apart":
+        return [own]
+    common = _start(effect, model, predictors, points)
+    return [common] if effect.rugged or has_many(own) else [common, own]
+
+
 def _start(effect: Effect, model: Model, predictors: list[Predictor], points: list[Trace]) -> EffectInstance:
     starts = start_points(effect, model)
     if effect.starts is not None:
@@ -136,39 +175,14 @@ def _start(effect: Effect, model: Model, predictors: list[Predictor], points: li
         starts += [instance_with(effect, model.bench, values) for values in starts_of(effect, evidence)]
     if len(starts) == 1:
         return starts[0]
-    # A start need only be near: one colour and plane are enough, and of what each laser has of its own, one of each.
-    best = _best_start(effect, model, predictors[:1], points[:1], starts)
-    lasers = [p for p in effect.parameters if p.per_laser and p.has_rows(model.bench)]
-    if not lasers:
-        return best
-    values = {p.name: best.values[p.name].copy() for p in lasers}
-    done = {predictors[0].scene.channel}
-    for predictor, point in zip(predictors[1:], points[1:], strict=True):
-        if predictor.scene.channel not in done:
-            done.add(predictor.scene.channel)
-            row = predictor.scene.channel_row()
-            own = _best_start(effect, model, [predictor], [point], starts)
-            for name, rows in values.items():
-                rows[row] = own.values[name][row]
-    return best.with_values({**best.values, **values})
-
-
-def _best_start(
-    effect: Effect,
-    model: Model,
-    predictors: list[Predictor],
-    points: list[Trace],
-    starts: Sequence[EffectInstance],
-) -> EffectInstance:
-    """The start that a fit would go on from with least error."""
+    # A start need only be near: one colour and plane are enough.
+    few, there = predictors[:1], points[:1]
     if effect.stage == "pupil":  # what the panel sends to other wavelengths is the same for all starts
-        points = [
-            p.trace(model.having(starts[0]), "pupil", t) for p, t in zip(predictors, points, strict=True)
-        ]
-    costs = [start_cost(model, predictors, points, start) for start in starts]
+        there = [p.trace(model.having(starts[0]), "pupil", t) for p, t in zip(few, there, strict=True)]
+    costs = [start_cost(model, few, there, start) for start in starts]
     if max(costs) - min(costs) < 1e-9 * max(costs) and not any(has_many(start) for start in starts):
         # A period or a place changes nothing while the amplitude is zero: compare one step ahead.
-        costs = [_one_step_ahead(model, predictors, points, start) for start in starts]
+        costs = [_one_step_ahead(model, few, there, start) for start in starts]
     return starts[costs.index(min(costs))]
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from trainer.formatting import UNIT_SUFFIX
 
 STAGES = ("drive", "panel", "pupil", "sensor")
 ACTS_ON = ("display", "camera")
+COLOURS = ("alike", "apart", "either")
 
 
 @dataclass(frozen=True)
@@ -43,8 +44,6 @@ class Parameter:
         0 for a single number; otherwise how many numbers, or a function of the effect's order.
     per_channel : bool
         One value (or row of values) for each colour.
-    per_laser : bool
-        The same on a bench of several colours; on a bench of one, the value alone.
     even : bool
         The effect depends on the square of this parameter, so its derivative at `absent` is zero.
     starts : tuple of float
@@ -71,7 +70,6 @@ class Parameter:
     high: float = np.inf
     count: int | Callable[[int], int] = 0
     per_channel: bool = False
-    per_laser: bool = False
     even: bool = False
     starts: tuple[float, ...] = ()
     about: str = ""
@@ -90,11 +88,7 @@ class Parameter:
         if self.per_pixel:
             return bench.camera.shape
         row = (self.count(order),) if callable(self.count) else (self.count,) if self.count else ()
-        return (*((len(bench.channels),) if self.has_rows(bench) else ()), *row)
-
-    def has_rows(self, bench: Bench) -> bool:
-        """Whether the parameter has a row for each colour, on a bench."""
-        return self.per_channel or (self.per_laser and len(bench.channels) > 1)
+        return (*((len(bench.channels),) if self.per_channel else ()), *row)
 
     @property
     def key(self) -> str:
@@ -139,6 +133,11 @@ class Effect:
         The effect that it equals in captures of one colour and plane, where it is no candidate; "" for none.
     rare : bool
         Few benches have it: an effect that captures cannot tell it from is named before it.
+    colours : str
+        On a bench of several colours: "alike", one value serves all; "apart", each has its own; "either", as captures
+        say.
+    in_common : Effect or None
+        Where each colour has its own values: the effect with one for all. See `apart`.
     free_form : FreeForm or None
         How the effect's map or curve goes on where its polynomials end.
     formula : str
@@ -165,6 +164,8 @@ class Effect:
     takes_moment: bool = False
     same_as: str = ""
     rare: bool = False
+    colours: str = "alike"
+    in_common: Effect | None = None
     free_form: FreeForm | None = None
     formula: str = ""
     description: str = ""
@@ -173,6 +174,14 @@ class Effect:
     def parameter(self, name: str) -> Parameter:
         """The parameter of that name."""
         return next(p for p in self.parameters if p.name == name)
+
+
+def apart(one: Effect) -> Effect:
+    """The same effect with values for each colour, where it has them for all together."""
+    if one.in_common is not None:
+        return one
+    parameters = tuple(p if p.per_pixel else replace(p, per_channel=True) for p in one.parameters)
+    return replace(one, parameters=parameters, in_common=one)
 
 
 def effect(
@@ -188,6 +197,7 @@ def effect(
     told_to: str | None = None,
     same_as: str = "",
     rare: bool = False,
+    colours: str = "alike",
     free_form: FreeForm | None = None,
     formula: str = "",
 ) -> Callable[[Callable[..., Any]], Effect]:
@@ -199,7 +209,8 @@ def effect(
 
     Parameters
     ----------
-    stage, acts_on, parameters, orders, starts, touches_iris, rugged, measure, same_as, rare, free_form, formula
+    stage, acts_on, parameters, orders, starts, touches_iris, rugged, measure, same_as, rare, colours, free_form,
+    formula
         As in `Effect`.
     told_to : str, optional
         The former name of `acts_on`.
@@ -212,7 +223,7 @@ def effect(
     Raises
     ------
     InputError
-        Where `stage` or `acts_on` is unknown, or the parameters do not fit the function.
+        Where `stage`, `acts_on` or `colours` is unknown, or the parameters do not fit the function.
     """
     acted_on = acts_on or told_to
 
@@ -222,6 +233,8 @@ def effect(
             raise InputError(f"effect '{name}': stage '{stage}' is not one of {', '.join(STAGES)}")
         if acted_on not in ACTS_ON:
             raise InputError(f"effect '{name}': acts_on '{acted_on}' is not one of {', '.join(ACTS_ON)}")
+        if colours not in COLOURS:
+            raise InputError(f"effect '{name}': colours '{colours}' is not one of {', '.join(COLOURS)}")
         if not parameters:
             raise InputError(f"effect '{name}': give it at least one Parameter")
         arguments = list(inspect.signature(function).parameters.values())[1:]
@@ -253,6 +266,8 @@ def effect(
             "moment" in given,
             same_as,
             rare,
+            colours,
+            None,
             free_form,
             formula.strip(),
             text.description,

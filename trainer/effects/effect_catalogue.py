@@ -14,7 +14,7 @@ from types import ModuleType
 
 from firmware_iface.errors import InputError
 from trainer.effects import camera_in_time, drive, light_source, modulation, panel, pupil, sensor
-from trainer.effects.definition import Effect
+from trainer.effects.definition import Effect, apart
 from trainer.effects.own_effect import line_in_file
 
 ENTRY_POINTS = "hololoop.effects"
@@ -63,17 +63,19 @@ Catalogue = dict[str, Effect]
 _files: dict[str, Catalogue] = {}  # effect files, read for effects that came from another process
 
 
-def _named(name: str, source: str) -> Effect:
-    for one in BUILT_IN:
-        if one.name == name:
-            return one
+def _named(name: str, source: str, is_apart: bool = False) -> Effect:
+    one = next((e for e in BUILT_IN if e.name == name), None) or _of_source(name, source)
+    return apart(one) if is_apart else one
+
+
+def _of_source(name: str, source: str) -> Effect:
     if source not in _files:
         _files[source] = {e.name: e for e in load_effects(Path(source))}
     return _files[source].get(name) or catalogue()[name]
 
 
 # An effect travels to other processes by name: the function of a decorated effect cannot be pickled.
-copyreg.pickle(Effect, lambda one: (_named, (one.name, one.source)))
+copyreg.pickle(Effect, lambda one: (_named, (one.name, one.source, one.in_common is not None)))
 
 
 def forget_effect_files() -> None:

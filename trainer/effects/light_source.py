@@ -20,6 +20,7 @@ FWHM = 2 * math.sqrt(2 * math.log(2))
 @effect(
     stage="pupil",
     acts_on="display",
+    colours="apart",
     parameters=[
         Parameter(
             "line_width",
@@ -27,7 +28,6 @@ FWHM = 2 * math.sqrt(2 * math.log(2))
             scale=0.3,
             low=0,
             high=40,
-            per_laser=True,
             even=True,
             starts=(0.5, 2.0),
             typical=(0, 40),
@@ -78,6 +78,7 @@ def _lines_needed(pupil: Pupil, deviation: float) -> int:
     stage="pupil",
     acts_on="display",
     orders=(1, 2),
+    colours="apart",
     parameters=[
         Parameter(
             "separation",
@@ -87,7 +88,6 @@ def _lines_needed(pupil: Pupil, deviation: float) -> int:
             low=-60,
             high=60,
             count=lambda order: order,
-            per_laser=True,
             starts=(-24.0, -12.0, -6.0, -3.0, -1.5, 1.5, 3.0, 6.0, 12.0, 24.0),
             about="of each further line from the stated wavelength",
             typical=(-20, 20),
@@ -99,7 +99,6 @@ def _lines_needed(pupil: Pupil, deviation: float) -> int:
             low=-0.2,
             high=0.5,
             count=lambda order: order,
-            per_laser=True,
             about="of the light in each further line",
             typical=(0, 0.5),
             example=0.4,
@@ -124,6 +123,7 @@ def source_lines(pupil: Pupil, separation: Tensor, share: Tensor) -> Pupil:
 @effect(
     stage="pupil",
     acts_on="display",
+    colours="either",
     touches_iris=True,
     parameters=[
         *(

@@ -68,6 +68,7 @@ def amplitude_modulation(drive: Drive, amplitude: Tensor) -> Drive:
 @effect(
     stage="drive",
     acts_on="display",
+    colours="either",
     rare=True,
     parameters=[
         Parameter(

@@ -19,6 +19,7 @@ from trainer.prediction.stages import Panel
 @effect(
     stage="panel",
     acts_on="display",
+    colours="either",
     orders=(0, 2, 4),
     parameters=[
         Parameter(
@@ -114,6 +115,7 @@ def _brightened(panel: Panel, log_amplitude: Tensor) -> Panel:
 @effect(
     stage="panel",
     acts_on="display",
+    colours="either",
     orders=(2, 4, 6, 8),
     free_form=FreeForm(_brightened, "1", 0.05),
     parameters=[
@@ -154,6 +156,7 @@ def _delayed(panel: Panel, wavefront: Tensor) -> Panel:
 @effect(
     stage="panel",
     acts_on="display",
+    colours="either",
     orders=(2, 4, 6, 8, 10),
     starts=wavefront_starts,
     free_form=FreeForm(_delayed, "rad", 0.1),
@@ -190,6 +193,7 @@ def panel_wavefront(panel: Panel, wavefront: Tensor) -> Panel:
 @effect(
     stage="panel",
     acts_on="display",
+    colours="either",
     starts=coherent_ghost_starts,
     parameters=[
         Parameter(

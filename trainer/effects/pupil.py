@@ -91,6 +91,7 @@ def _delayed(pupil: Pupil, waves: Tensor) -> Pupil:
 @effect(
     stage="pupil",
     acts_on="display",
+    colours="either",
     orders=(4, 6),
     free_form=FreeForm(_delayed, "waves", 0.02),
     parameters=[
@@ -127,6 +128,7 @@ def pupil_aberration(pupil: Pupil, zernike: Tensor, *, order: int) -> Pupil:
 @effect(
     stage="pupil",
     acts_on="display",
+    colours="either",
     touches_iris=True,
     rugged=True,
     parameters=[

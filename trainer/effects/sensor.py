@@ -20,6 +20,7 @@ from trainer.prediction.stages import Sensor
 @effect(
     stage="sensor",
     acts_on="camera",
+    colours="either",
     parameters=[
         *(
             Parameter(
@@ -74,6 +75,7 @@ def sensor_blur(
 @effect(
     stage="sensor",
     acts_on="camera",
+    colours="either",
     orders=(1, 3),
     starts=registration_starts,
     parameters=[
@@ -144,6 +146,7 @@ def _brightened(sensor: Sensor, log_gain: Tensor) -> Sensor:
 @effect(
     stage="sensor",
     acts_on="camera",
+    colours="either",
     orders=(2, 4, 6),
     free_form=FreeForm(_brightened, "1", 0.05),
     parameters=[
@@ -179,6 +182,7 @@ def vignetting(sensor: Sensor, log_gain: Tensor) -> Sensor:
 @effect(
     stage="sensor",
     acts_on="camera",
+    colours="either",
     orders=(1, 2, 4, 6, 8),
     free_form=FreeForm(Sensor.brightened, "counts", 5.0),
     parameters=[
@@ -288,6 +292,7 @@ def laser_drift(sensor: Sensor, spread: Tensor) -> Sensor:
 @effect(
     stage="sensor",
     acts_on="display",
+    colours="either",
     starts=ghost_starts,
     parameters=[
         Parameter(

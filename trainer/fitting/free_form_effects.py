@@ -109,7 +109,7 @@ def _node_shapes(model: Model, name: str, batch: Batch) -> list[tuple[int, int]]
     """Rows and columns of nodes to try, coarse to fine; of a curve, a row for all colours or one for each."""
     effect = model.instance(name).effect
     if effect.free_form is not None and effect.free_form.curve:
-        rows = len(model.bench.channels) if any(p.has_rows(model.bench) for p in effect.parameters) else 1
+        rows = len(model.bench.channels) if any(p.per_channel for p in effect.parameters) else 1
         return [(rows, count) for count in CURVE_NODES]
     grid = _grid(model, name, batch)
     spacings = sorted({max(min(grid) / parts, LEAST_SPACING) for parts in PARTS}, reverse=True)

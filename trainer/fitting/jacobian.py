@@ -42,6 +42,16 @@ def stepped(model: Model, key: tuple[str, str, int], change: float) -> Model:
     return model.having(replace(present, values={**present.values, parameter: values}))
 
 
+def colour_of(model: Model, key: tuple[str, str, int]) -> str | None:
+    """The colour whose own a number is; None where colours have it in common."""
+    name, parameter, index = key
+    present = model.instance(name)
+    if not present.effect.parameter(parameter).per_channel:
+        return None
+    rows = len(model.bench.channels)
+    return model.bench.channels[index // (present.values[parameter].size // rows)].name
+
+
 def away_from_absent(model: Model, key: tuple[str, str, int]) -> float:
     """How far one number of one effect is from its value where the effect is not there; physical units."""
     name, parameter, index = key
@@ -73,8 +83,8 @@ def columns(
     -------
     tensor [B, h, w], counts
     list of tensors [B, h, w]
-        Change a unit of each parameter, then of the logarithm of the gain. Zero for a number that changes nothing here,
-        where the difference would be rounding alone.
+        Change a unit of each parameter, then of the logarithm of the gain. Zero for another colour's number, and for
+        one that changes nothing here, where the difference would be rounding alone.
     """
     light = predictor.light(model, point)
     base = predictor.counts(model, light)
@@ -85,6 +95,8 @@ def columns(
         return found if scale * float(torch.linalg.vector_norm(found)) > least else torch.zeros_like(found)
 
     def of_number(key: tuple[str, str, int]) -> Tensor:
+        if colour_of(model, key) not in (None, predictor.batch.channel):
+            return torch.zeros_like(base)
         step, effect = column_step(model, key), model.instance(key[0]).effect
         moved = predictor.predict_nearby(stepped(model, key, step), effect.stage, point)
         return slope(moved, step, effect.parameter(key[1]).scale)

@@ -1,4 +1,4 @@
-"""Fits of whole models: one effect from its start, all effects together, and orders raised as far as that helps."""
+"""Fits of whole models: one effect from its start, all effects together, and further numbers as far as these help."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from trainer.fitting.jacobian import keys_of, remaining, stacked
 from trainer.fitting.many_numbers import has_many
 from trainer.fitting.predictor import Predictor
 from trainer.fitting.start_points import pattern_search
+from trainer.model.colours_apart import come_apart, may_come_apart
 from trainer.model.model import EffectInstance, Model, raised
 
 # Order from which a map goes on in free form, where its effect has one: terms grow as its square.
@@ -23,6 +24,9 @@ SEARCH_SCENES = 3
 RUGGED_TURNS, RUGGED_LEFT = 3, 0.8
 # Of the excess that an order must remove: where a straight line expects less, it is not fitted.
 LEAST_EXPECTED = 0.5
+# What further numbers of an effect are: of its next order, of each colour for itself, or of both (not at once).
+Further = tuple[str, str]
+ORDER, APART, BOTH = "order", "apart", "both"
 # Orders are raised at once where each expects this share of what the one that expects most does: what others expect may
 # be its doing.
 RIVALS = 0.3
@@ -94,7 +98,7 @@ def raise_orders(
     rising = [n for n in names if n not in {name for name, _ in fixed}]
     while True:
         needed = gain_needed(fitted.errors.excess)
-        trial = _with_orders_that_pay(fitted.model, names, rising, batches, LEAST_EXPECTED * needed)
+        trial = _with_numbers_that_pay(fitted.model, names, rising, batches, LEAST_EXPECTED * needed)
         if trial is None:
             return fitted
         better = fit(trial, names, batches, iterations=8, hold=hold, fixed=fixed)
@@ -104,58 +108,71 @@ def raise_orders(
 
 
 @torch.no_grad()
-def _with_orders_that_pay(
+def _with_numbers_that_pay(
     model: Model, names: Sequence[str], rising: Sequence[str], batches: Sequence[Batch], least: float
 ) -> Model | None:
-    """The model with the next orders, absent, of those effects that a straight-line step expects so much excess of.
+    """The model with further numbers, absent, of those effects that a straight-line step expects so much excess of.
 
-    The step is that of all new terms and everything that is fitted, on the most telling capture of each batch. Of
-    effects whose terms expect the same, the one that expects most is taken, and beside it those that expect about as
-    much of what is left.
+    Further numbers are those of an effect's next order, and those that each colour has for itself. The step is that of
+    all of them and everything that is fitted, on the most telling capture of each batch. Of those that expect the same,
+    the one that expects most is taken, and beside it those that expect about as much of what is left.
 
     Parameters
     ----------
-    names, rising : sequence of str
-        Of the effects that are fitted, and of those whose orders may be raised.
     least : float
-        Excess that an effect's next order must be expected to remove, beside those that are taken already.
+        Excess that further numbers must be expected to remove, beside those that are taken already.
 
     Returns
     -------
     Model or None
-        None where no order pays.
+        None where nothing pays.
     """
-    higher = {name: next_order(model.instance(name)) for name in rising}
-    trials = {n: raised(model.instance(n), model.bench, o) for n, o in higher.items() if o is not None}
-    if not trials:
-        return None
     every = model
-    for one in trials.values():
-        every = every.having(one)
+    colours = {b.channel for b in batches}
+    for name in rising:
+        present = model.instance(name)
+        order = next_order(present)
+        trial = present if order is None else raised(present, model.bench, order)
+        if len(colours) > 1 and may_come_apart(trial, model.bench):
+            alone = come_apart(trial, model.bench)
+            trial = trial if has_many(alone) else alone
+        every = every.having(trial) if trial is not present else every
+    if every is model:
+        return None
     few = [telling(model, b, 1) for b in batches]
     predictors = [Predictor(every, b) for b in few]
     points = [p.trace(every) for p in predictors]
     keys = keys_of(every, [n for n in names if not has_many(every.instance(n))])
     residual, slopes = stacked(every, keys, predictors, points)
-    new = [key[0] if _is_new(key, every, model) else "" for key in keys]
-    new += [""] * (len(slopes) - len(keys))
+    own = [_meaning(key, every, model) for key in keys]
+    kinds: list[Further | None] = [None] * len(slopes)
+    for k, (key, (kind, first)) in enumerate(zip(keys, own, strict=True)):
+        kinds[k] = kind
+        if first != key[2]:  # what colours have in common is the sum of their slopes
+            slopes[keys.index((*key[:2], first))] += slopes[k]
     scale = signal_variance(few)
 
-    def left(taken: Sequence[str]) -> float:
-        return remaining(residual, slopes[[not one or one in taken for one in new]]) / scale
+    def left(taken: Sequence[Further]) -> float:
+        return remaining(residual, slopes[[kind is None or kind in taken for kind in kinds]]) / scale
 
-    taken: list[str] = []
+    taken: list[Further] = []
     before = left(taken)
-    while rest := [n for n in trials if n not in taken]:
-        after = {n: left([*taken, n]) for n in rest}
-        best = min(rest, key=lambda n: after[n])
+    offered = [kind for kind in dict.fromkeys(kinds) if kind is not None and kind[1] != BOTH]
+    while rest := [kind for kind in offered if kind not in taken]:
+        after = {kind: left([*taken, kind]) for kind in rest}
+        best = min(rest, key=lambda kind: after[kind])
         if before - after[best] < least:
             break
         least = max(least, RIVALS * (before - after[best]))
         taken.append(best)
         before = after[best]
-    for name in taken:
-        model = model.having(trials[name])
+    for name, what in taken:
+        present = model.instance(name)
+        order = next_order(present)
+        if what == APART:
+            model = model.having(come_apart(present, model.bench))
+        elif order is not None:
+            model = model.having(raised(present, model.bench, order))
     return model if taken else None
 
 
@@ -165,11 +182,23 @@ def telling(model: Model, batch: Batch, count: int) -> Batch:
     return batch.only(sorted(left.argsort(descending=True)[:count].tolist()))
 
 
-def _is_new(key: tuple[str, str, int], trial: Model, lower: Model) -> bool:
-    """Whether a number is one that its effect did not have at the lower order."""
+def _meaning(key: tuple[str, str, int], every: Model, lower: Model) -> tuple[Further | None, int]:
+    """What a number of the larger model is a part of, None for one that is there already.
+
+    And the index of the first colour's number that stands for all colours' together: its own where colours have it for
+    themselves in both models.
+    """
     name, parameter, index = key
-    p = trial.instance(name).effect.parameter(parameter)
-    rows = (len(trial.bench.channels) if p.has_rows(trial.bench) else 1) * p.blocks
-    before = lower.instance(name).values[parameter].size // rows
-    now = trial.instance(name).values[parameter].size // rows
-    return index % now >= before if now else False
+    large, small = every.instance(name), lower.instance(name)
+    p, before = large.effect.parameter(parameter), small.effect.parameter(parameter)
+    size = large.values[parameter].size
+    rows = len(every.bench.channels) if p.per_channel else 1
+    rows_before = len(every.bench.channels) if before.per_channel else 1
+    block = size // (rows * p.blocks)
+    is_higher = index % block >= small.values[parameter].size // (rows_before * p.blocks) if block else False
+    if rows == rows_before:
+        return ((name, ORDER) if is_higher else None), index
+    row, first = divmod(index, size // rows)
+    if row == 0:
+        return ((name, ORDER) if is_higher else None), first
+    return ((name, BOTH if is_higher else APART)), first

@@ -130,10 +130,10 @@ def _numbers(present: EffectInstance, model: Model) -> Iterator[FittedNumber]:
             continue
         values = present.values[parameter.name]
         errors = present.errors[parameter.name] if present.errors else np.full(values.shape, math.nan)
-        absent, rows = parameter.absent_value(model.bench), parameter.has_rows(model.bench)
+        absent = parameter.absent_value(model.bench)
         for place in product(*map(range, values.shape)):
-            channel = model.bench.channels[place[0]].name if rows else None
-            rest = place[1:] if rows else place
+            channel = model.bench.channels[place[0]].name if parameter.per_channel else None
+            rest = place[1:] if parameter.per_channel else place
             yield FittedNumber(
                 present.effect.name,
                 present.effect.stage,

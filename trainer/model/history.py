@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
@@ -16,6 +17,7 @@ def recorded(
     errors: PredictionErrors,
     dropped: str | None = None,
     refined: str | None = None,
+    form: Mapping[str, str] | None = None,
 ) -> Model:
     """The model with one more record in its history.
 
@@ -28,7 +30,9 @@ def recorded(
     dropped : str, optional
         The effect that was taken out.
     refined : str, optional
-        The effect whose map or curve went on in free form.
+        The effect whose map or curve went on in free form, or whose colours were put together again.
+    form : mapping, optional
+        The key `form` of such a record: see `form_of` and `IN_COMMON`.
     """
     record: dict[str, Any] = {
         "added": name or "",
@@ -39,8 +43,11 @@ def recorded(
         record["removed"] = dropped
     if refined:
         record["refined"] = refined
-        record.update(form_of(model, refined))
+        record.update(form or {})
     return replace(model, history=(*model.history, record))
+
+
+IN_COMMON = {"form": "values in common"}  # of an effect whose colours were put together again
 
 
 def form_of(model: Model, refined: str) -> dict[str, str]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from trainer.captures.bench_file import Bench
-from trainer.effects.definition import Effect
+from trainer.effects.definition import Effect, apart
 from trainer.effects.own_effect import parameters_of
 from trainer.prediction.panel_field import NAME
 
@@ -110,8 +110,13 @@ class Model:
 
 
 def absent(effect: Effect, bench: Bench, order: int | None = None) -> EffectInstance:
-    """The effect at the values at which it changes nothing, at its lowest order unless another is given."""
+    """The effect at the values at which it changes nothing, at its lowest order unless another is given.
+
+    An effect of the lasers has values for each of several colours.
+    """
     order = effect.orders[0] if order is None else order
+    if effect.colours == "apart" and len(bench.channels) > 1:
+        effect = apart(effect)
     with parameters_of(effect):
         values = {
             p.name: np.full(p.shape(order, bench), p.absent_value(bench), dtype=np.float64)
@@ -135,7 +140,7 @@ def instance_with(
     base = absent(effect, bench, order)
     full = dict(base.values)
     for name, value in values.items():
-        p, shape = effect.parameter(name), base.values[name].shape
+        p, shape = base.effect.parameter(name), base.values[name].shape
         held = np.clip(np.asarray(value, dtype=float), p.low, p.high)
         full[name] = np.array(
             held.reshape(shape) if held.size == math.prod(shape) else np.broadcast_to(held, shape)
@@ -153,7 +158,7 @@ def raised(present: EffectInstance, bench: Bench, order: int) -> EffectInstance:
     for p in present.effect.parameters:
         old, new = present.values[p.name], higher.values[p.name].copy()
         source, target = old.reshape(-1), new.reshape(-1)
-        rows = (len(bench.channels) if p.has_rows(bench) else 1) * p.blocks
+        rows = (len(bench.channels) if p.per_channel else 1) * p.blocks
         if new.ndim == 0 or p.per_pixel:
             new = old.copy()
         elif source.size:

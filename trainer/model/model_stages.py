@@ -98,7 +98,7 @@ def _stage(
             value = given.get(p.name)
             if value is None:
                 value = torch.as_tensor(one.values[p.name], dtype=scene.dtype)
-            arguments[p.name] = value[row] if p.has_rows(scene.bench) else value
+            arguments[p.name] = value[row] if p.per_channel else value
         if one.effect.takes_order:
             arguments["order"] = one.order
         if one.effect.takes_moment:

@@ -12,10 +12,10 @@ import numpy as np
 from firmware_iface.errors import InputError, nearest
 from runtime.lightpath.propagation import METHODS
 from trainer.captures.bench_file import Bench, read_bench
-from trainer.effects.definition import Effect, Parameter
+from trainer.effects.definition import Effect, Parameter, apart
 from trainer.effects.effect_catalogue import Catalogue, find_effect
 from trainer.model.model import EffectInstance, Model
-from trainer.model.model_text import CURVE, MAP, allowed
+from trainer.model.model_text import APART, CURVE, MAP, allowed
 from trainer.prediction.free_stages import LEARNED, LEARNED_STAGES, learned_stage
 from trainer.prediction.panel_field import NAME, UNITS
 
@@ -158,7 +158,11 @@ def _effect(
         effect = find_effect(known, name)
     except InputError as error:
         raise InputError(f"{error}; an effect that is not built in needs its file, with --effects") from None
-    only_keys(row, ("name", "order", MAP, CURVE, "parameters"), f"effect '{name}': ")
+    only_keys(row, ("name", "order", APART, MAP, CURVE, "parameters"), f"effect '{name}': ")
+    if type(row.get(APART, False)) is not bool:
+        raise InputError(f"effect '{name}': {APART} is {shown(row[APART])}: write true or false")
+    if row.get(APART):
+        effect = apart(effect)
     order = row.get("order")
     if type(order) is not int or order not in effect.orders:
         orders = ", ".join(map(str, effect.orders))
@@ -222,10 +226,8 @@ def _numbers(
                 f"{where} has shape {array.shape} in the arrays' file: order {order} has {shape}"
             )
         array = array.astype(np.float64)
-    elif parameter.has_rows(bench):
+    elif parameter.per_channel:
         names = [c.name for c in bench.channels]
-        if parameter.per_laser and not isinstance(given, Mapping):
-            given = dict.fromkeys(names, given)  # one for all lasers, as older files have it
         if not isinstance(given, Mapping):
             raise InputError(
                 f"{where} is {shown(given)}: write one a channel, as {where.split('.')[-1]}.{names[0]} = ..."

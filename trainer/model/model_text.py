@@ -25,6 +25,7 @@ from trainer.prediction.panel_field import NAME
 
 LONGEST = 128  # numbers of an array that stay in the text: every built-in map and curve does
 WIDTH = 110
+APART = "apart"  # key of an effect whose values each colour has for itself
 MAP, CURVE = "map", "curve"  # keys of an effect's free form
 
 Store = Callable[[str, np.ndarray], str]
@@ -118,7 +119,7 @@ def comment(text: str) -> list[str]:
 
 def per_channel_rows(parameter: Parameter, array: np.ndarray, bench: Bench) -> list[tuple[str, np.ndarray]]:
     """What an array's rows are called in the file: one "" where the parameter is not a colour's own."""
-    if not parameter.has_rows(bench):
+    if not parameter.per_channel:
         return [("", array)]
     return [(c.name, row) for c, row in zip(bench.channels, array, strict=True)]
 
@@ -161,13 +162,15 @@ def _bench(bench: Bench) -> str:
 def _effect(present: EffectInstance, bench: Bench, store: Store) -> str:
     effect = present.effect
     lines = comment(f"{effect.about} [{effect.stage}]")
-    if effect not in BUILT_IN:
+    if (effect.in_common or effect) not in BUILT_IN:
         lines += comment(f"Not built in: name its file, {Path(effect.source).name}, with --effects.")
     lines += ["[[effect]]", f"name = {literal(effect.name)}"]
     order = f"order = {present.order}"
     if len(effect.orders) > 1:
         order += f"  # one of {', '.join(map(str, effect.orders))}; each order has its own number of terms"
     lines.append(order)
+    if effect.in_common is not None:
+        lines.append(f"{APART} = true  # each colour has values of its own")
     if present.nodes is not None and effect.free_form is not None:
         form, (rows, columns) = effect.free_form, present.nodes.shape
         name = store(f"{effect.name}.{form.form}", np.asarray(present.nodes, np.float64))

@@ -31,7 +31,7 @@ def json_values(present: EffectInstance, bench: Bench) -> dict[str, dict[str, An
 
 
 def _plain(parameter: Parameter, values: np.ndarray, bench: Bench) -> Any:
-    if parameter.has_rows(bench):
+    if parameter.per_channel:
         return {c.name: values[k].tolist() for k, c in enumerate(bench.channels)}
     return values.tolist()
 
@@ -56,7 +56,7 @@ def describe(present: EffectInstance, bench: Bench) -> str:
             continue
         if values.ndim == 0:
             words.append(f"{label} {measured(float(values), float(errors), p.unit)}")
-        elif p.has_rows(bench) and values.ndim == 1:
+        elif p.per_channel and values.ndim == 1:
             for k, channel in enumerate(bench.channels):
                 name = f"{label} " if len(bench.channels) == 1 else f"{label} ({channel.name}) "
                 words.append(f"{name}{measured(float(values[k]), float(errors[k]), p.unit)}")
