@@ -42,9 +42,9 @@ class FreeForm:
     curve: bool = False
 
     def added(self, stage: Any, nodes: Tensor, colour: int) -> Any:
-        """The stage with what the nodes [m, n] make; a curve's rows are one for all colours, or one for each."""
+        """The stage with what the nodes make: a map's [m, n], or [colours, m, n]; a curve's [1 or colours, n]."""
         if not self.curve:
-            return self.apply(stage, surface_over(stage, nodes))
+            return self.apply(stage, surface_over(stage, nodes[colour] if nodes.ndim == 3 else nodes))
         row = nodes[colour if nodes.shape[0] > 1 else 0]
         values = _over_pixels(SAMPLES, nodes.shape[1]).to(nodes.dtype) @ row
         return self.apply(stage, values - values[0])

@@ -30,6 +30,9 @@ CURVE_ITERATIONS, CURVE_ROUNDS = 10, 12  # a curve's nodes differ much in how ma
 FIRST_GAIN = 0.25  # share of the error that the coarsest map must remove for the polynomials to have ended
 FINER_GAIN = 0.05  # share that more nodes must remove to be kept
 REFIT_ITERATIONS = 3
+# Nodes and all other numbers go on in turns while each leaves less than this share. A rough beam on 96 x 128 pixels
+# ends at 0.0006 after one turn, and at 0.0001 after four.
+TURNS, UNSETTLED = 4, 0.8
 
 
 def can_go_on(model: Model) -> tuple[str, ...]:
@@ -73,7 +76,18 @@ def with_free_form(
         best, least = trial, excess
         if least < enough:
             break
-    return None if best is model else best
+    if best is model:
+        return None
+    for _ in range(TURNS):
+        if least < enough:
+            break
+        trial = _descended(best, name, None, fitted, stopping)
+        trial = fit(trial, trial.names, fitted, iterations=REFIT_ITERATIONS).model
+        excess = excess_on(trial, stopping)
+        if excess > UNSETTLED * least:
+            break
+        best, least = trial, excess
+    return best
 
 
 def refined(model: Model, fitted: Sequence[Batch], stopping: Sequence[Batch]) -> Model:
@@ -94,7 +108,9 @@ def _descended(
     """The model with one effect's nodes fitted, on as many nodes as are given or on those that it has."""
     present = model.instance(name)
     if shape is not None:
-        present = replace(present, nodes=_on_nodes(present, shape, _grid(model, name, fitted[0])))
+        present = replace(
+            present, nodes=_on_nodes(present, shape, _grid(model, name, fitted[0]), len(model.bench.channels))
+        )
         model = model.having(present)
     assert present.nodes is not None
     parts = [[FreeFormBatch(model, b) for b in batches] for batches in (fitted, stopping)]
@@ -116,13 +132,17 @@ def _node_shapes(model: Model, name: str, batch: Batch) -> list[tuple[int, int]]
     return [nodes_over(grid, spacing) for spacing in spacings]
 
 
-def _on_nodes(present: EffectInstance, shape: tuple[int, int], grid: tuple[int, int]) -> np.ndarray:
-    """An effect's nodes on as many others; zero where it has none."""
-    if present.nodes is None:
-        return np.zeros(shape)
+def _on_nodes(
+    present: EffectInstance, shape: tuple[int, int], grid: tuple[int, int], colours: int
+) -> np.ndarray:
+    """An effect's nodes on as many others; zero where it has none. One that came apart has a map for each colour."""
     if present.effect.free_form is not None and present.effect.free_form.curve:
-        return on_other_curve_nodes(present.nodes, shape[1])
-    return on_other_nodes(present.nodes, shape, grid)
+        return np.zeros(shape) if present.nodes is None else on_other_curve_nodes(present.nodes, shape[1])
+    if present.nodes is None:
+        return np.zeros((colours, *shape) if present.effect.in_common is not None else shape)
+    maps = present.nodes.reshape(-1, *present.nodes.shape[-2:])
+    others = np.stack([on_other_nodes(one, shape, grid) for one in maps])
+    return others.reshape(*present.nodes.shape[:-2], *shape)
 
 
 def _grid(model: Model, name: str, batch: Batch) -> tuple[int, int]:

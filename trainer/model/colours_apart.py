@@ -39,7 +39,10 @@ def put_together(present: EffectInstance) -> EffectInstance:
         p.name: present.values[p.name].mean(0) if in_common(p) else present.values[p.name]
         for p in common.parameters
     }
-    return replace(present, effect=common, values=values, errors=None)
+    nodes = present.nodes
+    if nodes is not None and nodes.ndim == 3:
+        nodes = nodes.mean(0)
+    return replace(present, effect=common, values=values, errors=None, nodes=nodes)
 
 
 def in_common(parameter: Parameter) -> bool:

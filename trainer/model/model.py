@@ -31,8 +31,8 @@ class EffectInstance:
         By parameter, in the parameter's unit.
     errors : dict of float64 arrays or None
         Standard errors, shaped as `values`; None where nothing was fitted.
-    nodes : float64 array [m, n] or None
-        Of the free-form map or curves that are added to the polynomials, in the unit of the effect's `free_form`.
+    nodes : float64 array [m, n], [colours, m, n] or None
+        Of the free-form map, maps or curves that are added to the polynomials, in the unit of the effect's `free_form`.
     """
 
     effect: Effect

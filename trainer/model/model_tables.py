@@ -203,13 +203,17 @@ def _nodes(given: Any, key: str, effect: Effect, bench: Bench, arrays: Arrays) -
     array = _array(given, where, arrays)
     if array is None:
         raise InputError(f"{where} is {shown(given)}: write {{ array = ... }}, or take it out")
-    fits = array.ndim == 2 and array.shape[1] >= 4 and np.isfinite(array).all()
+    of_each = not form.curve and effect.in_common is not None and array.ndim == 3
+    fits = array.ndim == 2 + of_each and array.shape[-1] >= 4 and np.isfinite(array).all()
+    fits = fits and (not of_each or array.shape[0] == len(bench.channels))
     if form.curve and not (fits and array.shape[0] in (1, len(bench.channels))):
         raise InputError(
             f"{where} is not a row, or a row a colour, of at least 4 finite numbers: fit it again"
         )
-    if not form.curve and not (fits and array.shape[0] >= 4):
-        raise InputError(f"{where} is not a table of at least 4 x 4 finite numbers: fit it again")
+    if not form.curve and not (fits and array.shape[-2] >= 4):
+        raise InputError(
+            f"{where} is not a table, or with {APART} a table a colour, of at least 4 x 4 finite numbers: fit it again"
+        )
     return array.astype(np.float64)
 
 

@@ -172,10 +172,11 @@ def _effect(present: EffectInstance, bench: Bench, store: Store) -> str:
     if effect.in_common is not None:
         lines.append(f"{APART} = true  # each colour has values of its own")
     if present.nodes is not None and effect.free_form is not None:
-        form, (rows, columns) = effect.free_form, present.nodes.shape
+        form, (rows, columns) = effect.free_form, present.nodes.shape[-2:]
         name = store(f"{effect.name}.{form.form}", np.asarray(present.nodes, np.float64))
         unit = "" if form.unit == "1" else f", in {form.unit}"
         nodes = f"{columns} nodes of a cubic" if form.curve else f"{rows} x {columns} nodes of a bicubic"
+        nodes = f"for each colour {nodes}" if present.nodes.ndim == 3 else nodes
         lines.append(
             f"{form.form} = {{ array = {literal(name)} }}  # goes on where the polynomials end: {nodes} spline{unit}"
         )

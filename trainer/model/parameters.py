@@ -62,9 +62,11 @@ def describe(present: EffectInstance, bench: Bench) -> str:
                 words.append(f"{name}{measured(float(values[k]), float(errors[k]), p.unit)}")
         else:
             size, error = float(np.sqrt((away**2).sum())), _rms(errors)
-            words.append(f"{label} {measured(size, error, p.unit)} in {values.size} terms")
+            of_each = ", each colour its own" if present.effect.in_common is not None else ""
+            words.append(f"{label} {measured(size, error, p.unit)} in {values.size} terms{of_each}")
     if present.nodes is not None and present.effect.free_form is not None:
-        form, (rows, columns) = present.effect.free_form, present.nodes.shape
+        form, (rows, columns) = present.effect.free_form, present.nodes.shape[-2:]
         grid = f"{columns}" if form.curve else f"{rows} x {columns}"
-        words.append(f"order {present.order} and a {form.form} of {grid} nodes")
+        each = " for each colour" if present.nodes.ndim == 3 else ""
+        words.append(f"order {present.order} and a {form.form} of {grid} nodes{each}")
     return ", ".join(words) or "at its absent values"
