@@ -236,9 +236,8 @@ def explain(
             if went_on is None:
                 break
             name, model, errors = went_on
-            form = form_of(model, name)
-            model = recorded(model, None, errors, refined=name, form=form)
-            steps.append(ExplanationStep(None, errors, refined=name, form=form))
+            model = recorded(model, None, errors, refined=name)
+            steps.append(ExplanationStep(None, errors, refined=name, form=form_of(model, name)))
             if save:
                 save(model)
             continue

@@ -32,7 +32,7 @@ def recorded(
     refined : str, optional
         The effect whose map or curve went on in free form, or whose colours were put together again.
     form : mapping, optional
-        The key `form` of such a record: see `form_of` and `IN_COMMON`.
+        The key `form` of such a record, where it is not that of `form_of`.
     """
     record: dict[str, Any] = {
         "added": name or "",
@@ -43,7 +43,7 @@ def recorded(
         record["removed"] = dropped
     if refined:
         record["refined"] = refined
-        record.update(form or {})
+        record.update(form_of(model, refined) if form is None else form)
     return replace(model, history=(*model.history, record))
 
 
