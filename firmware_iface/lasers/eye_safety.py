@@ -14,8 +14,9 @@ holds, against the limit of a source as large as the next smaller square. Sizes 
 
 Light that a panel gates to fields comes in pulses, and the standard asks for both: the mean power, summed over the
 fields of a frame, keeps the limits above, and each pulse keeps the limit of a single one, 7e-4 t^-0.25 C6 C5 W for a
-pulse of t seconds. C5 is taken as 1 up to 5 mrad and as 0.2, its lowest value, above; C6 grows up to
-200 t^0.5 mrad, and 5 mrad at least. Pulses of all lasers are taken to come together.
+pulse of t seconds. C5 is taken as 1 up to 5 mrad (as 0.4, its lowest value there, for pulses of 5 µs and less, of
+which a train has more than 600) and as 0.2, its lowest value, above; C6 grows up to 200 t^0.5 mrad, and 5 mrad at
+least. Pulses of all lasers are taken to come together.
 
 Where a laser has n pulses in a frame, any k of them that follow one another, k = 1 to n, also keep the limit of a
 single pulse: they bring k times the energy, taken as one pulse of k t. In truth they last longer, with the pauses
@@ -64,7 +65,8 @@ def pulse_limit_uw(source_mrad: float, pulse_s: float) -> float:
     """Class 1 thermal limit of the power in one pulse of a long train, for a source of this angular size, µW."""
     lasts_s = max(pulse_s, SHORTEST_PULSE_S)
     alpha = min(max(source_mrad, POINT_MRAD), largest_pulsed_mrad(lasts_s))
-    return 1e6 * 7e-4 * lasts_s**-0.25 * (alpha / POINT_MRAD) * (1.0 if source_mrad <= 5.0 else 0.2)
+    of_train = 0.2 if source_mrad > 5.0 else 0.4 if pulse_s <= SHORTEST_PULSE_S else 1.0
+    return 1e6 * 7e-4 * lasts_s**-0.25 * (alpha / POINT_MRAD) * of_train
 
 
 def largest_pulsed_mrad(pulse_s: float) -> float:

@@ -109,7 +109,8 @@ def test_fields_in_turn_use_their_sum_over_the_frame() -> None:
         (5.0, 0.004, 2.783 * 5 / 1.5),
         (10.0, 0.004, 0.2 * 2.783 * 10 / 1.5),
         (100.0, 0.004, 0.2 * 2.783 * 12.649 / 1.5),  # as large as 200 t^0.5 mrad at most
-        (1.5, 1e-9, 14.80),  # counts as 5 us
+        (1.5, 6e-6, 14.14),
+        (1.5, 1e-9, 0.4 * 14.80),  # counts as 5 us, of more than 600 in a train
     ],
 )
 def test_a_pulse_has_a_limit_of_its_own(mrad: float, pulse_s: float, mw: float) -> None:
