@@ -25,10 +25,10 @@ from trainer.diagnosis.unnecessary import without_one
 from trainer.diagnosis.verdict import Thresholds, below_the_noise
 from trainer.effects.effect_catalogue import Catalogue
 from trainer.fitting.free_form_effects import can_go_on
+from trainer.fitting.further_numbers import next_order
 from trainer.fitting.gains import with_gains
 from trainer.fitting.pool import Pool
 from trainer.fitting.predictor import evaluate_captures
-from trainer.fitting.refit import next_order
 from trainer.model.history import IN_COMMON, form_of, recorded
 from trainer.model.model import EffectInstance, Model
 

@@ -18,8 +18,8 @@ from trainer.fitting.jacobian import away_from_absent, keys_of, remaining, stack
 from trainer.fitting.least_squares_gain import with_gain
 from trainer.fitting.many_numbers import has_many
 from trainer.fitting.pool import Pool
-from trainer.fitting.predictor import Predictor, evaluate_captures, excess_on
-from trainer.fitting.refit import settled, telling
+from trainer.fitting.predictor import Predictor, evaluate_captures, excess_on, telling
+from trainer.fitting.refit import settled
 from trainer.model.model import Model
 
 FEW_STEPS = 3

@@ -19,8 +19,8 @@ from trainer.effects.evidence import Evidence
 from trainer.effects.own_effect import starts_of
 from trainer.fitting.gauss_newton import HOLD, fit, with_measured_values
 from trainer.fitting.least_squares_gain import with_gain
-from trainer.fitting.predictor import Predictor, lights_of
-from trainer.fitting.refit import least_for_order, raise_orders, telling
+from trainer.fitting.predictor import Predictor, lights_of, telling
+from trainer.fitting.refit import least_for_order, raise_orders
 from trainer.fitting.start_points import start_cost
 from trainer.model.model import Model, absent, instance_with
 

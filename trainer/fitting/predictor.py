@@ -116,3 +116,9 @@ def evaluate_captures(captures: CaptureSet, rows: Sequence[Capture], model: Mode
 def excess_on(model: Model, batches: Sequence[Batch]) -> float:
     """Excess of a model on batches that are loaded."""
     return joined([b.errors(Predictor(model, b).predict(model)) for b in batches]).excess
+
+
+def telling(model: Model, batch: Batch, count: int) -> Batch:
+    """The captures of a batch of which a model leaves most unexplained, in counts, in their order."""
+    left = (batch.mask * (batch.signal - Predictor(model, batch).predict(model)) ** 2).sum((1, 2))
+    return batch.only(sorted(left.argsort(descending=True)[:count].tolist()))
