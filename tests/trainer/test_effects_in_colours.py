@@ -66,6 +66,22 @@ def test_each_laser_has_a_line_width_of_its_own(
         assert abs(width["value"][name] - expected) < 4 * width["error"][name] + 0.1
 
 
+def test_a_laser_that_no_capture_shows_stays_as_the_bench_says(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with_few_effects(monkeypatch, "temporal_coherence")
+    captures = in_three_colours(capsys, tmp_path, 'kind = "temporal_coherence"\nlinewidth_nm = 6', 12)
+    table = captures / "captures.csv"
+    head, *rows = table.read_text().splitlines(keepends=True)
+    table.write_text(head + "".join(row for row in rows if ",blue," not in row))
+    found = ran(capsys, "explain", captures, "--out", tmp_path / "model.toml")
+    assert [s["added"] for s in found["steps"]] == [None, "temporal_coherence"]
+    width = found["effects"][0]["parameters"]["line_width_nm"]
+    assert width["value"]["red"] == pytest.approx(6, abs=0.3)
+    assert width["value"]["blue"] == 0
+    assert width["error"]["blue"] is None
+
+
 def test_each_laser_has_lines_of_its_own(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

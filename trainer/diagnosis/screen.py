@@ -7,6 +7,7 @@ effects projected out; those of present effects with more than 100 numbers stay 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -146,7 +147,8 @@ def _starts(
 ) -> list[EffectInstance]:
     """Where a fit of an effect may start: with values in common, and with each colour's own where it may have these."""
     colours = list(dict.fromkeys(p.scene.channel for p in predictors))
-    if len(colours) < 2 or effect.colours == "alike":
+    fewest = {"alike": math.inf, "either": math.inf if effect.rugged else 2, "apart": 1}[effect.colours]
+    if len(model.bench.channels) < 2 or len(colours) < fewest:
         return [_start(effect, model, predictors, points)]
     own = absent(effect, model.bench)
     own = come_apart(own, model.bench) if may_come_apart(own, model.bench) else own
@@ -162,7 +164,7 @@ def _starts(
     if effect.colours == "apart":
         return [own]
     common = _start(effect, model, predictors, points)
-    return [common] if effect.rugged or has_many(own) else [common, own]
+    return [common] if has_many(own) else [common, own]
 
 
 def _start(effect: Effect, model: Model, predictors: list[Predictor], points: list[Trace]) -> EffectInstance:
