@@ -23,7 +23,7 @@ from firmware_iface.virtual.defects import (
     SpatialCoherence,
     TemporalCoherence,
 )
-from firmware_iface.virtual.further_defects import CoherentGhost, SourceLines
+from firmware_iface.virtual.further_defects import CoherentGhost, LaserAlignment, SourceLines
 from firmware_iface.virtual.iris_opening import iris_opening
 from firmware_iface.virtual.simulated_drive import Component, Drive, Moment
 from firmware_iface.virtual.simulated_panel import REFERENCE_NM, Surface, tilt_factor
@@ -92,8 +92,9 @@ class OpticalPath:
             for wl, share in spectral_lines(centre, bench.defect(TemporalCoherence), of_power, laser)
         ]
         to_cycles = pitch / wavelength  # 1 mrad in cycles a pixel
-        points = source_points(bench.defect(SpatialCoherence))
-        self.tilts = [(fy * to_cycles, fx * to_cycles) for fy, fx in points]
+        points, aligned = source_points(bench.defect(SpatialCoherence)), bench.defect(LaserAlignment)
+        y, x = (laser * aligned.tilt_y_mrad, laser * aligned.tilt_x_mrad) if aligned else (0.0, 0.0)
+        self.tilts = [((fy + y) * to_cycles, (fx + x) * to_cycles) for fy, fx in points]
         self.wavelength_nm = wavelength
 
 

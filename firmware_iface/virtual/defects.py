@@ -21,6 +21,7 @@ from firmware_iface.virtual.further_defects import (
     Drivers,
     FixedPattern,
     FrameMotion,
+    LaserAlignment,
     PhaseRipple,
     PolarisationLeak,
     SlowResponse,
@@ -353,7 +354,7 @@ _CATALOGUE: tuple[type[Defect], ...] = (
     FixedPattern,
 )
 CATALOGUE_KINDS: tuple[str, ...] = tuple(c.kind for c in _CATALOGUE)
-_OUTSIDE: tuple[type[Defect], ...] = (Specks, Fringes, Stripes, MeasuredField, Convention)
+_OUTSIDE: tuple[type[Defect], ...] = (Specks, Fringes, Stripes, MeasuredField, LaserAlignment, Convention)
 DEFECT_KINDS: dict[str, type[Defect]] = {c.kind: c for c in _CATALOGUE + _OUTSIDE}
 
 

@@ -94,6 +94,16 @@ class SourceLines(Defect):
 
 
 @dataclass(frozen=True)
+class LaserAlignment(Defect):
+    """Lasers that do not point the same way: each further colour's beam is tilted against the one before."""
+
+    kind = "laser_alignment"
+    stage = "panel"
+    tilt_y_mrad: float = parameter(-0.06, "angle between one laser and the next", -20, 20)
+    tilt_x_mrad: float = parameter(0.1, "angle between one laser and the next", -20, 20)
+
+
+@dataclass(frozen=True)
 class Vibration(Defect):
     """The picture swings to and fro on the camera during an exposure, more in some captures than in others."""
 

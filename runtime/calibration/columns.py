@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from runtime.calibration.drift import LOWEST_AMPLITUDE, LOWEST_WAVEFRONT, axial_phase
+from runtime.calibration.drift import LASER_ORDERS, LOWEST_AMPLITUDE, LOWEST_WAVEFRONT, axial_phase
 from runtime.calibration.estimate import ColourLightPath, Estimate, Shot
 from runtime.calibration.parameter_layout import ParameterLayout
 from runtime.calibration.prediction import Predictor
@@ -74,12 +74,15 @@ class Columns:
         moved.transfers = [t * turned.astype(t.dtype) for t in moved.transfers]
         yield int(layout.edges[2]), self._change(channel, phase)
         moved.take(path)
+        turn = np.complex64(2j * math.pi / wavelength)
         if layout.wavefront:
-            turn = np.complex64(2j * math.pi / wavelength)
             for k, one in enumerate(legendre_map_by_map(path.grid.shape, layout.orders[0], LOWEST_WAVEFRONT)):
                 yield k, self._change(channel, phase, turn * one)
+        place = int(layout.edges[1]) + layout.channels.index(channel) * layout.block
+        if layout.laser:
+            for k, one in enumerate(legendre_map_by_map(path.grid.shape, *LASER_ORDERS)):
+                yield place + layout.amplitude + k, self._change(channel, phase, turn * one)
         if layout.amplitude:
-            place = int(layout.edges[1]) + layout.channels.index(channel) * layout.amplitude
             for k, one in enumerate(legendre_map_by_map(path.grid.shape, layout.orders[1], LOWEST_AMPLITUDE)):
                 yield place + k, self._change(channel, phase, one)
 

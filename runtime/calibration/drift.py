@@ -2,7 +2,8 @@
 
 The panel's wavefront and the beam multiply the source field and the leak, distance multiplies the transfer
 functions, and the response replaces the table. A tilt of the wavefront is left out: at one plane it is the
-same as a camera that has moved sideways, and no eye notices it.
+same as a camera that has moved sideways, and no eye notices it. One laser's tilt against another's is noticed: its
+picture stands beside theirs.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from runtime.lightpath.light_path import LightPath
 from runtime.lightpath.spline_maps import spline_surface
 
 LOWEST_WAVEFRONT, LOWEST_AMPLITUDE = 2, 1  # Legendre orders: without piston and tilt; without power
+LASER_ORDERS = 2, 1  # highest and lowest of a laser's own wavefront: its tilt and focus
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,8 @@ class Drift:
         Legendre terms of a path difference over the panel, from order 2 on, one for all colours.
     log_amplitude : mapping of str to float array [terms]
         Of each colour, Legendre terms of the logarithm of the beam's amplitude, from order 1 on.
+    laser_nm : mapping of str to float array [5], nm
+        Of each further colour, the Legendre terms (LASER_ORDERS) of its wavefront against the first one's.
     distance_mm : float, mm
         How much farther the image plane is.
     response : mapping of str to float array [levels], rad
@@ -47,11 +51,16 @@ class Drift:
     response: Mapping[str, np.ndarray] = field(default_factory=dict)
     wavefront_nodes_nm: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     amplitude_nodes: Mapping[str, np.ndarray] = field(default_factory=dict)
+    laser_nm: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def wavefront(self, shape: tuple[int, int]) -> np.ndarray:
         """The path difference over the panel, nm, float64 [H, W]."""
         fine = spline_surface(self.wavefront_nodes_nm, shape)
         return _legendre_surface(self.wavefront_nm, shape, LOWEST_WAVEFRONT) + fine
+
+    def laser(self, channel: str, shape: tuple[int, int]) -> np.ndarray:
+        """What a colour's own wavefront adds to it, nm, float64 [H, W]."""
+        return _legendre_surface(self.laser_nm.get(channel, np.zeros(0)), shape, LASER_ORDERS[1])
 
     def amplitude(self, channel: str, shape: tuple[int, int]) -> np.ndarray:
         """The factor on a colour's amplitude over the panel, float64 [H, W]."""
@@ -64,7 +73,7 @@ class Drift:
 def drifted(path: LightPath, channel: str, wavelength_nm: float, drift: Drift) -> LightPath:
     """A colour's light path with a drift applied, in the path's own precision."""
     shape, real = path.grid.shape, path.response.dtype
-    turn = 2 * math.pi / wavelength_nm * drift.wavefront(shape)
+    turn = 2 * math.pi / wavelength_nm * (drift.wavefront(shape) + drift.laser(channel, shape))
     factor = drift.amplitude(channel, shape).astype(real) * _turned(turn.astype(real))
     step = _turned((drift.distance_mm * axial_phase(path, wavelength_nm)).astype(real))
     response = drift.response.get(channel, path.response)

@@ -106,11 +106,13 @@ def _of_another_colour(
     waves, beams, end = int(layout.edges[1]), int(layout.edges[2]), int(layout.edges[4])
 
     def places(name: str) -> np.ndarray:
-        beam = waves + layout.channels.index(name) * layout.amplitude
-        return np.r_[0:waves, beam : beam + layout.amplitude, beams:end]
+        beam = waves + layout.channels.index(name) * layout.block
+        return np.r_[0:waves, beam : beam + layout.block, beams:end]
 
     scale = np.ones(end)
     scale[:waves], scale[beams] = 1 / ratio, ratio
+    own = waves + layout.channels.index(channel) * layout.block + layout.amplitude
+    scale[own : own + layout.laser] = 1 / ratio
     scale, found = scale[places(channel)], np.zeros_like(matrix)
     found[np.ix_(places(channel), places(channel))] = (
         scale[:, None] * matrix[np.ix_(places(known), places(known))] * scale

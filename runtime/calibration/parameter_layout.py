@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from runtime.calibration.drift import LOWEST_AMPLITUDE, LOWEST_WAVEFRONT, Drift
+from runtime.calibration.drift import LASER_ORDERS, LOWEST_AMPLITUDE, LOWEST_WAVEFRONT, Drift
 from runtime.calibration.estimate import Estimate
 from runtime.calibration.misfit import Slopes
 from runtime.camera.view import SENSITIVITY_ORDER, TERMS, View
@@ -17,6 +17,7 @@ from runtime.lightpath.legendre import legendre_count, legendre_moments
 
 # Standard deviations of what is possible before any capture; they hold what no light shows.
 LIKELY = {"wavefront": 1000.0, "amplitude": 1.0, "distance": 5.0, "view": 3.0}
+LIKELY_LASER_NM = 300.0
 LIKELY_STRETCH = 0.01  # of a homography from dots
 SHARPEST = -0.05  # square pixels: a lens cannot sharpen; this much is room for noise
 HELD = 1e30  # precision of what must not move
@@ -44,8 +45,12 @@ class ParameterLayout:
 
     Attributes
     ----------
+    laser : int
+        Numbers of a laser's own wavefront, where there are several; the first one's are held at 0.
+    block : int
+        Numbers of each colour: its amplitude's, then its laser's.
     edges : int array [5]
-        Where wavefront, amplitudes, distance and view begin in the vector, and its length.
+        Where wavefront, colours, distance and view begin in the vector, and its length.
     precision : float array [edges[-1]]
         1 / variance of each number beforehand.
     """
@@ -61,10 +66,15 @@ class ParameterLayout:
         self.orders = (wavefront, amplitude)
         self.wavefront = legendre_count(wavefront, LOWEST_WAVEFRONT) if wavefront >= 2 else 0
         self.amplitude = legendre_count(amplitude, LOWEST_AMPLITUDE) if amplitude >= 1 else 0
-        sizes = [self.wavefront, self.amplitude * len(channels), 1, len(view) + TERMS + 1]
+        self.laser = legendre_count(*LASER_ORDERS) if self.wavefront and len(channels) > 1 else 0
+        self.block = self.amplitude + self.laser
+        sizes = [self.wavefront, self.block * len(channels), 1, len(view) + TERMS + 1]
         self.edges = np.cumsum([0, *sizes])
         spread = [np.full(n, LIKELY[k]) for n, k in zip(sizes, LIKELY, strict=True)]
         self.precision = 1 / np.concatenate(spread) ** 2
+        for k in range(len(channels)):
+            own = self.edges[1] + k * self.block + self.amplitude
+            self.precision[own : own + self.laser] = 1 / LIKELY_LASER_NM**2 if k else HELD
         self.precision[self.edges[3] + len(VIEW) :][: len(view) - len(VIEW)] = 1 / LIKELY_STRETCH**2
         if not any(self.orders):
             self.precision[self.edges[2]] = HELD
@@ -73,7 +83,10 @@ class ParameterLayout:
         """Where the numbers of a layout of the same orders or lower stand in this one's vector."""
         begin, names = self.edges, [name for name, _ in self.view]
         beams = [
-            begin[1] + k * self.amplitude + np.arange(other.amplitude) for k in range(len(other.channels))
+            begin[1]
+            + k * self.block
+            + np.r_[0 : other.amplitude, self.amplitude : self.amplitude + other.laser]
+            for k in range(len(other.channels))
         ]
         view = [begin[3] + names.index(name) for name, _ in other.view]
         rest = begin[3] + len(names) + np.arange(TERMS + 1)
@@ -82,7 +95,11 @@ class ParameterLayout:
     def numbers(self, estimate: Estimate) -> np.ndarray:
         """The vector of an estimate."""
         drift, view = estimate.drift, estimate.view
-        beams = [drift.log_amplitude[c] for c in self.channels]
+        beams = [
+            part
+            for c in self.channels
+            for part in (drift.log_amplitude[c], drift.laser_nm.get(c, np.zeros(self.laser)))
+        ]
         of_view = [getattr(view, name) for name, _ in self.view]
         parts = [drift.wavefront_nm, *beams, [drift.distance_mm], of_view, view.sensitivity, [view.stray]]
         return np.concatenate([np.asarray(p, float) for p in parts])
@@ -93,11 +110,12 @@ class ParameterLayout:
         wavefront, beams, distance, of_view = (
             vector[a:b] for a, b in zip(self.edges[:-1], self.edges[1:], strict=True)
         )
-        split = beams.reshape(len(self.channels), self.amplitude)
+        split = beams.reshape(len(self.channels), self.block)
         drift = replace(
             estimate.drift,
             wavefront_nm=wavefront,
-            log_amplitude=dict(zip(self.channels, split, strict=True)),
+            log_amplitude=dict(zip(self.channels, split[:, : self.amplitude], strict=True)),
+            laser_nm=dict(zip(self.channels, split[:, self.amplitude :], strict=True)),
             distance_mm=float(distance[0]),
         )
         values: dict[str, Any] = dict(zip((name for name, _ in self.view), map(float, of_view), strict=False))
@@ -131,6 +149,10 @@ class ParameterLayout:
                 wavefront += turn * legendre_moments(over.imag, self.orders[0], LOWEST_WAVEFRONT)
             if self.amplitude:
                 beams.append(legendre_moments(over.real, self.orders[1], LOWEST_AMPLITUDE))
+            if self.laser:
+                beams.append(
+                    2 * math.pi / wavelengths_nm[channel] * legendre_moments(over.imag, *LASER_ORDERS)
+                )
         blur = dict(zip(("blur_y_px2", "blur_x_px2"), map(float, slopes.blur), strict=True))
         of_view = [
             blur[name]
@@ -157,8 +179,10 @@ class ParameterLayout:
         """An estimate with as many terms as are to be fitted: further ones 0."""
         drift = estimate.drift
         beams = {c: _sized(drift.log_amplitude.get(c, np.zeros(0)), self.amplitude) for c in self.channels}
+        lasers = {c: _sized(drift.laser_nm.get(c, np.zeros(0)), self.laser) for c in self.channels}
         wavefront = _sized(drift.wavefront_nm, self.wavefront)
-        return replace(estimate, drift=replace(drift, wavefront_nm=wavefront, log_amplitude=beams))
+        wider = replace(drift, wavefront_nm=wavefront, log_amplitude=beams, laser_nm=lasers)
+        return replace(estimate, drift=wider)
 
     def nothing(self, estimate: Estimate) -> Estimate:
         """An estimate that says that nothing has drifted."""

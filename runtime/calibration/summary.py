@@ -42,6 +42,7 @@ def numbers(found: Calibration) -> dict[str, Any]:
             "illumination_rms": float(np.log(beam).std()),
             "illumination_error": _rms_error(found.errors.log_amplitude[channel], shape, LOWEST_AMPLITUDE),
             "illumination_terms": [float(v) for v in terms],
+            **({"laser_terms_nm": own} if (own := drift.laser_nm.get(channel, np.zeros(0)).tolist()) else {}),
             "response_change_rad": float(np.abs((now - now[0]) - (was - was[0])).max()),
             "response_gain": float((now[last] - now[0]) / (was[last] - was[0])),
             "response_error_rad": float(np.median(sweep.error)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -83,6 +84,30 @@ def test_slopes_are_what_differences_of_chi_squared_say(make: object, new_view: 
         above, below = (chi_squared(bases, shots, layout.moved(start, s * step)) for s in (1, -1))
         # against what the cost could change by along so long a step, for a slope that is nearly 0
         assert (above - below) / 2 == pytest.approx(float(gradient @ step), rel=0.03, abs=2e-4 * chi2)
+
+
+def test_slopes_over_a_lasers_own_wavefront_are_what_differences_of_chi_squared_say() -> None:
+    bases, shots = {}, []
+    for channel, nm in (("red", 638.0), ("green", 520.0)):
+        path = ideal_path(SMALL, 8e-3)
+        bases[channel] = ColourLightPath(path, nm)
+        shots += [
+            replace(shot, channel=channel)
+            for shot in shots_of(path, Estimate(Drift(wavefront_nm=np.full(7, 20.0)), View(SMALL)), 2)
+        ]
+    layout = layout_of(bases, (4, 3), False)
+    start = moved_at_random(layout, SMALL)
+    chi2, slopes = Misfit(bases, shots).at(start)
+    wavelengths = {c: b.wavelength_nm for c, b in bases.items()}
+    gradient = layout.gradient(slopes, wavelengths, layout.levers(start.view, SMALL))
+    step = np.zeros(len(gradient))
+    own = int(layout.edges[1]) + layout.block + layout.amplitude
+    step[own : own + layout.laser] = np.random.default_rng(4).normal(size=layout.laser) * 0.3
+    above, below = (chi_squared(bases, shots, layout.moved(start, s * step)) for s in (1, -1))
+    assert (above - below) / 2 == pytest.approx(float(gradient @ step), rel=0.03, abs=2e-4 * chi2)
+    assert (
+        layout.precision[layout.edges[1] + layout.amplitude] > 1e20
+    )  # the first laser is what others differ from
 
 
 def test_a_reading_has_its_adjoint_and_moves_as_its_camera_does() -> None:

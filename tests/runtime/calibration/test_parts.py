@@ -115,20 +115,22 @@ def test_a_view_is_what_it_was_after_a_bundle() -> None:
     assert View.from_json(view.as_json()) == view
 
 
-def test_derivatives_are_what_differences_say() -> None:
+@pytest.mark.parametrize("channels", [("green",), ("red", "green")])
+def test_derivatives_are_what_differences_say(channels: tuple[str, ...]) -> None:
     """Every column of the fit against a central difference of the prediction, with modes, leak and crosstalk."""
     full = random_path(SMALL)
     one = ColourLightPath(full, WAVELENGTH_NM)
     rng = np.random.default_rng(2)
     gray = rng.integers(0, 256, SMALL, dtype=np.uint8)
     shot = shot_of("green", gray, np.zeros(SMALL, np.float32), 0.0, np.ones(SMALL, np.float32))
-    layout = ParameterLayout(("green",), 3, 2)
+    layout = ParameterLayout(channels, 3, 2)
     start = layout.moved(
         layout.nothing(Estimate(Drift(), View(SMALL))), 0.02 * rng.normal(size=int(layout.edges[-1]))
     )
     bases = {"green": one}
     columns = dict(Columns(bases, start, layout).of(shot))
-    assert sorted(columns) == list(range(int(layout.edges[-1])))
+    of_red = range(int(layout.edges[1]), int(layout.edges[1]) + layout.block * (len(channels) - 1))
+    assert sorted(columns) == [k for k in range(int(layout.edges[-1])) if k not in of_red]
     for place, column in columns.items():
         step = np.zeros(int(layout.edges[-1]))
         step[place] = 1e-2 if place < layout.edges[1] else 1e-3

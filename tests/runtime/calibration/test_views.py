@@ -127,22 +127,54 @@ def test_what_the_camera_alone_does_never_reaches_the_headset() -> None:
     assert found.counts_per_ms["green"][1] > 0.05  # the changing power is found
 
 
-@pytest.mark.slow
-def test_three_colours_share_one_wavefront(tmp_path: Path) -> None:
-    colours = {"red": 638.0, "green": 520.0, "blue": 450.0}
-    bench = drifted_bench("panel_wavefront", "phase_response", shape=SHAPE)
-    bench = replace(bench, channels=tuple(ChannelDescription(n, w) for n, w in colours.items()))
+COLOURS = {"red": 638.0, "green": 520.0, "blue": 450.0}
+
+
+def bundle_of_three(folder: Path) -> Bundle:
+    """An ideal bundle of three colours, in a folder."""
     paths = []
-    for name, wavelength in colours.items():
+    for name, wavelength in COLOURS.items():
         from tests.runtime import benches
 
         before, benches.WAVELENGTH = benches.WAVELENGTH, wavelength * 1e-9
         paths.append((name, DISTANCE_MM, wavelength, ideal_path(SHAPE, DISTANCE_MM * 1e-3, dtype=np.float32)))
         benches.WAVELENGTH = before
     records, arrays = pack_light_paths(paths)
-    folder = tmp_path / "bundle"
     write_bundle(folder, arrays, {"paths": records, "distance_mm": DISTANCE_MM}, {})
-    bundle = read_bundle(folder)
+    return read_bundle(folder)
+
+
+def bench_of_three(*defects: str, **parameters: float) -> BenchDescription:
+    """A bench of the same colours with defects; parameters go to the first."""
+    bench = drifted_bench(*defects, shape=SHAPE, **parameters)
+    return replace(bench, channels=tuple(ChannelDescription(n, w) for n, w in COLOURS.items()))
+
+
+@pytest.mark.slow
+def test_lasers_that_point_apart_are_found(tmp_path: Path) -> None:
+    """Green by 0.1 mrad and blue by 0.2 against red: with one wavefront for all, all of 0.0069 is left."""
+    bundle = bundle_of_three(tmp_path / "bundle")
+    bench = bench_of_three("laser_alignment", tilt_x_mrad=0.1, tilt_y_mrad=-0.06)
+    found = calibrate(opened(VirtualHeadset(bench, 1)), bundle)
+    assert found.verdict == "recalibrated" and found.complete
+    half = [4.0 * n for n in SHAPE]  # of the panel, um: mrad times um are nm
+    for k, name in enumerate(COLOURS):
+        y, x, *focus = found.estimate.drift.laser_nm[name]
+        assert abs(y + 0.06 * k * half[0]) < 0.02 * half[0] and abs(x - 0.1 * k * half[1]) < 0.02 * half[1]
+        assert np.abs(focus).max() < 1.0
+    assert numbers(found)["channels"]["blue"]["laser_terms_nm"] == pytest.approx(
+        list(found.estimate.drift.laser_nm["blue"])
+    )
+    replace_bundle(tmp_path / "bundle", bundle, found)
+    turned = load_light_path(read_bundle(tmp_path / "bundle"), "blue").source
+    slope = np.angle(np.vdot(turned[:, :-1], turned[:, 1:])) / (2 * np.pi) * 450  # nm a pixel
+    assert slope == pytest.approx(0.2 * 8, abs=0.1)
+
+
+@pytest.mark.slow
+def test_three_colours_share_one_wavefront(tmp_path: Path) -> None:
+    folder, colours = tmp_path / "bundle", COLOURS
+    bundle, bench = bundle_of_three(folder), bench_of_three("panel_wavefront", "phase_response")
     found = calibrate(opened(VirtualHeadset(bench, 1)), bundle)
     assert found.verdict == "recalibrated" and found.complete
     hidden = panel_path_nm(bench.defects[0], *SHAPE, SHAPE[1] / SHAPE[0])  # type: ignore[arg-type]
