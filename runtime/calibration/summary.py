@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from runtime.calibration.drift import LOWEST_AMPLITUDE, LOWEST_WAVEFRONT
+from runtime.calibration.drift import LOWEST_AMPLITUDE, LOWEST_WAVEFRONT, Drift
+from runtime.calibration.estimate import ColourLightPath
 from runtime.calibration.self_calibration import Calibration
 from runtime.calibration.shown_patterns import GRAINS, HELD_OUT
 from runtime.excess import PredictionErrors, removed_excess
@@ -42,7 +43,7 @@ def numbers(found: Calibration) -> dict[str, Any]:
             "illumination_rms": float(np.log(beam).std()),
             "illumination_error": _rms_error(found.errors.log_amplitude[channel], shape, LOWEST_AMPLITUDE),
             "illumination_terms": [float(v) for v in terms],
-            **({"laser_terms_nm": own} if (own := drift.laser_nm.get(channel, np.zeros(0)).tolist()) else {}),
+            **_laser(drift, channel, base),
             "response_change_rad": float(np.abs((now - now[0]) - (was - was[0])).max()),
             "response_gain": float((now[last] - now[0]) / (was[last] - was[0])),
             "response_error_rad": float(np.median(sweep.error)),
@@ -139,6 +140,19 @@ def sentence_of(found: dict[str, Any], replaced: bool) -> str:
         f"The light path has drifted: the refit takes the excess from {before:.2g} to {after:.2g}; {done}{more}."
         f"{after_planes}"
     )
+
+
+def _laser(drift: Drift, channel: str, base: ColourLightPath) -> dict[str, Any]:
+    """A laser's own wavefront against the first one's, and its tilt; nothing where there is one laser."""
+    terms = [float(v) for v in drift.laser_nm.get(channel, ())]
+    if not terms:
+        return {}
+    grid = base.path.grid
+    half_um = [0.5e6 * grid.pitch * n for n in grid.shape]  # P_1 rises by 1 over half of the panel
+    return {
+        "laser_terms_nm": terms,
+        "laser_tilt_mrad": [term / half for term, half in zip(terms[:2], half_um, strict=True)],
+    }
 
 
 def _heldout(before: PredictionErrors, after: PredictionErrors) -> dict[str, Any]:

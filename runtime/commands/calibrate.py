@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import Any
@@ -108,6 +109,11 @@ def show(result: Result, args: Namespace, screen: Screen) -> None:
             f"{100 * c['illumination_rms']:.1f} % rms; power {_power(c)}; picture "
             f"{c['picture_psnr_db']['before']:.1f} -> {c['picture_psnr_db']['after']:.1f} dB"
         )
+    first, *others = result["channels"]
+    for name in others:
+        tilt = result["channels"][name].get("laser_tilt_mrad")
+        if tilt is not None:
+            screen.say(f"{name:<11} laser at {math.hypot(*tilt):.3f} mrad to {first}'s")
     for plane in result["planes"]:
         before, after = (plane["heldout"][k]["excess"] for k in ("before", "after"))
         screen.say(

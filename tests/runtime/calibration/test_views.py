@@ -165,6 +165,7 @@ def test_lasers_that_point_apart_are_found(tmp_path: Path) -> None:
     assert numbers(found)["channels"]["blue"]["laser_terms_nm"] == pytest.approx(
         list(found.estimate.drift.laser_nm["blue"])
     )
+    assert numbers(found)["channels"]["green"]["laser_tilt_mrad"] == pytest.approx([-0.06, 0.1], abs=0.002)
     replace_bundle(tmp_path / "bundle", bundle, found)
     turned = load_light_path(read_bundle(tmp_path / "bundle"), "blue").source
     slope = np.angle(np.vdot(turned[:, :-1], turned[:, 1:])) / (2 * np.pi) * 450  # nm a pixel
