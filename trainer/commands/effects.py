@@ -42,7 +42,7 @@ def _described(effect: Effect) -> Result:
         "formula": effect.formula,
         "references": list(effect.references),
         "orders": list(effect.orders),
-        "colours": effect.colours,
+        "colours": "apart" if all(p.per_channel for p in effect.parameters) else effect.colours,
         "source": "built in" if effect in BUILT_IN else effect.source,
         "parameters": [
             {
@@ -60,6 +60,13 @@ def _described(effect: Effect) -> Result:
     }
 
 
+COLOURS = {
+    "alike": "On a bench of several colours, one value serves all.",
+    "apart": "On a bench of several colours, each has its own values.",
+    "either": "On a bench of several colours, one value serves all, or each has its own where captures say so.",
+}
+
+
 def show(result: Result, args: Namespace, screen: Screen) -> None:
     """A table of all, or everything about one."""
     if not args.name:
@@ -72,6 +79,7 @@ def show(result: Result, args: Namespace, screen: Screen) -> None:
     one = result["effects"][0]
     screen.say(f"{one['name']}: {one['about']}", style="bold")
     screen.say(f"Stage {one['stage']}, acts on the {one['acts_on']}, {one['source']}.")
+    screen.say(COLOURS[one["colours"]])
     for text in (one["description"], one["formula"], *one["references"]):
         if text:
             screen.say(text)
