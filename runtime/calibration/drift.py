@@ -33,8 +33,6 @@ class Drift:
         Legendre terms of a path difference over the panel, from order 2 on, one for all colours.
     log_amplitude : mapping of str to float array [terms]
         Of each colour, Legendre terms of the logarithm of the beam's amplitude, from order 1 on.
-    laser_nm : mapping of str to float array [5], nm
-        Of each further colour, the Legendre terms (LASER_ORDERS) of its wavefront against the first one's.
     distance_mm : float, mm
         How much farther the image plane is.
     response : mapping of str to float array [levels], rad
@@ -43,6 +41,8 @@ class Drift:
         Nodes of a cubic B-spline over the panel that is added to the path difference; empty: none.
     amplitude_nodes : mapping of str to float array [rows, columns]
         Of each colour, the same for the logarithm of the beam's amplitude.
+    laser_nm : mapping of str to float array [5], nm
+        Of each of several colours, the Legendre terms (LASER_ORDERS) of its wavefront against the first one's.
     """
 
     wavefront_nm: np.ndarray = field(default_factory=lambda: np.zeros(0))

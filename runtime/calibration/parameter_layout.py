@@ -143,16 +143,13 @@ class ParameterLayout:
         """
         wavefront, beams = np.zeros(self.wavefront), []
         for channel in self.channels:
-            over = slopes.over_panel[channel]
+            over, turn = slopes.over_panel[channel], 2 * math.pi / wavelengths_nm[channel]
             if self.wavefront:
-                turn = 2 * math.pi / wavelengths_nm[channel]
                 wavefront += turn * legendre_moments(over.imag, self.orders[0], LOWEST_WAVEFRONT)
             if self.amplitude:
                 beams.append(legendre_moments(over.real, self.orders[1], LOWEST_AMPLITUDE))
             if self.laser:
-                beams.append(
-                    2 * math.pi / wavelengths_nm[channel] * legendre_moments(over.imag, *LASER_ORDERS)
-                )
+                beams.append(turn * legendre_moments(over.imag, *LASER_ORDERS))
         blur = dict(zip(("blur_y_px2", "blur_x_px2"), map(float, slopes.blur), strict=True))
         of_view = [
             blur[name]

@@ -16,9 +16,10 @@ from runtime.program.screen import Screen
 DESCRIPTION = """Find out with the headset's own camera what has drifted, and put it into the bundle's light path.
 
 Some thirty patterns a colour are shown and captured: dots (where the camera looks), a sweep of gratings (the panel's
-phase response), ten patterns of random grains (wavefront, beam and distance, refit together) and three that the fit
-does not see. The light path is replaced only if it predicts those three better, surely and by enough to matter, and
-predicts them no worse in the bundle's other planes, as far as the camera can be focused on them. A network in
+phase response), ten patterns of random grains (wavefront, beam, distance and, of several colours, where each
+laser points, refit together) and three that the fit does not see. The light path is replaced only if it predicts
+those three better, surely and by enough to matter, and predicts them no worse in the bundle's other planes, as far as
+the camera can be focused on them. A network in
 the bundle is refitted, kept or left out with it, as a test picture decides. The folder holds the old bundle
 or the new one at every moment; the old one is kept as BUNDLE.previous. Where the headset's configuration has fields in
 turn, each colour is lit in its own field alone.

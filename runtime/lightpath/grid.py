@@ -1,7 +1,7 @@
 """The grid that a light path is sampled on: its sizes, its frequencies and its windows.
 
 Irradiance is sampled twice as finely as the panel, because it has twice the bandwidth of the field, and four times
-where the iris passes more than the panel's own band. The grid is zero-padded, so light that leaves one side does not
+where the iris is WIDE. The grid is zero-padded, so light that leaves one side does not
 come back on the other.
 """
 
@@ -109,9 +109,8 @@ def grid_for(
     room = math.ceil(max(1.6 * walk, 2 * margin / min(narrowest or half_width, 1)))
     rows, columns = (_even_fast_size(n + room) for n in shape)
     band = tuple(_band_edge(half_width, n, padded) for n, padded in zip(shape, (rows, columns), strict=True))
-    return Grid(
-        shape, (rows, columns), margin, (band[0], band[1]), pitch, FINEST if half_width > WIDE else FINE
-    )
+    fine = FINEST if half_width > WIDE else FINE
+    return Grid(shape, (rows, columns), margin, (band[0], band[1]), pitch, fine)
 
 
 def beyond_edge(count: int) -> float:

@@ -65,10 +65,10 @@ class Solver:
     penalty : str
         One of PENALTIES.
     grid : str or None
-        "panel" computes irradiance once a pixel. "fine" computes it twice an axis (behind an
-        iris that is wider than the panel's band, four times), for about four times the work;
-        that is worth it where the iris passes more than three quarters of the panel's band and there is time, and for
-        several frames, which come nearer to the picture. None decides by these.
+        "panel" computes irradiance once a pixel. "fine" computes it on the paths' own grids, twice an axis (four times
+        behind a wide iris), for about four times the work; that is worth it where the iris passes more than three
+        quarters of the panel's band and there is time, and for several frames, which come nearer to the picture. None
+        decides by these.
     region : array [H, W] or None
         Which pixels count, or how much; light is free to go to the others.
     approximator : Approximator or None

@@ -14,6 +14,12 @@ from trainer.commands.inputs import effects_option
 if TYPE_CHECKING:
     from trainer.effects.definition import Effect
 
+COLOURS = {
+    "alike": "On a bench of several colours, one value serves all.",
+    "apart": "On a bench of several colours, each has its own values.",
+    "either": "On a bench of several colours, one value serves all, or each has its own where captures say so.",
+}
+
 
 def options(parser: ArgumentParser) -> None:
     """The options of `effects`."""
@@ -58,13 +64,6 @@ def _described(effect: Effect) -> Result:
             for p in effect.parameters
         ],
     }
-
-
-COLOURS = {
-    "alike": "On a bench of several colours, one value serves all.",
-    "apart": "On a bench of several colours, each has its own values.",
-    "either": "On a bench of several colours, one value serves all, or each has its own where captures say so.",
-}
 
 
 def show(result: Result, args: Namespace, screen: Screen) -> None:

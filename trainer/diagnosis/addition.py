@@ -104,14 +104,14 @@ def add_from(roles: CaptureRoles, model: Model, start: EffectInstance) -> Model:
 
 
 def all_refitted(
-    folder: Path, ids: tuple[str, ...], base: Model, fitted: EffectInstance
+    folder: Path, ids: tuple[str, ...], base: Model, given: EffectInstance
 ) -> tuple[FitResult, PredictionErrors]:
-    """A model with an effect that was fitted to it alone, all fitted together, and its held-out errors.
+    """A model with an effect as it is given, all fitted together, and its held-out errors.
 
     A task for any process.
     """
     roles = _roles_of(folder, ids)
-    model = base.having(fitted)
+    model = base.having(given)
     found = fit(model, model.names, load(roles.captures, roles.fitted))
     return found, evaluate_captures(roles.captures, roles.held_out, found.model)
 

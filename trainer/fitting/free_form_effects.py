@@ -68,9 +68,7 @@ def with_free_form(
     best, least = model, excess_on(model, stopping)
     shapes = _node_shapes(model, name, fitted[0])
     for level, shape in enumerate(shapes):
-        trial = _descended(best, name, shape, fitted, stopping)
-        trial = fit(trial, trial.names, fitted, iterations=REFIT_ITERATIONS).model
-        excess = excess_on(trial, stopping)
+        trial, excess = _turn(best, name, shape, fitted, stopping)
         if least - excess < (FIRST_GAIN if level == 0 else FINER_GAIN) * abs(least):
             break
         best, least = trial, excess
@@ -81,13 +79,24 @@ def with_free_form(
     for _ in range(TURNS):
         if least < enough:
             break
-        trial = _descended(best, name, None, fitted, stopping)
-        trial = fit(trial, trial.names, fitted, iterations=REFIT_ITERATIONS).model
-        excess = excess_on(trial, stopping)
+        trial, excess = _turn(best, name, None, fitted, stopping)
         if excess > UNSETTLED * least:
             break
         best, least = trial, excess
     return best
+
+
+def _turn(
+    model: Model,
+    name: str,
+    shape: tuple[int, int] | None,
+    fitted: Sequence[Batch],
+    stopping: Sequence[Batch],
+) -> tuple[Model, float]:
+    """The model with one effect's nodes fitted, then all other numbers, and its excess on `stopping`."""
+    trial = _descended(model, name, shape, fitted, stopping)
+    trial = fit(trial, trial.names, fitted, iterations=REFIT_ITERATIONS).model
+    return trial, excess_on(trial, stopping)
 
 
 def refined(model: Model, fitted: Sequence[Batch], stopping: Sequence[Batch]) -> Model:

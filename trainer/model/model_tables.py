@@ -240,6 +240,8 @@ def _numbers(
         array = np.array(
             [_row(given.get(n), f"{where}.{n}", shape[1:], order, parameter, is_value) for n in names]
         )
+    elif isinstance(given, Mapping):
+        raise InputError(f"{where} has a value a colour: write one for all, or {APART} = true in the effect")
     else:
         array = np.array(_row(given, where, shape, order, parameter, is_value))
     _in_range(array, where, parameter, is_value)
