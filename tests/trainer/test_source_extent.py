@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.trainer.hidden import captured, ran
+from tests.trainer.hidden import LARGER, captured, ran
 from tests.trainer.test_effects import present, scene_of
 from trainer.model.model_stages import stages_for
 from trainer.prediction.scene import Scene
@@ -60,7 +60,11 @@ def test_light_that_the_iris_cuts_from_aside_is_in_the_model(
 ) -> None:
     """A blur of the same shape leaves several times as much: it takes nothing at the iris's edge."""
     captures = captured(
-        capsys, tmp_path, 'kind = "spatial_coherence"\nrings = 5', width=160, height=128, distance_mm=15
+        capsys,
+        tmp_path,
+        'kind = "spatial_coherence"\nrings = 4',
+        options=("--patterns", 4),
+        **LARGER,
     )
     left = {
         name: ran(capsys, "add", name, captures, "--out", tmp_path / f"{name}.toml")["after"]["excess"]
