@@ -58,11 +58,11 @@ def psnr(cycle: CycleState, number: int) -> float:
 
 def test_each_round_is_better_than_none(tmp_path: Path) -> None:
     """The fringes of the bench are corrected: with nothing learned they cost more than 4 dB."""
-    cycle = cycle_of(fringed(), tmp_path)
+    cycle = cycle_of(fringed(), tmp_path, count=2)
     assert len(cycle.history) == 3
     assert psnr(cycle, 1) > psnr(cycle, 0) + 4
     assert psnr(cycle, 2) > psnr(cycle, 0) + 4
-    assert len(list((tmp_path / "round-2" / "patterns").iterdir())) == 3
+    assert len(list((tmp_path / "round-2" / "patterns").iterdir())) == 2
     assert (tmp_path / "round-1" / "network.safetensors").is_file()
 
 

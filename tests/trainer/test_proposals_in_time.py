@@ -192,6 +192,7 @@ def test_fringes_that_grow_over_the_captures_end_at_the_noise(tmp_path: Path) ->
     assert again.after.excess < 1e-4
 
 
+@pytest.mark.slow
 def test_a_wavefront_that_swings_about_flat_is_seen_though_no_steady_probe_shows_it(tmp_path: Path) -> None:
     captures = captured_while_changing(
         tmp_path,
