@@ -7,13 +7,13 @@ Forward transforms are not scaled, inverse ones are divided by their length (Num
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 import numpy as np
 from array_api_compat import array_namespace
 
 from runtime.lightpath.host_arrays import of_kind, on_host
+from runtime.program.threads import cores
 
 try:
     import ducc0.fft as _ducc
@@ -23,7 +23,7 @@ except ImportError:  # pragma: no cover - exercised only where the wheel is miss
 
 Array = Any
 
-THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+THREADS = cores()
 
 
 def fft(x: Array, axis: int, n: int | None = None) -> Array:

@@ -1,4 +1,4 @@
-"""How threads wait: asleep, so that programs next to each other do not slow each other down."""
+"""How many threads work, and how they wait: asleep, so that programs next to each other do not slow each other down."""
 
 from __future__ import annotations
 
@@ -18,3 +18,10 @@ def wait_asleep() -> None:
     """
     for name, value in WAITING.items():
         os.environ.setdefault(name, value)
+
+
+def cores() -> int:
+    """Processors this process may use; OMP_NUM_THREADS lowers the number."""
+    here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+    limit = os.environ.get("OMP_NUM_THREADS", "")
+    return min(here, int(limit)) if limit.isdigit() and int(limit) > 0 else here

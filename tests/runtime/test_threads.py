@@ -30,6 +30,30 @@ while time.process_time() - begin < 1.2:
     steps += 1
 print(steps)
 """
+# How many threads this process has after a transform and a pass over rows that several could share.
+SHARED_WORK = """
+import os
+import numpy as np
+from runtime.lightpath import fft
+from runtime.solver.array_backend import Backend
+fft.fft(np.ones((1024, 1024), np.complex64), 0)
+Backend().over_rows(1024, 64, lambda worker, rows: None)
+print(len(os.listdir("/proc/self/task")))
+"""
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="threads cannot be counted here")
+def test_the_solver_uses_no_more_threads_than_the_process_was_given() -> None:
+    limited = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", SHARED_WORK],
+        cwd=ROOT,
+        env={**os.environ, **limited},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert int(done.stdout) == 1
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes cannot be put on two cores here")

@@ -6,6 +6,7 @@ from argparse import ArgumentParser, Namespace
 
 from firmware_iface.errors import InputError
 from runtime.program.options import whole
+from runtime.program.threads import cores
 
 
 def worker_options(parser: ArgumentParser, cluster: bool = True) -> None:
@@ -32,8 +33,6 @@ def workers_of(args: Namespace) -> int:
     InputError
         For several processes, or a cluster, on a GPU.
     """
-    from trainer.fitting.pool import cores
-
     on_gpu = getattr(args, "device", "cpu") == "cuda"
     if on_gpu and (args.workers not in (None, 1) or getattr(args, "cluster", None) is not None):
         raise InputError(
@@ -48,7 +47,5 @@ def workers_of(args: Namespace) -> int:
 def use_every_core() -> None:
     """Let torch use all of this process's processors: for work that is done in this process."""
     import torch
-
-    from trainer.fitting.pool import cores
 
     torch.set_num_threads(cores())

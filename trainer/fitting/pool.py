@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from firmware_iface.errors import InputError
 from runtime.program.large_blocks import keep_large_blocks
+from runtime.program.threads import cores
 from trainer.captures.kept_pictures import keep_pictures
 
 if TYPE_CHECKING:
@@ -106,13 +107,6 @@ class Pool:
     def result(self, future: Future[Any]) -> Any:
         """What a task returned, or raises what it raised; waits for it."""
         return pickle.loads(future.result()) if self.elsewhere else future.result()
-
-
-def cores() -> int:
-    """Processors this process may use; OMP_NUM_THREADS lowers the number."""
-    here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
-    limit = os.environ.get("OMP_NUM_THREADS", "")
-    return min(here, int(limit)) if limit.isdigit() and int(limit) > 0 else here
 
 
 @contextmanager

@@ -14,6 +14,7 @@ import torch
 
 from runtime.program.outputs import emptied
 from runtime.program.progress import Progress
+from runtime.program.threads import cores
 from trainer.captures.batches import load
 from trainer.captures.block_means import blocks
 from trainer.captures.capture_set import CaptureSet, chosen, opened
@@ -35,7 +36,7 @@ from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import catalogue, find_effect, forget_effect_files
 from trainer.fitting.gains import with_gains
 from trainer.fitting.learned_field import learn_field
-from trainer.fitting.pool import cores, open_pool
+from trainer.fitting.pool import open_pool
 from trainer.fitting.predictor import evaluate_captures
 from trainer.model.history import recorded
 from trainer.model.model import Model
