@@ -75,7 +75,7 @@ class MemorylessBfgs:
         gg, go, sg = self._dots(((gradient, gradient), (gradient, before), (move, gradient)))
         oo, so = known or self._dots(((before, before), (move, before)))
         sy, yy, yg = sg - so, gg - 2 * go + oo, gg - go
-        if sy <= 1e-12 * yy:
+        if not sy > 1e-12 * yy > 0:  # without curvature, or where rounding is all that is left of the change
             return steepest, 0.0, 0.0
         gamma, along = sy / yy, sg / sy
         beta = gamma * (yg - along * yy) / sy
