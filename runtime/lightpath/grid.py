@@ -121,6 +121,30 @@ def beyond_edge(count: int) -> float:
     return 1 / (2 * count)
 
 
+def passed_share(frequency: Array, side: Array | float, width: float) -> Array:
+    """Share of each frequency sample along an axis that lies between the sides of a rectangular iris.
+
+    A sample on an edge passes by the share of its width that lies inside. So the iris's size has a gradient, and what
+    passes does not depend on the padding.
+
+    Parameters
+    ----------
+    frequency : real array
+        From the iris's centre; any unit.
+    side : real array or float
+        Half width of the iris with what it passes beyond (`beyond_edge`), in the same unit.
+    width : float
+        Of a sample, in the same unit.
+
+    Returns
+    -------
+    real array
+        0 to 1.
+    """
+    xp = array_namespace(frequency)
+    return xp.clip((side - xp.abs(frequency)) / width + 0.5, 0, 1)
+
+
 def _band_edge(half_width: float, count: int, padded: int) -> int:
     """The highest frequency index of which the iris passes a part."""
     edge = half_width * padded / 2 + max(beyond_edge(count) * padded / 2 - 0.5, 0.0)

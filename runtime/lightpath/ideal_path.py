@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from runtime.lightpath.grid import band_frequencies, grid_for
+from runtime.lightpath.grid import band_frequencies, beyond_edge, grid_for, passed_share
 from runtime.lightpath.light_path import LightPath
 from runtime.lightpath.propagation import Aperture, band_limit, check_sampling, transfer_function
 
@@ -33,11 +33,15 @@ def ideal_path(
         Where the sampling does not hold.
     """
     grid = grid_for(shape, pitch, wavelength, distance, half_width)
-    edge = half_width / (2 * pitch) * (1 + 1e-9)
-    check_sampling("angular_spectrum", Aperture(shape, grid.padded, pitch), wavelength, distance, edge)
+    band = 1 / (2 * pitch)
+    aperture = Aperture(shape, grid.padded, pitch)
+    check_sampling("angular_spectrum", aperture, wavelength, distance, half_width * band * (1 + 1e-9))
     fy, fx = band_frequencies(grid, np.zeros((), np.float64))
+    rows, columns = (
+        passed_share(f, (half_width + beyond_edge(count)) * band, 1 / (padded * pitch))
+        for f, count, padded in zip((fy, fx), shape, grid.padded, strict=True)
+    )
     limits = tuple(band_limit(wavelength, distance, n * pitch) for n in grid.padded)
-    passed = (np.abs(fy)[:, None] <= edge) & (np.abs(fx)[None, :] <= edge)
     transfer = transfer_function(
         fy[:, None], fx[None, :], wavelength, distance, (limits[0], limits[1]), "angular_spectrum"
     )
@@ -45,7 +49,7 @@ def ideal_path(
         grid=grid,
         response=2 * math.pi * np.arange(256) / 256,
         source=np.ones(shape, np.complex128),
-        transfers=(passed * transfer)[None],
+        transfers=(rows[:, None] * columns[None, :] * transfer)[None],
         weights=np.ones(1),
     )
 

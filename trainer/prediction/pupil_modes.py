@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from runtime.lightpath.grid import beyond_edge
+from runtime.lightpath.grid import beyond_edge, passed_share
 from runtime.lightpath.propagation import band_limit, transfer_function
 from trainer.kept_results import kept_by_device, kept_for_same
 from trainer.prediction.scene import Scene, bare_stages
@@ -106,9 +106,8 @@ def _transfer(scene: Scene, pupil: Pupil, wavelength: Any, distance: Tensor) -> 
 def iris_opening(scene: Scene, pupil: Pupil) -> Tensor:
     """What the iris passes of each frequency.
 
-    A frequency sample passes by the share of its width that lies inside. So the iris's size and place have gradients,
-    and the result does not depend on the padding. A rectangle passes a little more than its half widths
-    (`beyond_edge`), an ellipse what they say.
+    A frequency sample passes by the share of its width that lies inside (`passed_share`). A rectangle passes a little
+    more than its half widths (`beyond_edge`), an ellipse what they say.
 
     Returns
     -------
@@ -122,11 +121,8 @@ def iris_opening(scene: Scene, pupil: Pupil) -> Tensor:
     rows = pupil.half_width * (1 - pupil.stretch) + beyond[0]
     columns = pupil.half_width * (1 + pupil.stretch) + beyond[1]
     if not any(bool(x != 0) for x in (pupil.roundness, pupil.rotation, pupil.edge)):
-        passed = [
-            torch.clamp((side - torch.abs(f)) / width + 0.5, 0, 1)
-            for side, f, width in ((rows, v, bins[0]), (columns, u, bins[1]))
-        ]
-        return passed[0] * passed[1]
+        opening: Tensor = passed_share(v, rows, bins[0]) * passed_share(u, columns, bins[1])
+        return opening
     cosine, sine = torch.cos(pupil.rotation), torch.sin(pupil.rotation)
     along, across = cosine * u + sine * v, cosine * v - sine * u
     # Signed distance to a rounded square of half side 1, in units of the iris's own sides.
