@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 
@@ -41,17 +42,19 @@ def held_out_errors(
         Each is predicted with its own best gain.
     estimate : Estimate
     """
-    parts, residuals = [], []
-    predictor = Predictor(bases)
-    predictor.take(estimate)
-    for number, shot in enumerate(shots):
-        light = predictor.light(shot)
-        prediction = gain_of(shot, light) * light
-        signal, weight = shot.signal, shot.weight  # each is made anew when it is asked for
-        mask = weight > 0
-        noise = np.divide(1, weight, out=np.zeros(weight.shape, np.float64), where=mask)
-        arrays = (a.astype(np.float64)[None] for a in (signal, prediction, noise, mask))
-        parts.append(prediction_errors([f"{number:03d}"], *arrays))
-        error = np.where(mask, signal - prediction, 0)
-        residuals.append((error * np.sqrt(weight)).astype(np.float32))
+    parts: list[PredictionErrors] = []
+    residuals: list[np.ndarray] = []
+    for channel, own in groupby(shots, lambda shot: shot.channel):
+        predictor = Predictor({channel: bases[channel]})  # the buffers of one colour at a time
+        predictor.take(estimate)
+        for shot in own:
+            light = predictor.light(shot)
+            prediction = gain_of(shot, light) * light
+            signal, weight = shot.signal, shot.weight  # each is made anew when it is asked for
+            mask = weight > 0
+            noise = np.divide(1, weight, out=np.zeros(weight.shape, np.float64), where=mask)
+            arrays = (a.astype(np.float64)[None] for a in (signal, prediction, noise, mask))
+            parts.append(prediction_errors([f"{len(parts):03d}"], *arrays))
+            error = np.where(mask, signal - prediction, 0)
+            residuals.append((error * np.sqrt(weight)).astype(np.float32))
     return HeldOutErrors(joined(parts), tuple(residuals))

@@ -75,7 +75,7 @@ class Misfit:
         self.images: list[np.ndarray] = []  # of each shot, where the light path stays
         self.predictor = Predictor(bases, finer, motion)
         self.axial: dict[str, np.ndarray] = {}
-        for name, base in bases.items():
+        for name, base in bases.items() if light else ():
             phase = axial_phase(base.path, base.wavelength_nm)[None]
             ordered = self.predictor.optics[name].in_band_order(phase, base.path.grid)
             self.axial[name] = ordered[0].astype(np.float32)
@@ -92,7 +92,7 @@ class Misfit:
         blur, total, distance, stray = np.zeros(2), 0.0, 0.0, 0.0
         for number, shot in enumerate(self.shots):
             channel = shot.channel
-            optics, reading = predictor.optics[channel], predictor.readings[channel]
+            reading = predictor.readings[channel]
             phase = predictor.phase(shot) if self.light else None
             image = self.images[number] if phase is None else predictor.image(channel, phase)
             seen = reading.read(image)
@@ -114,6 +114,7 @@ class Misfit:
             back, of_blur = reading.adjoint(slope)
             blur += of_blur
             if phase is not None:
+                optics = predictor.optics[channel]
                 distance += optics.factor_adjoint(phase, back, over_panel[channel], self.axial[channel])
         return total, Slopes(over_panel, distance, maps[0], maps[1], maps[2], blur, stray)
 
@@ -125,3 +126,4 @@ class Misfit:
         self.predictor.take(estimate)
         for shot in self.shots:
             self.images.append(self.predictor.image(shot.channel, self.predictor.phase(shot)).copy())
+        self.predictor.forget_light()

@@ -90,6 +90,11 @@ class Predictor:
                 )
             self.readings[name] = made[key]
 
+    def forget_light(self) -> None:
+        """Let the light paths' buffers go, half a gigabyte at full size: from now on only the camera is asked."""
+        self.optics.clear()
+        self.images.clear()
+
     def phase(self, shot: Shot, response: np.ndarray | None = None) -> np.ndarray:
         """Phase (rad) that a shot's pattern drives the panel to, [H, W]; `response` in place of the estimate's."""
         path = self.paths[shot.channel]
