@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -123,10 +124,28 @@ def iris_opening(scene: Scene, pupil: Pupil) -> Tensor:
     if not any(bool(x != 0) for x in (pupil.roundness, pupil.rotation, pupil.edge)):
         opening: Tensor = passed_share(v, rows, bins[0]) * passed_share(u, columns, bins[1])
         return opening
-    cosine, sine = torch.cos(pupil.rotation), torch.sin(pupil.rotation)
-    along, across = cosine * u + sine * v, cosine * v - sine * u
+    y, x = torch.abs(v) / rows, torch.abs(u) / columns
+    if bool(pupil.rotation != 0) or pupil.rotation.requires_grad:
+        cosine, sine = torch.cos(pupil.rotation), torch.sin(pupil.rotation)
+        y, x = torch.abs(cosine * v - sine * u) / rows, torch.abs(cosine * u + sine * v) / columns
+    y, x = torch.broadcast_tensors(y, x)
+    if y.requires_grad or any(t.requires_grad for t in (pupil.roundness, pupil.edge)):
+        return _passed_by_rounded(y, x, pupil, (rows, columns), bins)
+    # Without derivatives only what the edge can cut is computed: the outline lies between a circle and a square.
+    reach = (math.hypot(*bins) + float(pupil.edge)) / (2 * min(float(rows), float(columns))) + 1e-5
+    farther = torch.maximum(y, x)
+    cut = (farther < 1 + reach) & (y**2 + x**2 > max(1 - reach, 0) ** 2)
+    passed = (farther < 1).to(y.dtype)
+    passed[cut] = _passed_by_rounded(y[cut], x[cut], pupil, (rows, columns), bins)
+    return passed
+
+
+def _passed_by_rounded(
+    y: Tensor, x: Tensor, pupil: Pupil, sides: tuple[Tensor, Tensor], bins: Sequence[float]
+) -> Tensor:
+    """Share of samples that a rounded rectangle passes: `y` and `x` from its centre in half sides, `bins` wide."""
+    rows, columns = sides
     # Signed distance to a rounded square of half side 1, in units of the iris's own sides.
-    y, x = torch.abs(across) / rows, torch.abs(along) / columns
     corner = torch.clamp(pupil.roundness, 1e-6, 1)
     beyond_y, beyond_x = torch.clamp(y - 1 + corner, min=0), torch.clamp(x - 1 + corner, min=0)
     reach = torch.sqrt(beyond_y**2 + beyond_x**2 + 1e-12)
