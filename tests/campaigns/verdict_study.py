@@ -1,6 +1,6 @@
 """How often the verdict's rule names what is not there, and how small an effect it finds, on benches of known truth.
 
-    python -m tests.campaigns.verdict_study                      # 200 small sets: about twenty minutes on one core
+    python -m tests.campaigns.verdict_study                      # 200 small sets: 7 to 20 minutes on one core
     python -m tests.campaigns.verdict_study --sets 35 --json
 
 Each set is 9 to 12 captures of a bench of 96 x 80 pixels that hides nothing or one defect of the catalogue at a random
