@@ -207,6 +207,8 @@ def test_quality_is_free_of_scale() -> None:
         (np.full(SHAPE, -1.0), "never below zero"),
         (np.full(SHAPE, np.nan), "non-finite"),
         (np.zeros(SHAPE), "all dark"),
+        (np.full(SHAPE, 1e30), "brightest pixel is 1e.30"),
+        (np.full(SHAPE, 1e-40), "brightest pixel is 1e-40"),
     ],
 )
 def test_targets_that_cannot_be_shown_are_refused(ideal: LightPath, target: np.ndarray, message: str) -> None:
