@@ -75,7 +75,7 @@ class Misfit:
         self.images: list[np.ndarray] = []  # of each shot, where the light path stays
         self.predictor = Predictor(bases, finer, motion)
         self.axial: dict[str, np.ndarray] = {}
-        for name, base in bases.items() if light else ():
+        for name, base in (bases if light else {}).items():
             phase = axial_phase(base.path, base.wavelength_nm)[None]
             ordered = self.predictor.optics[name].in_band_order(phase, base.path.grid)
             self.axial[name] = ordered[0].astype(np.float32)

@@ -10,7 +10,7 @@ import numpy as np
 from firmware_iface.errors import InputError
 from runtime.lightpath.light_path import LightPath
 
-BRIGHTEST = (1e-20, 1e20)  # of a target's brightest pixel: single precision holds its square, and its parts
+BRIGHTEST = (1e-20, 1e20)  # of a target's brightest pixel: single precision also holds its square
 MOST_FRAMES = 32  # patterns for each colour of a picture; each takes as much memory as a colour
 
 
@@ -85,12 +85,12 @@ def checked_target(target: np.ndarray, colours: int, planes: int, shape: tuple[i
     if not (math.isfinite(low) and math.isfinite(high)) or low < 0:
         raise InputError("the target has negative or non-finite values: irradiance is never below zero")
     whole = np.broadcast_to(target, (colours, planes, *shape))
-    brightest = [float(one.max()) for one in whole.reshape(-1, *shape)]
-    if min(brightest) == 0:
+    darkest = min(float(one.max()) for one in whole.reshape(-1, *shape))
+    if darkest == 0:
         raise InputError("the target is all dark: any pattern shows some light, so give it a bright pixel")
-    if min(brightest) < BRIGHTEST[0] or max(brightest) > BRIGHTEST[1]:
+    if darkest < BRIGHTEST[0] or high > BRIGHTEST[1]:
         raise InputError(
-            f"the target's brightest pixel is {max(brightest):g} ({min(brightest):g} in its darkest colour or plane): "
+            f"the target's brightest pixel is {high:g} ({darkest:g} in its darkest colour or plane): "
             f"scale it to between {BRIGHTEST[0]:g} and {BRIGHTEST[1]:g}, such as to 1"
         )
     return whole

@@ -124,15 +124,15 @@ def iris_opening(scene: Scene, pupil: Pupil) -> Tensor:
     if not any(bool(x != 0) for x in (pupil.roundness, pupil.rotation, pupil.edge)):
         opening: Tensor = passed_share(v, rows, bins[0]) * passed_share(u, columns, bins[1])
         return opening
-    y, x = torch.abs(v) / rows, torch.abs(u) / columns
+    across, along = v, u
     if bool(pupil.rotation != 0) or pupil.rotation.requires_grad:
         cosine, sine = torch.cos(pupil.rotation), torch.sin(pupil.rotation)
-        y, x = torch.abs(cosine * v - sine * u) / rows, torch.abs(cosine * u + sine * v) / columns
-    y, x = torch.broadcast_tensors(y, x)
+        across, along = cosine * v - sine * u, cosine * u + sine * v
+    y, x = torch.broadcast_tensors(torch.abs(across) / rows, torch.abs(along) / columns)
     if y.requires_grad or any(t.requires_grad for t in (pupil.roundness, pupil.edge)):
         return _passed_by_rounded(y, x, pupil, (rows, columns), bins)
     # Without derivatives only what the edge can cut is computed: the outline lies between a circle and a square.
-    reach = (math.hypot(*bins) + float(pupil.edge)) / (2 * min(float(rows), float(columns))) + 1e-5
+    reach = float((math.hypot(*bins) + pupil.edge) / (2 * torch.minimum(rows, columns))) + 1e-5
     farther = torch.maximum(y, x)
     cut = (farther < 1 + reach) & (y**2 + x**2 > max(1 - reach, 0) ** 2)
     passed = (farther < 1).to(y.dtype)
