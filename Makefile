@@ -23,6 +23,7 @@ QUICK := tests/test_layers.py \
 	tests/trainer/test_fleet_drift.py \
 	tests/trainer/test_kept_pictures.py \
 	tests/trainer/test_model_file.py \
+	tests/trainer/test_model_text.py \
 	tests/trainer/test_verdict.py
 
 .PHONY: help install quick test demo benchmark clean
