@@ -12,6 +12,7 @@ from tests.trainer.studio.chromium import CHROMIUM, FLAGS
 
 if TYPE_CHECKING:
     from tests.trainer.studio.studio_pages import Studio
+    from trainer.captures.capture_set import CaptureSet
 
 
 @pytest.fixture(scope="module")
@@ -22,6 +23,16 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("home")
     leaking_captures(folder / "leaking")
     return folder
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory: pytest.TempPathFactory) -> CaptureSet:
+    """A small set with a leak at the panel, for tests without a browser."""
+    from trainer.effects.effect_catalogue import catalogue
+    from trainer.effects.testing import captures_with
+
+    folder = tmp_path_factory.mktemp("studio") / "leaking"
+    return captures_with(folder, catalogue()["zero_order"], {"leak_real": 0.2}, patterns=6)
 
 
 @pytest.fixture(scope="module")
