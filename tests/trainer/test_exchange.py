@@ -11,13 +11,15 @@ from trainer.captures.acquire import acquire_from
 from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.held_out import capture_roles
-from trainer.diagnosis.exchange import exchanged, one_for_two
+from trainer.diagnosis.exchange import exchanged, one_for_two, preferred
+from trainer.diagnosis.screen import screen_batches
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import catalogue
 from trainer.fitting.gains import with_gains
 from trainer.fitting.gauss_newton import fit
 from trainer.fitting.pool import open_pool
 from trainer.fitting.predictor import evaluate_captures
+from trainer.fitting.refit import fit_from
 from trainer.model.model import Model, absent
 
 
@@ -91,3 +93,30 @@ def test_a_rival_stands_for_two_effects_where_it_does_as_well(
     )
     if found is not None:
         assert found[3].names == ("polarisation_leak",) and found[4].excess < 5e-4
+
+
+@pytest.mark.parametrize(
+    ("hidden", "rival"),
+    [("distance", "source_lines"), ("source_lines", "distance"), ("spatial_coherence", "sensor_blur")],
+)
+def test_captures_that_tell_in_the_end_decide_between_effects_that_were_alike(
+    hidden: str, rival: str, tmp_path: Path
+) -> None:
+    """Two lines may both lie aside, and then are a distance; a blur of the camera is much like a source's extent."""
+    acquire_from(str(bench_file(tmp_path, f'kind = "{hidden}"')), tmp_path / "captures", patterns=6)
+    captures = read_captures(tmp_path / "captures")
+    roles = capture_roles(captures)
+    batches = load(captures, roles.fitted)
+    ideal = with_gains(captures, Model(captures.bench), roles.fitted)
+    models = {}
+    for name in (hidden, rival):
+        start = screen_batches(batches, ideal, (catalogue()[name],))[0].start
+        models[name] = fit_from(ideal, start, batches).model
+    exchanges = {}
+    with open_pool(1) as pool:
+        for present, other in ((hidden, rival), (rival, hidden)):
+            errors = evaluate_captures(captures, roles.held_out, models[present])
+            alike = {present: {other: models[other].instance(other)}}
+            found = preferred(roles, models[present], errors, alike, Thresholds(), 1.0, pool)
+            exchanges[present] = None if found is None else found[:2]
+    assert exchanges == {hidden: None, rival: (rival, hidden)}

@@ -46,17 +46,12 @@ def exchanged(
     (str, str, Model, PredictionErrors) or None
         What was taken out, what was put in its place, and the model, everything refitted.
     """
-    pairs = [
-        (old, new, fitted)
-        for old, others in rivals.items()
-        for new, fitted in others.items()
-        if old in model.names and new not in model.names
-    ]
+    pairs = _pairs(model, rivals)
     trials = [(model.without(old), fitted) for old, _, fitted in pairs]
-    found = _best(roles, model, trials, lambda left: CLEARLY * left, pool)
-    if found is None:
+    found = _promising(roles, model, trials, lambda left: CLEARLY * left, pool)
+    if not found:
         return None
-    which, together, after = found
+    which, together, after = found[0]
     old, new, _ = pairs[which]
     if after.excess > CLEARLY * errors.excess:  # before orders are raised, which is most of the work
         return None
@@ -99,24 +94,77 @@ def one_for_two(
         if stages[other] == stages[old] == fitted.effect.stage
     ]
     trials = [(base, fitted) for *_, base, fitted in triples]
-    found = _best(roles, model, trials, lambda left: left + thresholds.least(ideal_excess), pool)
-    if found is None:
+    found = _promising(roles, model, trials, lambda left: left + thresholds.least(ideal_excess), pool)
+    if not found:
         return None
-    which, together, after = found
+    which, together, after = found[0]
     old, other, new, *_ = triples[which]
     if thresholds.worth_adding(removed_excess(after, errors), ideal_excess, 1):
         return None
     return new, old, other, together.model, after
 
 
-def _best(
+def preferred(
+    roles: CaptureRoles,
+    model: Model,
+    errors: PredictionErrors,
+    rivals: Rivals,
+    thresholds: Thresholds,
+    ideal_excess: float,
+    pool: Pool,
+) -> tuple[str, str, Model, PredictionErrors] | None:
+    """The model with one effect exchanged for a rival that captures prefer now that nothing else is missing.
+
+    A plainer rival is preferred unless it does worse, a less plain one only where it is worth it.
+
+    Parameters
+    ----------
+    errors : PredictionErrors
+        Of `model` on the held-out captures.
+    rivals : mapping
+        As of `exchanged`, of those alone that captures could not tell from the effect.
+
+    Returns
+    -------
+    (str, str, Model, PredictionErrors) or None
+        As of `exchanged`.
+    """
+    pairs = _pairs(model, rivals)
+    trials = [(model.without(old), fitted) for old, _, fitted in pairs]
+    found = _promising(roles, model, trials, lambda left: left + thresholds.least(ideal_excess), pool)
+    for which, together, after in found:
+        old, new, _ = pairs[which]
+        present, rival = model.instance(old), together.model.instance(new)
+        gained, lost = removed_excess(errors, after), removed_excess(after, errors)
+        if present.is_plainer_than(rival):
+            prefers = thresholds.worth_adding(gained, ideal_excess, len(pairs))
+        elif rival.is_plainer_than(present):
+            prefers = lost.interval(1 - thresholds.level)[0] <= 0
+        else:
+            prefers = gained.interval(1 - thresholds.level, len(pairs))[0] > 0
+        if prefers:
+            return old, new, together.model, after
+    return None
+
+
+def _pairs(model: Model, rivals: Rivals) -> list[tuple[str, str, EffectInstance]]:
+    """Effects of the model with their rivals that are not in it: the two names, and the rival's fit."""
+    return [
+        (old, new, fitted)
+        for old, others in rivals.items()
+        for new, fitted in others.items()
+        if old in model.names and new not in model.names
+    ]
+
+
+def _promising(
     roles: CaptureRoles,
     model: Model,
     trials: Sequence[tuple[Model, EffectInstance]],
     most: Callable[[float], float],
     pool: Pool,
-) -> tuple[int, FitResult, PredictionErrors] | None:
-    """The trial, a model and an effect added to it, that leaves least when everything is fitted together.
+) -> list[tuple[int, FitResult, PredictionErrors]]:
+    """The trials, each a model and an effect added to it, that leave little enough on few captures.
 
     Parameters
     ----------
@@ -125,11 +173,11 @@ def _best(
 
     Returns
     -------
-    (int, FitResult, PredictionErrors) or None
-        Which one, its fit, and its errors on the held-out captures.
+    list of (int, FitResult, PredictionErrors)
+        Which one, its fit with everything free, and its errors on the held-out captures; those that leave least first.
     """
     if not trials:
-        return None
+        return []
     # What a model cannot explain of few captures, with its numbers free to suit these alone, it cannot explain of all.
     few = telling_captures(roles.captures, roles.fitted, model)
     enough = most(evaluate_captures(roles.captures, few, model).excess)
@@ -137,8 +185,6 @@ def _best(
     on_few = pool.map_here_if_one(try_together_on_few, [(roles.folder, ids, *trial) for trial in trials])
     promising = [k for k, excess in enumerate(on_few) if excess < enough]
     tasks = [(roles.folder, roles.ids, *trials[k]) for k in promising]
-    found = list(zip(promising, pool.map_here_if_one(all_refitted, tasks), strict=True))
-    if not found:
-        return None
-    which, (together, after) = min(found, key=lambda one: one[1][1].excess)
-    return which, together, after
+    fits = pool.map_here_if_one(all_refitted, tasks)
+    found = [(k, together, after) for k, (together, after) in zip(promising, fits, strict=True)]
+    return sorted(found, key=lambda one: one[2].excess)

@@ -15,7 +15,7 @@ from trainer.captures.held_out import CaptureRoles, capture_roles
 from trainer.diagnosis.addition import all_raised, all_refitted, gone_on, with_maps_again
 from trainer.diagnosis.colours_in_common import one_in_common
 from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors, screen_candidates
-from trainer.diagnosis.exchange import CLEARLY, exchanged, one_for_two
+from trainer.diagnosis.exchange import CLEARLY, exchanged, one_for_two, preferred
 from trainer.diagnosis.fitted_ranking import expects_the_rest
 from trainer.diagnosis.learned_rest import LearnedRest, learn_rest
 from trainer.diagnosis.ranking import RankedEffect
@@ -165,6 +165,7 @@ def explain(
     steps = [ExplanationStep(None, errors)]
     # By each effect that was added, those that could have been added in its place.
     rivals: dict[str, dict[str, EffectInstance]] = {}
+    alike: dict[str, dict[str, EffectInstance]] = {}  # those of the rivals that it could not be told from
     diagnoses: list[Diagnosis] = []
 
     def without_unnecessary(
@@ -262,8 +263,17 @@ def explain(
             for r in found.ranking
             if r.worth_adding and r.effect.name != newest
         }
+        alike[newest] = {n: one for n, one in rivals[newest].items() if n in best.indistinguishable_from}
     kept = model.names
-    simpler = one_for_two(roles, model, errors, rivals, diagnoses[-1].thresholds, ideal.excess, pool)
+    limits = (diagnoses[-1].thresholds, ideal.excess)
+    while (better := preferred(roles, model, errors, alike, *limits, pool)) is not None:
+        old, new, model, errors = better
+        del alike[old]
+        model = recorded(model, new, errors, old)
+        steps.append(ExplanationStep(new, errors, removed=old))
+        if save:
+            save(model)
+    simpler = one_for_two(roles, model, errors, rivals, *limits, pool)
     if simpler is not None:
         new, old, other, model, errors = simpler
         model = recorded(recorded(model, new, errors, old), None, errors, other)

@@ -301,7 +301,7 @@ def rank(
         How many were screened, which the test of each is corrected for.
     """
     ordered = sorted(fits, key=lambda f: f.held_out.excess)
-    plainer = next((f for f in ordered[1:] if _is_plainer(f, ordered[0], before, known, thresholds)), None)
+    plainer = next((f for f in ordered[1:] if _is_plainer(f, ordered[0], before, thresholds)), None)
     if plainer is not None:  # of two that the captures cannot tell apart
         ordered.remove(plainer)
         ordered.insert(0, plainer)
@@ -327,18 +327,12 @@ def rank(
 
 
 def _is_plainer(
-    one: CandidateFit, best: CandidateFit, before: PredictionErrors, known: Catalogue, thresholds: Thresholds
+    one: CandidateFit, best: CandidateFit, before: PredictionErrors, thresholds: Thresholds
 ) -> bool:
-    """Whether a candidate says as much as the best: as its plain form, less rare, or in half of the numbers."""
+    """Whether a candidate says as much as the best, and is plainer."""
     if not _alike(one, best, before, thresholds, PLAINER):
         return False
-    if known[best.effect].same_as == one.effect or known[best.effect].rare > known[one.effect].rare:
-        return True
-    return known[one.effect].measure is None and 2 * _numbers(one) <= _numbers(best)
-
-
-def _numbers(fitted: CandidateFit) -> int:
-    return sum(values.size for values in fitted.model.instance(fitted.effect).values.values())
+    return one.model.instance(one.effect).is_plainer_than(best.model.instance(best.effect))
 
 
 def _inseparable(

@@ -41,6 +41,13 @@ class EffectInstance:
     errors: Values | None = None
     nodes: np.ndarray | None = None
 
+    def is_plainer_than(self, other: EffectInstance) -> bool:
+        """Whether it is the other one's plain form, less rare, or has half of its numbers."""
+        if other.effect.same_as == self.effect.name or other.effect.rare > self.effect.rare:
+            return True
+        own, others = (sum(values.size for values in one.values.values()) for one in (self, other))
+        return self.effect.measure is None and 2 * own <= others
+
     def with_values(self, values: Mapping[str, np.ndarray]) -> EffectInstance:
         """The same with other values, without errors."""
         return replace(self, values=dict(values), errors=None)
