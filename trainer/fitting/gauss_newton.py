@@ -152,11 +152,11 @@ def _fit(
     else:
         settled = False
     normal, scatter = _normal(slopes), _scatter(slopes, residuals)
-    model = with_measured_values(model, free, batches)
     inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
     covariance = inverse @ scatter @ inverse
     spread = _spread(keys, covariance, normal)
-    return FitResult(_with_errors(model, keys, spread), errors, covariance, keys, settled)
+    model = with_measured_values(_with_errors(model, keys, spread), free, batches)
+    return FitResult(model, errors, covariance, keys, settled)
 
 
 def _fit_many(
@@ -207,7 +207,6 @@ def _fit_many(
     table = slopes_of(model, keys, channels, predictors, points)
     slopes = ManySlopes(model, many, predictors, points, table)
     spread_of_many = slopes.errors(residuals)
-    model = with_measured_values(model, free, batches)
     normal = _normal(table)
     inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
     covariance = inverse @ _scatter(table, residuals) @ inverse
@@ -218,12 +217,16 @@ def _fit_many(
     inner = np.arange(len(keys), len(every))
     whole[inner, inner] = spread_of_many**2
     spread = np.concatenate([_spread(keys, covariance, normal), spread_of_many])
-    return FitResult(_with_errors(model, every, spread), errors, whole, every, settled)
+    model = with_measured_values(_with_errors(model, every, spread), free, batches)
+    return FitResult(model, errors, whole, every, settled)
 
 
 @torch.no_grad()
 def with_measured_values(model: Model, free: Sequence[str], batches: Sequence[Batch]) -> Model:
-    """The model with the values that its named effects read off the captures instead of fitting them."""
+    """The model with the values that its named effects read off the captures instead of fitting them.
+
+    These have no errors: they say how far captures differ.
+    """
     for name in free:
         present = model.instance(name)
         if present.effect.measure is None:
@@ -234,7 +237,8 @@ def with_measured_values(model: Model, free: Sequence[str], batches: Sequence[Ba
         ]
         read = measured_by(present.effect, evidence, present.order)
         values = {n: np.full_like(v, read[n]) if n in read else v for n, v in present.values.items()}
-        model = model.having(replace(present, values=values))
+        errors = {n: np.full_like(v, np.nan) if n in read else v for n, v in (present.errors or {}).items()}
+        model = model.having(replace(present, values=values, errors=errors or None))
     return model
 
 

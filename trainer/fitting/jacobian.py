@@ -86,7 +86,8 @@ def columns(
         Change a unit of each parameter, then of the logarithm of the gain. Zero for another colour's number, and for
         one that changes nothing here, where the difference would be rounding alone.
     """
-    light = predictor.light(model, point)
+    near = predictor.motions(model, point)
+    light = predictor.light(model, point, near)
     base = predictor.counts(model, light)
     least = NO_CHANGE * float(torch.linalg.vector_norm(base))
 
@@ -98,7 +99,7 @@ def columns(
         if colour_of(model, key) not in (None, predictor.batch.channel):
             return torch.zeros_like(base)
         step, effect = column_step(model, key), model.instance(key[0]).effect
-        moved = predictor.predict_nearby(stepped(model, key, step), effect.stage, point)
+        moved = predictor.predict_nearby(stepped(model, key, step), effect.stage, point, near)
         return slope(moved, step, effect.parameter(key[1]).scale)
 
     result = side_by_side(of_number, keys, base[0].numel())

@@ -14,8 +14,11 @@ from trainer.captures.capture_table import Capture
 from trainer.fitting.side_by_side import side_by_side
 from trainer.model.model import Model
 from trainer.model.model_stages import scene_for, stages_of
-from trainer.prediction.predict import Trace, counts, light_on_camera, trace
+from trainer.prediction.capture_motion import MotionNearby
+from trainer.prediction.predict import Trace, counts, light_on_camera, motion_on_camera, trace
 from trainer.prediction.scene import Scene, Stages
+
+Motions = list[MotionNearby | None]
 
 
 class Predictor:
@@ -68,12 +71,28 @@ class Predictor:
         """Patterns shown before capture k [1, n, H, W], where the panel still shows something of them."""
         return None if stages.drive.persistence is None else self.batch.shown_before()[k : k + 1]
 
-    def light(self, model: Model, point: Trace) -> Tensor:
-        """Irradiance on the camera [B, h, w]."""
+    def motions(self, model: Model, point: Trace) -> Motions:
+        """What `light` needs of models that are a small step away, a part of the batch each."""
         batch = self.batch
-        found = [
-            light_on_camera(self.scene, stages, point.image[part], (batch.signal[part], batch.mask[part]))
+        return [
+            motion_on_camera(self.scene, stages, point.image[part], (batch.signal[part], batch.mask[part]))
             for part, stages in self.parts(model)
+        ]
+
+    def light(self, model: Model, point: Trace, near: Motions | None = None) -> Tensor:
+        """Irradiance on the camera [B, h, w].
+
+        Parameters
+        ----------
+        near : list, optional
+            The motions of a model that is a small step away, for derivatives.
+        """
+        batch, parts = self.batch, self.parts(model)
+        found = [
+            light_on_camera(
+                self.scene, stages, point.image[part], (batch.signal[part], batch.mask[part]), motion
+            )
+            for (part, stages), motion in zip(parts, near or [None] * len(parts), strict=True)
         ]
         return found[0] if len(found) == 1 else torch.cat(found)
 
@@ -91,9 +110,10 @@ class Predictor:
         """Counts above black [B, h, w]."""
         return self.counts(model, self.light(model, self.trace(model)))
 
-    def predict_nearby(self, model: Model, start: str, before: Trace) -> Tensor:
+    def predict_nearby(self, model: Model, start: str, before: Trace, near: Motions | None = None) -> Tensor:
         """Counts above black [B, h, w] of a model that is a small step away from stage `start` on."""
-        return self.counts(model, self.light(model, self.trace(model, start, before, nearby=True)))
+        point = self.trace(model, start, before, nearby=True)
+        return self.counts(model, self.light(model, point, near))
 
 
 def lights_of(model: Model, predictors: Sequence[Predictor], points: Sequence[Trace]) -> list[Tensor]:

@@ -4,82 +4,241 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache, reduce
 
+import numpy as np
 import torch
+from numpy.polynomial import chebyshev
 from torch import Tensor
 
 from trainer.prediction.stages import Sensor
 
 STEPS = 3  # of Gauss-Newton; displacements are a small part of a speckle
 MOST = 1.0  # panel pixels that one step may move
-BLUR_STEP, TRIED_BLURS = 0.3, 8  # between widths that are tried, as shares of the usual one; how many at once
-WIDEST_BLURS = 4  # times as many are tried where the widest of them fits best
+# Widths of blurs, as shares of the usual one: the widest at first, and in the end, where the widest fits best.
+WIDEST_BLUR, LIMIT = 2.4, 9.6
+TRIED_BLURS = 6, 2.1  # how many: a few, and so many more a usual width
+BLUR_STEP = 0.05  # for derivatives, share of the usual width
+RATIOS = np.linspace(0, 1, 161)  # of the widest, between which the best is looked for
 
 
-def displaced_spectrum(
+@dataclass(frozen=True)
+class Motion:
+    """How each capture's picture is moved, in numbers of its own.
+
+    Attributes
+    ----------
+    shift : Tensor [B, 2] or None
+        Displacement along rows and columns, panel pixels.
+    blur : Tensor [B] or None
+        Width of the blur, share of the usual one.
+    """
+
+    shift: Tensor | None
+    blur: Tensor | None
+
+    def filter(self, sensor: Sensor) -> Tensor:
+        """Transfer functions [B, n, m] of the motions of a sensor that has motions of these kinds."""
+        parts = []
+        if self.shift is not None:
+            parts.append(_ramp(sensor, self.shift))
+        if self.blur is not None and sensor.capture_blur is not None:
+            parts.append(torch.stack([sensor.capture_blur(b**2) for b in self.blur]))
+        return reduce(torch.mul, parts)
+
+
+def measured_motion(
     sensor: Sensor, spectrum: Tensor, read: Callable[[Tensor], Tensor], measured: tuple[Tensor, Tensor]
-) -> Tensor:
-    """The spectrum of pictures, each displaced to where its capture has it.
+) -> Motion | None:
+    """The motion of each capture as the captures themselves show it; None where the sensor has none.
 
     Parameters
     ----------
     spectrum : complex Tensor [B, n, m]
-        Of the pictures over the frequencies (iy, ix), before their displacement.
+        Of the pictures over the frequencies (iy, ix), before their motion.
     read : callable
         Gives the light on the camera's pixels, [B, h, w], of such a spectrum.
     measured : (Tensor, Tensor)
         Signal and weight, [B, h, w].
     """
     with torch.no_grad():
-        shift = torch.zeros((*spectrum.shape[:-2], 2), dtype=sensor.iy.dtype)
-        plain = spectrum.detach()
-        for _ in range(STEPS):
-            shift = shift + _step(sensor, plain * _ramp(sensor, shift), read, measured)
-    return spectrum * _ramp(sensor, shift)
+        spectrum, shift, blur = spectrum.detach(), None, None
+        if sensor.free_capture_shift:
+            shift = torch.zeros((*spectrum.shape[:-2], 2), dtype=sensor.iy.dtype)
+            for _ in range(STEPS):
+                shift = shift + _step(sensor, spectrum * _ramp(sensor, shift), read, measured)
+            spectrum = spectrum * _ramp(sensor, shift)
+        if sensor.capture_blur is not None:
+            blur = _blur(sensor, sensor.capture_blur, spectrum, read, measured)
+    return None if shift is None and blur is None else Motion(shift, blur)
 
 
-def blurred_spectrum(
-    sensor: Sensor, spectrum: Tensor, read: Callable[[Tensor], Tensor], measured: tuple[Tensor, Tensor]
+@dataclass(frozen=True)
+class MotionNearby:
+    """Light under models a small step from one whose captures' motions are known, for derivatives.
+
+    To measure each motion anew is most of the work. To first order it takes up that part of the light's change that
+    looks like more motion: the change is projected (Kaufman 1975, variable projection).
+
+    Attributes
+    ----------
+    motion : Motion
+    sensor : Sensor
+        Of the model whose motions these are.
+    filter : Tensor [B, n, m]
+        Its transfer functions.
+    seen : Tensor [B, h, w]
+        What the motions were measured by, under that model: light times the sensor's gain, and added light.
+    counts : Tensor [B, 1, 1]
+        Counts for a unit of `seen`.
+    slopes : Tensor [B, k, h w]
+        How the light changes with each number of the motion.
+    weighted : Tensor [B, k + 1, h w]
+        How `seen` changes with these and with brightness, weighted as where motions are measured.
+    inverse : Tensor [B, k + 1, k + 1]
+        Of their products.
+    """
+
+    motion: Motion
+    sensor: Sensor
+    filter: Tensor
+    seen: Tensor
+    counts: Tensor
+    slopes: Tensor
+    weighted: Tensor
+    inverse: Tensor
+
+    def suits(self, sensor: Sensor) -> bool:
+        """Whether a sensor has the same motions: to first order, one of another shape would look like more of it."""
+        blur, own = sensor.capture_blur, self.sensor.capture_blur
+        if sensor.free_capture_shift != self.sensor.free_capture_shift or (blur is None) != (own is None):
+            return False
+        return (
+            blur is own
+            or own is None
+            or blur is None
+            or torch.equal(blur(_usual(sensor)), own(_usual(sensor)))
+        )
+
+    def light_of(self, sensor: Sensor, spectrum: Tensor, read: Callable[[Tensor], Tensor]) -> Tensor:
+        """Light on the camera's pixels [B, h, w] of a spectrum before its motion."""
+        light = read(spectrum * self.filter)
+        change = (_seen(sensor, light, self.counts) - self.seen).flatten(1)[:, :, None]
+        taken_up = (self.inverse @ (self.weighted @ change).double())[:, :-1].to(light.dtype)
+        return light - (taken_up.mT @ self.slopes).reshape(light.shape)
+
+
+def motion_nearby(
+    sensor: Sensor,
+    motion: Motion,
+    spectrum: Tensor,
+    read: Callable[[Tensor], Tensor],
+    measured: tuple[Tensor, Tensor],
+) -> MotionNearby:
+    """What derivatives need of a model's motions: see `measured_motion`."""
+    moving = motion.filter(sensor)
+    moved, slopes = spectrum * moving, []
+    light = read(moved)
+    if motion.shift is not None:
+        slopes += [read(moved * (2j * math.pi * f)) for f in (sensor.iy, sensor.ix)]
+    if motion.blur is not None:
+        more = replace(motion, blur=motion.blur + BLUR_STEP)
+        free = (motion.blur > BLUR_STEP).to(light.dtype)  # none has less blur than none
+        slopes.append((read(spectrum * more.filter(sensor)) - light) / BLUR_STEP * free[:, None, None])
+    observed, weight = _signal(sensor, measured)
+    columns = [_on_sensor(sensor, one) for one in (*slopes, light)]
+    stacked = torch.stack(columns, 1).flatten(2)
+    weighted = stacked * weight.flatten(1)[:, None]
+    products = (weighted @ stacked.mT).double()
+    power = products[:, -1, -1, None, None].clamp(min=1e-30)
+    counts = _sum(weight * observed * columns[-1])[:, None, None] / power
+    inverse = torch.linalg.pinv(products, rtol=1e-12, hermitian=True)
+    counts = torch.where(counts > 0, counts, 1.0).to(light.dtype)
+    seen = _seen(sensor, light, counts)
+    return MotionNearby(
+        motion, sensor, moving, seen, counts, torch.stack(slopes, 1).flatten(2), weighted, inverse
+    )
+
+
+def _blur(
+    sensor: Sensor,
+    blur: Callable[[Tensor], Tensor],
+    spectrum: Tensor,
+    read: Callable[[Tensor], Tensor],
+    measured: tuple[Tensor, Tensor],
 ) -> Tensor:
-    """The spectrum of pictures, each blurred as much as its capture is.
+    """Width of each capture's blur [B], share of the usual one."""
+    observed, weight = _signal(sensor, measured)
+    widest = WIDEST_BLUR
+    while True:
+        amounts, interpolation = _blurs_tried(widest)
+        sums = []
+        for amount in amounts:
+            tried = blur(torch.tensor(amount, dtype=sensor.iy.dtype))
+            picture = _on_sensor(sensor, read(spectrum * tried))
+            weighted = weight * picture
+            sums.append(torch.stack([_sum(weighted * observed), _sum(weighted * picture)]))
+        ratio = _best_ratio(torch.stack(sums, -1), interpolation) * widest
+        if widest >= LIMIT or bool((ratio < 0.95 * widest).all()):
+            return ratio.to(sensor.iy.dtype)
+        widest *= 2
+
+
+@cache
+def _blurs_tried(widest: float) -> tuple[tuple[float, ...], Tensor]:
+    """Squares of the widths that are tried, and the matrix that interpolates from these to RATIOS, float64.
+
+    What a picture's products with others are is smooth in the square of its blur's width, so a few Chebyshev points up
+    to the widest one tell all between.
+    """
+    tried = round(TRIED_BLURS[0] + TRIED_BLURS[1] * widest)
+    nodes = chebyshev.chebpts1(tried)
+    there = chebyshev.chebvander(nodes, tried - 1)
+    between = chebyshev.chebvander(2 * RATIOS**2 - 1, tried - 1)
+    return tuple(0.5 * (1 + nodes) * widest**2), torch.as_tensor(np.linalg.solve(there.T, between.T).T)
+
+
+def _best_ratio(sums: Tensor, interpolation: Tensor) -> Tensor:
+    """The widths at which blurred pictures fit best, [B], shares of the widest one tried.
 
     Parameters
     ----------
-    sensor : Sensor
-        With a blur of each capture's own.
-    spectrum, read, measured
-        As in `displaced_spectrum`.
+    sums : Tensor [2, B, K], float64
+        Products of the blurred pictures with the measured ones, and with themselves.
+    interpolation : Tensor [N, K]
+        From the blurs tried to RATIOS.
     """
-    blur = sensor.capture_blur
-    assert blur is not None
-    with torch.no_grad():
-        observed, weight = _flat(sensor, measured)
-        scores: list[Tensor] = []
-        while len(scores) < WIDEST_BLURS * TRIED_BLURS:
-            for _ in range(TRIED_BLURS):
-                ratio = torch.tensor(BLUR_STEP * len(scores), dtype=sensor.iy.dtype)
-                picture = _on_sensor(sensor, read(spectrum * blur(ratio**2))).flatten(1).double()
-                # With the best brightness, the misfit falls by (m . p)^2 / (p . p).
-                power = (weight * picture**2).sum(1).clamp(min=1e-30)
-                scores.append((weight * picture * observed).sum(1) ** 2 / power)
-            score = torch.stack(scores, 1)
-            if bool((score.argmax(1) < len(scores) - 1).all()):
-                break
-        best = score.argmax(1).clamp(1, len(scores) - 2)
-        before, here, after = (score.gather(1, best[:, None] + k)[:, 0] for k in (-1, 0, 1))
-        bend = before - 2 * here + after
-        part = torch.where(bend < 0, 0.5 * (before - after) / torch.where(bend < 0, bend, -1.0), 0.0)
-        part = torch.where(bend < 0, part, torch.sign(after - before))
-        amount = ((best + part.clamp(-1, 1)).to(ratio.dtype) * BLUR_STEP) ** 2
-    return spectrum * torch.stack([blur(a) for a in amount])
+    product, power = sums @ interpolation.T
+    power = torch.maximum(power, 0.5 * sums[1].amin(1, keepdim=True)).clamp(min=1e-30)
+    score = product.clamp(min=0) ** 2 / power  # with the best brightness, the misfit falls by this
+    best = score.argmax(1).clamp(1, len(RATIOS) - 2)
+    before, here, after = (score.gather(1, best[:, None] + k)[:, 0] for k in (-1, 0, 1))
+    bend = before - 2 * here + after
+    part = torch.where(bend < 0, 0.5 * (before - after) / torch.where(bend < 0, bend, -1.0), 0.0)
+    part = torch.where(bend < 0, part, torch.sign(after - before))
+    return (best + part.clamp(-1, 1)) * RATIOS[1]
 
 
-def _flat(sensor: Sensor, measured: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """Signal without added light, and weight: [B, pixels]."""
+def _signal(sensor: Sensor, measured: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """Signal without added light, and weight: [B, h, w]."""
     observed, weight = measured
-    if sensor.offset is not None:
-        observed = observed - sensor.offset
-    return observed.flatten(1).double(), weight.flatten(1).double()
+    return (observed if sensor.offset is None else observed - sensor.offset), weight
+
+
+def _usual(sensor: Sensor) -> Tensor:
+    """The amount of a usual blur."""
+    return torch.ones((), dtype=sensor.iy.dtype)
+
+
+def _seen(sensor: Sensor, light: Tensor, counts: Tensor) -> Tensor:
+    """What motions are measured by, in units of light: light times the sensor's gain, and added light."""
+    on_sensor = _on_sensor(sensor, light)
+    return on_sensor if sensor.offset is None else on_sensor + sensor.offset / counts
+
+
+def _sum(pictures: Tensor) -> Tensor:
+    return pictures.sum((-2, -1), dtype=torch.float64)
 
 
 def _on_sensor(sensor: Sensor, light: Tensor) -> Tensor:
@@ -96,7 +255,7 @@ def _step(
     sensor: Sensor, spectrum: Tensor, read: Callable[[Tensor], Tensor], measured: tuple[Tensor, Tensor]
 ) -> Tensor:
     """Displacements [B, 2] that fit the pictures better, each with a brightness of its own."""
-    observed, weight = _flat(sensor, measured)
+    observed, weight = (t.flatten(1).double() for t in _signal(sensor, measured))
     columns = [read(spectrum)]
     columns += [read(spectrum * (2j * math.pi * f)) for f in (sensor.iy, sensor.ix)]
     stacked = torch.stack([_on_sensor(sensor, c) for c in columns], 1).flatten(2).double()

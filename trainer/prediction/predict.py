@@ -30,7 +30,7 @@ from runtime.lightpath.propagation import far_field_matrix
 from trainer.device import array_of
 from trainer.kept_results import kept_by_device, kept_for_same
 from trainer.prediction.capture_gain import own_gain
-from trainer.prediction.capture_motion import blurred_spectrum, displaced_spectrum
+from trainer.prediction.capture_motion import MotionNearby, measured_motion, motion_nearby
 from trainer.prediction.other_beam import spectra_of_other_beam
 from trainer.prediction.panel_gradient import has_panel_gradient, image_with_panel_gradient
 from trainer.prediction.panel_spectra import BESIDE, NOMINAL, irradiance_of, panel_spectra
@@ -257,7 +257,11 @@ def _lit(scene: Scene, stages: Stages, path: LightPath, image: Callable[[LightPa
 
 
 def light_on_camera(
-    scene: Scene, stages: Stages, image: Tensor, measured: tuple[Tensor, Tensor] | None = None
+    scene: Scene,
+    stages: Stages,
+    image: Tensor,
+    measured: tuple[Tensor, Tensor] | None = None,
+    near: MotionNearby | None = None,
 ) -> Tensor:
     """Irradiance that the camera's pixels integrate, before gain, offset and response.
 
@@ -269,14 +273,41 @@ def light_on_camera(
         Irradiance on the fine image grid, as in `Trace`.
     measured : (Tensor, Tensor), optional
         Signal and weight [B, h, w]: where the camera moves, each capture's own displacement and blur follow from them.
+    near : MotionNearby, optional
+        Of a model that is a small step away: the motions follow from that model's, for derivatives.
 
     Returns
     -------
     Tensor [B, h, w]
     """
+    sensor = stages.sensor
+    spectrum, read = _before_motion(scene, stages, image)
+    if near is not None and near.suits(sensor):
+        return near.light_of(sensor, spectrum, read)
+    if measured is not None:
+        motion = measured_motion(sensor, spectrum, read, measured)
+        spectrum = spectrum if motion is None else spectrum * motion.filter(sensor)
+    elif sensor.capture_blur is not None:
+        spectrum = spectrum * sensor.capture_blur(torch.ones((), dtype=scene.dtype))
+    return read(spectrum)
+
+
+def motion_on_camera(
+    scene: Scene, stages: Stages, image: Tensor, measured: tuple[Tensor, Tensor]
+) -> MotionNearby | None:
+    """What `light_on_camera` needs of models a small step away; None where the camera does not move.
+
+    Parameters are those of `light_on_camera`.
+    """
+    spectrum, read = _before_motion(scene, stages, image)
+    motion = measured_motion(stages.sensor, spectrum, read, measured)
+    return None if motion is None else motion_nearby(stages.sensor, motion, spectrum, read, measured)
+
+
+def _before_motion(scene: Scene, stages: Stages, image: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+    """Spectrum of the irradiance on the camera before the captures' motions, and how its pixels read it."""
     grid, camera = scene.grid, scene.bench.camera
     sensor = stages.sensor
-    transfer = _camera_transfer(scene, stages.pupil, sensor)
     if sensor.displacement is not None:
         dy, dx = sensor.displacement
         rows = torch.arange(dy.shape[-2], dtype=dy.dtype)[:, None]
@@ -293,15 +324,7 @@ def light_on_camera(
         fine = finer_picture(finer, grid.image_shape, FINER)
         return samples_at(fine, *sample_places(grid, *places, FINER))
 
-    spectrum = rfft2(image) * transfer
-    if sensor.free_capture_shift and measured is not None:
-        spectrum = displaced_spectrum(sensor, spectrum, read, measured)
-    if sensor.capture_blur is not None:
-        if measured is None:
-            spectrum = spectrum * sensor.capture_blur(torch.ones((), dtype=scene.dtype))
-        else:
-            spectrum = blurred_spectrum(sensor, spectrum, read, measured)
-    return read(spectrum)
+    return rfft2(image) * _camera_transfer(scene, stages.pupil, sensor), read
 
 
 @kept_for_same(2)  # of a fit's model and of its trial
