@@ -14,7 +14,8 @@ levels sent to it (here: pattern) are a phase hologram. This module names what i
     solver = hololoop.Solver("bundle/")
     solver.solve("picture.png", fit=True).save("pattern.png")
 
-In a notebook the results show themselves. `Solver` needs the base install alone; everything else needs the
+Import it before torch: threads then wait asleep instead of spinning, which is what keeps this quick on a machine with
+other work. In a notebook the results show themselves. `Solver` needs the base install alone; everything else needs the
 workstation's packages: pip install 'hololoop[trainer]'.
 
 Other modules of the packages `trainer`, `runtime` and `firmware_iface` may change between versions. These names
@@ -25,6 +26,9 @@ from __future__ import annotations
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+from runtime.program.large_blocks import keep_large_blocks
+from runtime.program.threads import wait_asleep
 
 if TYPE_CHECKING:
     from firmware_iface.errors import DeviceError, InputError
@@ -55,6 +59,10 @@ __all__ = [
     "read_model",
     "write_model",
 ]
+
+# As the programs do: for the whole process, before anything is loaded that reads it.
+wait_asleep()
+keep_large_blocks()
 
 # Where each name is defined: (module, name there).
 _DEFINED_IN = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -14,6 +15,7 @@ import pytest
 from PIL import Image
 
 import hololoop
+from runtime.program.threads import WAITING
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -64,6 +66,26 @@ def loaded_after(script: str) -> set[str]:
     return {name.split(".")[0] for name in json.loads(done.stdout.splitlines()[-1])}
 
 
+def test_threads_wait_asleep_unless_the_environment_says_otherwise() -> None:
+    """OpenMP reads the environment when torch loads, so it is said as soon as hololoop is imported."""
+    script = "import os, hololoop; print(os.environ['OMP_WAIT_POLICY'], os.environ['GOMP_SPINCOUNT'])"
+
+    def said(**given: str) -> str:
+        bare = {k: v for k, v in os.environ.items() if k not in WAITING}
+        run = subprocess.run(
+            [sys.executable, "-c", script],
+            cwd=ROOT,
+            env=bare | given,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        return run.stdout.strip()
+
+    assert said() == "PASSIVE 0"
+    assert said(OMP_WAIT_POLICY="ACTIVE") == "ACTIVE 0"
+
+
 def test_these_names_are_public_and_no_others() -> None:
     assert sorted(hololoop.__all__) == PUBLIC
     assert dir(hololoop) == PUBLIC
@@ -75,17 +97,19 @@ def test_these_names_are_public_and_no_others() -> None:
 
 def test_what_type_checkers_see_is_what_is_given() -> None:
     """The imports under TYPE_CHECKING and the table that is used at run time name the same things."""
+    module = ast.parse((ROOT / "hololoop.py").read_text(encoding="utf-8"))
+    (checked,) = (node for node in module.body if isinstance(node, ast.If))  # if TYPE_CHECKING
     seen = {}
-    for node in ast.walk(ast.parse((ROOT / "hololoop.py").read_text(encoding="utf-8"))):
-        if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in hololoop._OWN:
-            seen |= {alias.asname or alias.name: (node.module, alias.name) for alias in node.names}
+    for node in checked.body:
+        assert isinstance(node, ast.ImportFrom)
+        seen |= {alias.asname or alias.name: (node.module, alias.name) for alias in node.names}
     assert seen == hololoop._DEFINED_IN
 
 
 def test_importing_it_brings_neither_torch_nor_numpy() -> None:
     loaded = loaded_after("import hololoop")
     assert "hololoop" in loaded
-    assert not loaded & {"torch", "numpy", "scipy", "matplotlib", "trainer", "runtime", "firmware_iface"}
+    assert not loaded & {"torch", "numpy", "scipy", "matplotlib", "trainer", "firmware_iface"}
 
 
 def test_the_solver_comes_without_torch_and_the_trainer() -> None:
