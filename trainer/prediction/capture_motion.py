@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, reduce
+from functools import reduce
 
 import numpy as np
 import torch
 from numpy.polynomial import chebyshev
 from torch import Tensor
 
+from trainer.kept_results import kept_by_device
 from trainer.prediction.stages import Sensor
 
 STEPS = 3  # of Gauss-Newton; displacements are a small part of a speckle
@@ -79,7 +80,7 @@ class MotionNearby:
     """Light under models a small step from one whose captures' motions are known, for derivatives.
 
     To measure each motion anew is most of the work. To first order it takes up that part of the light's change that
-    looks like more motion: the change is projected (Kaufman 1975, variable projection).
+    looks like more motion: the change is projected (variable projection).
 
     Attributes
     ----------
@@ -98,6 +99,10 @@ class MotionNearby:
         How `seen` changes with these and with brightness, weighted as where motions are measured.
     inverse : Tensor [B, k + 1, k + 1]
         Of their products.
+
+    References
+    ----------
+    Kaufman 1975: the derivative of a variable projection without the projection's own.
     """
 
     motion: Motion
@@ -185,7 +190,7 @@ def _blur(
         widest *= 2
 
 
-@cache
+@kept_by_device(3)
 def _blurs_tried(widest: float) -> tuple[tuple[float, ...], Tensor]:
     """Squares of the widths that are tried, and the matrix that interpolates from these to RATIOS, float64.
 
