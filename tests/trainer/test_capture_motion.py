@@ -44,6 +44,22 @@ def test_a_captures_blur_is_found_however_much_wider_than_the_usual_one(share: f
     assert motion.blur.item() == pytest.approx(share, rel=0.015, abs=0.01)
 
 
+@pytest.mark.parametrize("share", [0.5, 1.6])
+def test_a_blur_is_found_through_a_bent_response_and_added_light(share: float) -> None:
+    """Counts of bright places that are too low look like a wider blur."""
+    sharp = speckle(4)
+    light = 0.8 * read(torch.fft.rfft2(sharp) * gaussian(torch.tensor(share**2))) + 0.1
+
+    def bent(share: torch.Tensor) -> torch.Tensor:
+        return 1 - torch.exp(-1.5 * share)
+
+    sensor = sensor_that(blurs=True).responding(bent).brightened(torch.full((SIDE, SIDE), 0.1))
+    measured = (bent(light), torch.ones_like(light))
+    motion = measured_motion(sensor, torch.fft.rfft2(sharp), read, measured)
+    assert motion is not None and motion.blur is not None
+    assert motion.blur.item() == pytest.approx(share, rel=0.015)
+
+
 @pytest.mark.parametrize(
     ("kinds", "own"),
     [

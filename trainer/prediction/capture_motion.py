@@ -21,6 +21,8 @@ MOST = 1.0  # panel pixels that one step may move
 WIDEST_BLUR, LIMIT = 2.4, 9.6
 TRIED_BLURS = 6, 2.1  # how many: a few, and so many more a usual width
 BLUR_STEP = 0.05  # for derivatives, share of the usual width
+RESPONSE = -0.1, 1.5, 2049  # shares of full scale between which a response is turned back, and how many
+FLAT = 0.05  # least slope that a response is turned back with
 RATIOS = np.linspace(0, 1, 161)  # of the widest, between which the best is looked for
 
 
@@ -63,16 +65,19 @@ def measured_motion(
     measured : (Tensor, Tensor)
         Signal and weight, [B, h, w].
     """
+    if not sensor.free_capture_shift and sensor.capture_blur is None:
+        return None
     with torch.no_grad():
         spectrum, shift, blur = spectrum.detach(), None, None
+        signal = straight_signal(sensor, *measured)
         if sensor.free_capture_shift:
             shift = torch.zeros((*spectrum.shape[:-2], 2), dtype=sensor.iy.dtype)
             for _ in range(STEPS):
-                shift = shift + _step(sensor, spectrum * _ramp(sensor, shift), read, measured)
+                shift = shift + _step(sensor, spectrum * _ramp(sensor, shift), read, *signal)
             spectrum = spectrum * _ramp(sensor, shift)
         if sensor.capture_blur is not None:
-            blur = _blur(sensor, sensor.capture_blur, spectrum, read, measured)
-    return None if shift is None and blur is None else Motion(shift, blur)
+            blur = _blur(sensor, sensor.capture_blur, spectrum, read, *signal)
+    return Motion(shift, blur)
 
 
 @dataclass(frozen=True)
@@ -89,14 +94,16 @@ class MotionNearby:
         Of the model whose motions these are.
     filter : Tensor [B, n, m]
         Its transfer functions.
-    seen : Tensor [B, h, w]
-        What the motions were measured by, under that model: light times the sensor's gain, and added light.
+    measured : (Tensor, Tensor)
+        Signal and weight, [B, h, w].
+    beyond : Tensor [B, h, w]
+        What that model's light has more than the captures show, on the sensor: the motions make it smallest.
     counts : Tensor [B, 1, 1]
-        Counts for a unit of `seen`.
+        Counts for a unit of light on the sensor.
     slopes : Tensor [B, k, h w]
         How the light changes with each number of the motion.
     weighted : Tensor [B, k + 1, h w]
-        How `seen` changes with these and with brightness, weighted as where motions are measured.
+        How `beyond` changes with these and with brightness, weighted as where motions are measured.
     inverse : Tensor [B, k + 1, k + 1]
         Of their products.
 
@@ -108,7 +115,8 @@ class MotionNearby:
     motion: Motion
     sensor: Sensor
     filter: Tensor
-    seen: Tensor
+    measured: tuple[Tensor, Tensor]
+    beyond: Tensor
     counts: Tensor
     slopes: Tensor
     weighted: Tensor
@@ -129,7 +137,7 @@ class MotionNearby:
     def light_of(self, sensor: Sensor, spectrum: Tensor, read: Callable[[Tensor], Tensor]) -> Tensor:
         """Light on the camera's pixels [B, h, w] of a spectrum before its motion."""
         light = read(spectrum * self.filter)
-        change = (_seen(sensor, light, self.counts) - self.seen).flatten(1)[:, :, None]
+        change = (_beyond(sensor, light, self.counts, self.measured[0]) - self.beyond).flatten(1)[:, :, None]
         taken_up = (self.inverse @ (self.weighted @ change).double())[:, :-1].to(light.dtype)
         return light - (taken_up.mT @ self.slopes).reshape(light.shape)
 
@@ -151,18 +159,24 @@ def motion_nearby(
         more = replace(motion, blur=motion.blur + BLUR_STEP)
         free = (motion.blur > BLUR_STEP).to(light.dtype)  # none has less blur than none
         slopes.append((read(spectrum * more.filter(sensor)) - light) / BLUR_STEP * free[:, None, None])
-    observed, weight = _signal(sensor, measured)
+    signal, weight = straight_signal(sensor, *measured)
     columns = [_on_sensor(sensor, one) for one in (*slopes, light)]
     stacked = torch.stack(columns, 1).flatten(2)
     weighted = stacked * weight.flatten(1)[:, None]
     products = (weighted @ stacked.mT).double()
     power = products[:, -1, -1, None, None].clamp(min=1e-30)
-    counts = _sum(weight * observed * columns[-1])[:, None, None] / power
-    inverse = torch.linalg.pinv(products, rtol=1e-12, hermitian=True)
+    counts = _sum(weight * signal * columns[-1])[:, None, None] / power
     counts = torch.where(counts > 0, counts, 1.0).to(light.dtype)
-    seen = _seen(sensor, light, counts)
     return MotionNearby(
-        motion, sensor, moving, seen, counts, torch.stack(slopes, 1).flatten(2), weighted, inverse
+        motion,
+        sensor,
+        moving,
+        measured,
+        columns[-1] - signal / counts,
+        counts,
+        torch.stack(slopes, 1).flatten(2),
+        weighted,
+        torch.linalg.pinv(products, rtol=1e-12, hermitian=True),
     )
 
 
@@ -171,10 +185,10 @@ def _blur(
     blur: Callable[[Tensor], Tensor],
     spectrum: Tensor,
     read: Callable[[Tensor], Tensor],
-    measured: tuple[Tensor, Tensor],
+    signal: Tensor,
+    weight: Tensor,
 ) -> Tensor:
     """Width of each capture's blur [B], share of the usual one."""
-    observed, weight = _signal(sensor, measured)
     widest = WIDEST_BLUR
     while True:
         amounts, interpolation = _blurs_tried(widest)
@@ -183,7 +197,7 @@ def _blur(
             tried = blur(torch.tensor(amount, dtype=sensor.iy.dtype))
             picture = _on_sensor(sensor, read(spectrum * tried))
             weighted = weight * picture
-            sums.append(torch.stack([_sum(weighted * observed), _sum(weighted * picture)]))
+            sums.append(torch.stack([_sum(weighted * signal), _sum(weighted * picture)]))
         ratio = _best_ratio(torch.stack(sums, -1), interpolation) * widest
         if widest >= LIMIT or bool((ratio < 0.95 * widest).all()):
             return ratio.to(sensor.iy.dtype)
@@ -225,9 +239,17 @@ def _best_ratio(sums: Tensor, interpolation: Tensor) -> Tensor:
     return (best + part.clamp(-1, 1)) * RATIOS[1]
 
 
-def _signal(sensor: Sensor, measured: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """Signal without added light, and weight: [B, h, w]."""
-    observed, weight = measured
+def straight_signal(sensor: Sensor, observed: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Counts and weight as of a camera that adds nothing and responds in proportion to light, [B, h, w]."""
+    if sensor.response is not None:
+        shares = torch.linspace(*RESPONSE, dtype=observed.dtype)
+        curve = sensor.response(shares).cummax(0).values
+        seen = (observed / sensor.full_scale).contiguous()
+        k = torch.searchsorted(curve, seen).clamp(1, len(curve) - 1)
+        step = shares[1] - shares[0]
+        slope = ((curve[k] - curve[k - 1]) / step).clamp(min=FLAT)
+        observed = (shares[k - 1] + (seen - curve[k - 1]) / slope) * sensor.full_scale
+        weight = weight * slope**2
     return (observed if sensor.offset is None else observed - sensor.offset), weight
 
 
@@ -236,10 +258,9 @@ def _usual(sensor: Sensor) -> Tensor:
     return torch.ones((), dtype=sensor.iy.dtype)
 
 
-def _seen(sensor: Sensor, light: Tensor, counts: Tensor) -> Tensor:
-    """What motions are measured by, in units of light: light times the sensor's gain, and added light."""
-    on_sensor = _on_sensor(sensor, light)
-    return on_sensor if sensor.offset is None else on_sensor + sensor.offset / counts
+def _beyond(sensor: Sensor, light: Tensor, counts: Tensor, observed: Tensor) -> Tensor:
+    signal, _ = straight_signal(sensor, observed, torch.ones_like(observed))
+    return _on_sensor(sensor, light) - signal / counts
 
 
 def _sum(pictures: Tensor) -> Tensor:
@@ -257,10 +278,10 @@ def _ramp(sensor: Sensor, shift: Tensor) -> Tensor:
 
 
 def _step(
-    sensor: Sensor, spectrum: Tensor, read: Callable[[Tensor], Tensor], measured: tuple[Tensor, Tensor]
+    sensor: Sensor, spectrum: Tensor, read: Callable[[Tensor], Tensor], signal: Tensor, weight: Tensor
 ) -> Tensor:
     """Displacements [B, 2] that fit the pictures better, each with a brightness of its own."""
-    observed, weight = (t.flatten(1).double() for t in _signal(sensor, measured))
+    observed, weight = signal.flatten(1).double(), weight.flatten(1).double()
     columns = [read(spectrum)]
     columns += [read(spectrum * (2j * math.pi * f)) for f in (sensor.iy, sensor.ix)]
     stacked = torch.stack([_on_sensor(sensor, c) for c in columns], 1).flatten(2).double()
