@@ -52,8 +52,8 @@ kind = "distance"
 """
 
 
-def loaded_after(script: str) -> set[str]:
-    """Top-level modules that a fresh interpreter has imported after a script."""
+def modules_after(script: str) -> set[str]:
+    """Modules that a fresh interpreter has imported after a script."""
     done = subprocess.run(
         [sys.executable, "-c", f"{script}\nimport json, sys\nprint(json.dumps(sorted(sys.modules)))"],
         cwd=ROOT,
@@ -63,7 +63,12 @@ def loaded_after(script: str) -> set[str]:
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    return {name.split(".")[0] for name in json.loads(done.stdout.splitlines()[-1])}
+    return set(json.loads(done.stdout.splitlines()[-1]))
+
+
+def loaded_after(script: str) -> set[str]:
+    """Top-level modules that a fresh interpreter has imported after a script."""
+    return {name.split(".")[0] for name in modules_after(script)}
 
 
 def test_threads_wait_asleep_unless_the_environment_says_otherwise() -> None:
@@ -107,9 +112,13 @@ def test_what_type_checkers_see_is_what_is_given() -> None:
 
 
 def test_importing_it_brings_neither_torch_nor_numpy() -> None:
-    loaded = loaded_after("import hololoop")
+    modules = modules_after("import hololoop")
+    loaded = {name.split(".")[0] for name in modules}
     assert "hololoop" in loaded
     assert not loaded & {"torch", "numpy", "scipy", "matplotlib", "trainer", "firmware_iface"}
+    # Of its own packages only what says how threads wait and memory is kept.
+    settings = {"runtime", "runtime.program", "runtime.program.large_blocks", "runtime.program.threads"}
+    assert {name for name in modules if name.split(".")[0] == "runtime"} == settings
 
 
 def test_the_solver_comes_without_torch_and_the_trainer() -> None:

@@ -40,7 +40,7 @@ def test_a_captures_blur_is_found_however_much_wider_than_the_usual_one(share: f
     blurred = read(torch.fft.rfft2(sharp) * gaussian(torch.tensor(share**2)))
     measured = (3 * blurred, torch.ones_like(sharp))  # the exposure is not known
     motion = measured_motion(sensor_that(blurs=True), torch.fft.rfft2(sharp), read, measured)
-    assert motion is not None and motion.blur is not None
+    assert motion.blur is not None
     assert motion.blur.item() == pytest.approx(share, rel=0.015, abs=0.01)
 
 
@@ -56,7 +56,7 @@ def test_a_blur_is_found_through_a_bent_response_and_added_light(share: float) -
     sensor = sensor_that(blurs=True).responding(bent).brightened(torch.full((SIDE, SIDE), 0.1))
     measured = (bent(light), torch.ones_like(light))
     motion = measured_motion(sensor, torch.fft.rfft2(sharp), read, measured)
-    assert motion is not None and motion.blur is not None
+    assert motion.blur is not None
     assert motion.blur.item() == pytest.approx(share, rel=0.015)
 
 
@@ -77,8 +77,7 @@ def test_near_a_model_a_captures_motion_takes_up_what_looks_like_more_of_it(
     measured = (3 * torch.as_tensor(seen)[None], torch.ones_like(sharp))
     spectrum = torch.fft.rfft2(sharp)
     motion = measured_motion(sensor, spectrum, read, measured)
-    assert motion is not None
-    near = motion_nearby(sensor, motion, spectrum, read, measured)
+    near = motion_nearby(sensor, spectrum, read, measured)
     before = read(spectrum * motion.filter(sensor))
     assert torch.allclose(near.light_of(sensor, spectrum, read), before, atol=1e-6)
 
@@ -88,7 +87,6 @@ def test_near_a_model_a_captures_motion_takes_up_what_looks_like_more_of_it(
     changed = spectrum * like_motion + 0.01 * torch.fft.rfft2(speckle(5))
     held = read(changed * motion.filter(sensor))
     again = measured_motion(sensor, changed, read, measured)
-    assert again is not None
     exactly = read(changed * again.filter(sensor))
     error = (near.light_of(sensor, changed, read) - exactly).norm()
     assert error < 0.1 * (held - exactly).norm()

@@ -159,14 +159,19 @@ def explain(
     model = with_gains(captures, model, roles.fitted)
     errors = evaluate_captures(captures, roles.held_out, model)
     ideal = ideal_errors(roles, model) if model.present else errors
-    model = recorded(model, None, errors)
-    if save:
-        save(model)
-    steps = [ExplanationStep(None, errors)]
+    steps: list[ExplanationStep] = []
     # By each effect that was added, those that could have been added in its place.
     rivals: dict[str, dict[str, EffectInstance]] = {}
-    alike: dict[str, dict[str, EffectInstance]] = {}  # those of the rivals that it could not be told from
     diagnoses: list[Diagnosis] = []
+
+    def took(model: Model, *new: ExplanationStep) -> None:
+        """Note the steps that led to a model, and save it."""
+        steps.extend(new)
+        if save:
+            save(model)
+
+    model = recorded(model, None, errors)
+    took(model, ExplanationStep(None, errors))
 
     def without_unnecessary(
         model: Model, errors: PredictionErrors, names: Sequence[str]
@@ -180,9 +185,7 @@ def explain(
             dropped, model, errors = smaller
             names = [n for n in names if n != dropped]
             model = recorded(model, None, errors, dropped)
-            steps.append(ExplanationStep(None, errors, removed=dropped))
-            if save:
-                save(model)
+            took(model, ExplanationStep(None, errors, removed=dropped))
 
     def with_exchanges(
         model: Model, errors: PredictionErrors, report: Progress
@@ -199,9 +202,7 @@ def explain(
             old, new, model, errors = better
             del rivals[old]
             model = recorded(model, new, errors, old)
-            steps.append(ExplanationStep(new, errors, removed=old))
-            if save:
-                save(model)
+            took(model, ExplanationStep(new, errors, removed=old))
 
     screened = together = None
     if is_far(roles, model, errors):
@@ -214,10 +215,8 @@ def explain(
         history = model
         for name, errors in together.ladder:
             history = recorded(history, name, errors)
-            steps.append(ExplanationStep(name, errors))
         model = replace(together.model, history=history.history)
-        if save:
-            save(model)
+        took(model, *(ExplanationStep(*rung) for rung in together.ladder))
 
     while True:
         done = len(steps) - 1
@@ -238,9 +237,7 @@ def explain(
                 break
             name, model, errors = went_on
             model = recorded(model, None, errors, refined=name)
-            steps.append(ExplanationStep(None, errors, refined=name, form=form_of(model, name)))
-            if save:
-                save(model)
+            took(model, ExplanationStep(None, errors, refined=name, form=form_of(model, name)))
             continue
         report_share(0.9, f"adding {best.effect.name}")
         best, candidate, after = _added(roles, found, pool)
@@ -253,9 +250,7 @@ def explain(
             break
         errors = after
         model = recorded(candidate, best.effect.name, errors)
-        steps.append(ExplanationStep(best.effect.name, errors, best.indistinguishable_from))
-        if save:
-            save(model)
+        took(model, ExplanationStep(best.effect.name, errors, best.indistinguishable_from))
         newest = best.effect.name
         model, errors = without_unnecessary(model, errors, [n for n in model.names if n != newest])
         rivals[newest] = {
@@ -263,23 +258,23 @@ def explain(
             for r in found.ranking
             if r.worth_adding and r.effect.name != newest
         }
-        alike[newest] = {n: one for n, one in rivals[newest].items() if n in best.indistinguishable_from}
     kept = model.names
     limits = (diagnoses[-1].thresholds, ideal.excess)
+    alike = {
+        s.added: {n: one for n, one in rivals[s.added].items() if n in s.indistinguishable_from}
+        for s in steps
+        if s.added in rivals
+    }
     while (better := preferred(roles, model, errors, alike, *limits, pool)) is not None:
         old, new, model, errors = better
         del alike[old]
         model = recorded(model, new, errors, old)
-        steps.append(ExplanationStep(new, errors, removed=old))
-        if save:
-            save(model)
+        took(model, ExplanationStep(new, errors, removed=old))
     simpler = one_for_two(roles, model, errors, rivals, *limits, pool)
     if simpler is not None:
         new, old, other, model, errors = simpler
         model = recorded(recorded(model, new, errors, old), None, errors, other)
-        steps += [ExplanationStep(new, errors, removed=old), ExplanationStep(None, errors, removed=other)]
-        if save:
-            save(model)
+        took(model, ExplanationStep(new, errors, removed=old), ExplanationStep(None, errors, removed=other))
     # A last pass: of every effect but the newest it is known already that the rest cannot do without it.
     if len(model.names) > 1:
         model, errors = without_unnecessary(model, errors, [steps[-1].added] if steps[-1].added else [])
@@ -288,9 +283,7 @@ def explain(
     ) is not None:
         name, model, errors = common
         model = recorded(model, None, errors, refined=name, form=IN_COMMON)
-        steps.append(ExplanationStep(None, errors, refined=name, form=IN_COMMON))
-        if save:
-            save(model)
+        took(model, ExplanationStep(None, errors, refined=name, form=IN_COMMON))
     if model.names != kept or steps[-1].form == IN_COMMON:
         found = diagnose(captures, model, known, pool, thresholds, None, ideal, thorough=False)
         diagnoses.append(found)

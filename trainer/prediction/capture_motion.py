@@ -42,7 +42,7 @@ class Motion:
     blur: Tensor | None
 
     def filter(self, sensor: Sensor) -> Tensor:
-        """Transfer functions [B, n, m] of the motions of a sensor that has motions of these kinds."""
+        """Transfer functions [B, n, m] of the motions of a sensor that `moves` in these ways."""
         parts = []
         if self.shift is not None:
             parts.append(_ramp(sensor, self.shift))
@@ -53,8 +53,8 @@ class Motion:
 
 def measured_motion(
     sensor: Sensor, spectrum: Tensor, read: Callable[[Tensor], Tensor], measured: tuple[Tensor, Tensor]
-) -> Motion | None:
-    """The motion of each capture as the captures themselves show it; None where the sensor has none.
+) -> Motion:
+    """The motion of each capture as the captures themselves show it, of a sensor that `moves`.
 
     Parameters
     ----------
@@ -65,8 +65,6 @@ def measured_motion(
     measured : (Tensor, Tensor)
         Signal and weight, [B, h, w].
     """
-    if not sensor.free_capture_shift and sensor.capture_blur is None:
-        return None
     with torch.no_grad():
         spectrum, shift, blur = spectrum.detach(), None, None
         signal = straight_signal(sensor, *measured)
@@ -89,11 +87,10 @@ class MotionNearby:
 
     Attributes
     ----------
-    motion : Motion
     sensor : Sensor
         Of the model whose motions these are.
     filter : Tensor [B, n, m]
-        Its transfer functions.
+        Transfer functions of its motions.
     measured : (Tensor, Tensor)
         Signal and weight, [B, h, w].
     beyond : Tensor [B, h, w]
@@ -112,7 +109,6 @@ class MotionNearby:
     Kaufman 1975: the derivative of a variable projection without the projection's own.
     """
 
-    motion: Motion
     sensor: Sensor
     filter: Tensor
     measured: tuple[Tensor, Tensor]
@@ -124,32 +120,27 @@ class MotionNearby:
 
     def suits(self, sensor: Sensor) -> bool:
         """Whether a sensor has the same motions: to first order, one of another shape would look like more of it."""
-        blur, own = sensor.capture_blur, self.sensor.capture_blur
-        if sensor.free_capture_shift != self.sensor.free_capture_shift or (blur is None) != (own is None):
+        if sensor.free_capture_shift != self.sensor.free_capture_shift:
             return False
-        return (
-            blur is own
-            or own is None
-            or blur is None
-            or torch.equal(blur(_usual(sensor)), own(_usual(sensor)))
-        )
+        if sensor.capture_blur is self.sensor.capture_blur:
+            return True
+        blur, own = sensor.usual_blur, self.sensor.usual_blur
+        return blur is not None and own is not None and torch.equal(blur, own)
 
     def light_of(self, sensor: Sensor, spectrum: Tensor, read: Callable[[Tensor], Tensor]) -> Tensor:
         """Light on the camera's pixels [B, h, w] of a spectrum before its motion."""
         light = read(spectrum * self.filter)
-        change = (_beyond(sensor, light, self.counts, self.measured[0]) - self.beyond).flatten(1)[:, :, None]
-        taken_up = (self.inverse @ (self.weighted @ change).double())[:, :-1].to(light.dtype)
-        return light - (taken_up.mT @ self.slopes).reshape(light.shape)
+        signal, _ = straight_signal(sensor, *self.measured)
+        change = _on_sensor(sensor, light) - signal / self.counts - self.beyond
+        taken_up = self.inverse @ (self.weighted @ change.flatten(1)[:, :, None]).double()
+        return light - (taken_up[:, :-1].to(light.dtype).mT @ self.slopes).reshape(light.shape)
 
 
 def motion_nearby(
-    sensor: Sensor,
-    motion: Motion,
-    spectrum: Tensor,
-    read: Callable[[Tensor], Tensor],
-    measured: tuple[Tensor, Tensor],
+    sensor: Sensor, spectrum: Tensor, read: Callable[[Tensor], Tensor], measured: tuple[Tensor, Tensor]
 ) -> MotionNearby:
-    """What derivatives need of a model's motions: see `measured_motion`."""
+    """What derivatives need of a model's motions; the parameters are those of `measured_motion`."""
+    motion = measured_motion(sensor, spectrum, read, measured)
     moving = motion.filter(sensor)
     moved, slopes = spectrum * moving, []
     light = read(moved)
@@ -160,19 +151,18 @@ def motion_nearby(
         free = (motion.blur > BLUR_STEP).to(light.dtype)  # none has less blur than none
         slopes.append((read(spectrum * more.filter(sensor)) - light) / BLUR_STEP * free[:, None, None])
     signal, weight = straight_signal(sensor, *measured)
-    columns = [_on_sensor(sensor, one) for one in (*slopes, light)]
-    stacked = torch.stack(columns, 1).flatten(2)
+    on_sensor = _on_sensor(sensor, light)
+    stacked = torch.stack([*(_on_sensor(sensor, one) for one in slopes), on_sensor], 1).flatten(2)
     weighted = stacked * weight.flatten(1)[:, None]
     products = (weighted @ stacked.mT).double()
     power = products[:, -1, -1, None, None].clamp(min=1e-30)
-    counts = _sum(weight * signal * columns[-1])[:, None, None] / power
+    counts = _sum(weight * signal * on_sensor)[:, None, None] / power
     counts = torch.where(counts > 0, counts, 1.0).to(light.dtype)
     return MotionNearby(
-        motion,
         sensor,
         moving,
         measured,
-        columns[-1] - signal / counts,
+        on_sensor - signal / counts,
         counts,
         torch.stack(slopes, 1).flatten(2),
         weighted,
@@ -251,16 +241,6 @@ def straight_signal(sensor: Sensor, observed: Tensor, weight: Tensor) -> tuple[T
         observed = (shares[k - 1] + (seen - curve[k - 1]) / slope) * sensor.full_scale
         weight = weight * slope**2
     return (observed if sensor.offset is None else observed - sensor.offset), weight
-
-
-def _usual(sensor: Sensor) -> Tensor:
-    """The amount of a usual blur."""
-    return torch.ones((), dtype=sensor.iy.dtype)
-
-
-def _beyond(sensor: Sensor, light: Tensor, counts: Tensor, observed: Tensor) -> Tensor:
-    signal, _ = straight_signal(sensor, observed, torch.ones_like(observed))
-    return _on_sensor(sensor, light) - signal / counts
 
 
 def _sum(pictures: Tensor) -> Tensor:

@@ -284,11 +284,10 @@ def light_on_camera(
     spectrum, read = _before_motion(scene, stages, image)
     if near is not None and near.suits(sensor):
         return near.light_of(sensor, spectrum, read)
-    if measured is not None:
-        motion = measured_motion(sensor, spectrum, read, measured)
-        spectrum = spectrum if motion is None else spectrum * motion.filter(sensor)
-    elif sensor.capture_blur is not None:
-        spectrum = spectrum * sensor.capture_blur(torch.ones((), dtype=scene.dtype))
+    if measured is not None and sensor.moves:
+        spectrum = spectrum * measured_motion(sensor, spectrum, read, measured).filter(sensor)
+    elif (blur := sensor.usual_blur) is not None:
+        spectrum = spectrum * blur
     return read(spectrum)
 
 
@@ -299,9 +298,9 @@ def motion_on_camera(
 
     Parameters are those of `light_on_camera`.
     """
-    spectrum, read = _before_motion(scene, stages, image)
-    motion = measured_motion(stages.sensor, spectrum, read, measured)
-    return None if motion is None else motion_nearby(stages.sensor, motion, spectrum, read, measured)
+    if not stages.sensor.moves:
+        return None
+    return motion_nearby(stages.sensor, *_before_motion(scene, stages, image), measured)
 
 
 def _before_motion(scene: Scene, stages: Stages, image: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:

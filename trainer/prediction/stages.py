@@ -299,6 +299,17 @@ class Sensor:
     free_capture_shift: bool = False
     capture_blur: Callable[[Tensor], Tensor] | None = None
 
+    @property
+    def moves(self) -> bool:
+        """Whether each capture has a motion of its own."""
+        return self.free_capture_shift or self.capture_blur is not None
+
+    @property
+    def usual_blur(self) -> Tensor | None:
+        """Transfer function over (iy, ix) of the usual capture's blur; None where captures have none of their own."""
+        blur = self.capture_blur
+        return None if blur is None else blur(torch.ones((), dtype=self.iy.dtype))
+
     def blurred(self, transfer: Tensor) -> Sensor:
         """The sensor with the camera's picture filtered by a transfer function over (iy, ix)."""
         return replace(self, blur=transfer if self.blur is None else self.blur * transfer)
