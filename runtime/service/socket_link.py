@@ -69,8 +69,12 @@ class MessageLink:
         BlockingIOError
             On a socket that does not block, where there is nothing yet.
         """
-        room = socket.CMSG_SPACE(MOST_FDS * 4)
-        data, control, flags, _ = self.connection.recvmsg(LARGEST, room, socket.MSG_CMSG_CLOEXEC)
+        try:
+            data, control, flags, _ = self._next_packet()
+        except ConnectionResetError:
+            # The other side closed without reading all that it was sent. The kernel says so once, before it gives what
+            # that side had sent, which may be why it ended.
+            data, control, flags, _ = self._next_packet()
         fds = array.array("i")
         for level, kind, payload in control:
             if (level, kind) == (socket.SOL_SOCKET, socket.SCM_RIGHTS):
@@ -88,6 +92,11 @@ class MessageLink:
                 os.close(fd)
             raise
         return serial, message, fds[0] if fds else None
+
+    def _next_packet(self) -> tuple[bytes, list[tuple[int, int, bytes]], int, object]:
+        """What `recvmsg` returns, with room for any message and its descriptors."""
+        room = socket.CMSG_SPACE(MOST_FDS * 4)
+        return self.connection.recvmsg(LARGEST, room, socket.MSG_CMSG_CLOEXEC)
 
     def peer(self) -> PeerCredentials:
         """The credentials of the other side at the time it connected."""
