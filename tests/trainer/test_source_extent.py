@@ -11,8 +11,10 @@ import pytest
 import torch
 
 from tests.trainer.hidden import LARGER, captured, ran
-from tests.trainer.test_effects import present, scene_of
+from tests.trainer.test_effects import bench, gray, present, scene_of
+from trainer.model.model import EffectInstance, absent
 from trainer.model.model_stages import stages_for
+from trainer.prediction.predict import trace
 from trainer.prediction.scene import Scene
 from trainer.prediction.source_extent import lit_by_extent
 
@@ -24,7 +26,7 @@ def lit(scene: Scene, maps: torch.Tensor) -> torch.Tensor:
     stages = stages_for(
         scene, (present("spatial_coherence", extent_y=1e3 * EXTENT_Y, extent_x=1e3 * EXTENT_X),)
     )
-    return lit_by_extent(stages.pupil, lambda pupil: point_light(*pupil.centre, maps))
+    return lit_by_extent(stages.pupil, lambda pupil: point_light(*pupil.centre, maps))[0]
 
 
 def point_light(v: Any, u: Any, maps: Any) -> Any:
@@ -72,3 +74,32 @@ def test_light_that_the_iris_cuts_from_aside_is_in_the_model(
     }
     assert left["spatial_coherence"] < 1e-4
     assert left["sensor_blur"] > 4 * left["spatial_coherence"]
+
+
+@pytest.mark.parametrize(
+    ("other", "start", "most"),
+    [
+        (present("illumination", log_amplitude=0.05), "panel", 0.03),
+        (present("phase_response", gain=1.02), "drive", 0.05),
+        (present("spatial_coherence", extent_y=0.82, extent_x=0.5), "pupil", 0.1),
+        (present("spatial_coherence", extent_y=0.8, extent_x=0.5, halo=0.02), "pupil", 1e-9),
+        (present("iris", half_width=0.85), "pupil", 1e-9),
+    ],
+    ids=lambda value: value.effect.name if isinstance(value, EffectInstance) else None,
+)
+def test_a_derivative_takes_light_from_aside_as_it_was_where_the_pupil_is_the_same(
+    other: EffectInstance, start: str, most: float
+) -> None:
+    """It differs little from that of all five pictures, and not at all where the pupil is another one."""
+    extent = present("spatial_coherence", extent_y=0.8, extent_x=0.5)
+    scene = scene_of(extent, other)
+    here = [extent, *([] if other.effect is extent.effect else [absent(other.effect, bench())])]
+    there = [other if one.effect is other.effect else one for one in here]
+    base = trace(scene, stages_for(scene, tuple(here)), gray()[:1])
+    moved = stages_for(scene, tuple(there))
+    near, whole = (
+        trace(scene, moved, gray()[:1], start, base, nearby=nearby).image - base.image
+        for nearby in (True, False)
+    )
+    assert float(whole.norm()) > 1e-4 * float(base.image.norm())
+    assert float((near - whole).norm()) <= most * float(whole.norm())

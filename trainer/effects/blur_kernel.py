@@ -32,6 +32,8 @@ CORE_AND_HALO = (
     ),
 )
 
+MOST_DECAY = 40.0  # so that the product of two has a normal number
+
 
 def kernel_transfer(
     iy: Tensor, ix: Tensor, widths: tuple[Tensor, Tensor, Tensor], kurtosis: Tensor, halo: Tensor
@@ -64,19 +66,25 @@ def kernel_core(ky: Tensor, kx: Tensor, widths: tuple[Tensor, Tensor], kurtosis:
     exp(-w^2/2 + kurtosis w^4/24), the second limited to half of the first, where the expansion ends.
     """
     w2 = (widths[0] * ky) ** 2 + (widths[1] * kx) ** 2
-    peaked = torch.exp(w2 * (torch.clamp(kurtosis * w2 / 24, 0, 0.25) - 0.5))
-    return peaked if float(kurtosis.detach()) >= 0 else _flat_topped(w2, -kurtosis, peaked)
+    if float(kurtosis.detach()) < 0:
+        return _flat_topped(w2, -kurtosis)
+    return decayed(w2 * (torch.clamp(kurtosis * w2 / 24, max=0.25) - 0.5))
 
 
 def kernel_halo(ky: Tensor, kx: Tensor, width: Tensor) -> Tensor:
     """Transfer function of a round Gaussian halo, over radians per unit of its rms width."""
-    return torch.exp(-0.5 * width**2 * (ky**2 + kx**2))
+    return decayed(-0.5 * width**2 * (ky**2 + kx**2))
 
 
-def _flat_topped(w2: Tensor, flatness: Tensor, gaussian: Tensor) -> Tensor:
+def decayed(exponent: Tensor) -> Tensor:
+    """exp of what is 0 or less, down to a least one: where no normal number is left, exp is thirty times as slow."""
+    return torch.exp(torch.clamp(exponent, min=-MOST_DECAY))
+
+
+def _flat_topped(w2: Tensor, flatness: Tensor) -> Tensor:
     """The core between a Gaussian (flatness 0), a disc (1) and a ring (1.5), at squared frequencies w^2."""
     w = torch.sqrt(torch.clamp(w2, min=1e-8))  # a quotient has no value at 0
     disc = 2 * bessel_j1_over_x(2 * w)
     if float(flatness.detach()) <= 1:
-        return torch.lerp(gaussian, disc, flatness)
+        return torch.lerp(decayed(-0.5 * w2), disc, flatness)
     return torch.lerp(disc, bessel_j0(math.sqrt(2) * w), 2 * (flatness - 1))

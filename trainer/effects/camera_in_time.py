@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from trainer.effects.bessel import bessel_j0
+from trainer.effects.blur_kernel import decayed
 from trainer.effects.definition import Parameter, effect
 from trainer.effects.measured_values import blur_rms, pixel_pattern, shift_spread
 from trainer.prediction.stages import Sensor
@@ -76,7 +77,7 @@ def vibration(sensor: Sensor, rms: Tensor, direction: Tensor, kurtosis: Tensor) 
         w2 = amount * whole
         share = -kurtosis / 1.5
         sinusoid = bessel_j0(torch.sqrt(torch.clamp(2 * w2, min=1e-12)))  # a root has no slope at 0
-        return share * sinusoid + (1 - share) * torch.exp(-0.5 * w2)
+        return share * sinusoid + (1 - share) * decayed(-0.5 * w2)
 
     return sensor if float(rms.detach()) == 0 else replace(sensor, capture_blur=blur)
 

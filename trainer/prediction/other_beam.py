@@ -35,7 +35,7 @@ def spectra_of_other_beam(before: LightPath, path: LightPath, spectra: Tensor) -
     """
     if before.aperture != path.aperture:
         return None
-    if _same(before.leak, path.leak) and _same(before.source, path.source):
+    if same(before.leak, path.leak) and same(before.source, path.source):
         return spectra
     if path.crosstalk is None:
         return None
@@ -60,5 +60,6 @@ def _field(path: LightPath, spectra: Tensor) -> Tensor:
     return field
 
 
-def _same(one: Tensor | None, other: Tensor | None) -> bool:
+def same(one: Tensor | None, other: Tensor | None) -> bool:
+    """Whether two tensors are one, or have the same numbers."""
     return one is other or (one is not None and other is not None and torch.equal(one, other))

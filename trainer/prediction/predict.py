@@ -7,7 +7,7 @@ irradiance, counts.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,13 +31,13 @@ from trainer.device import array_of
 from trainer.kept_results import kept_by_device, kept_for_same
 from trainer.prediction.capture_gain import own_gain
 from trainer.prediction.capture_motion import MotionNearby, measured_motion, motion_nearby
-from trainer.prediction.other_beam import spectra_of_other_beam
+from trainer.prediction.other_beam import same, spectra_of_other_beam
 from trainer.prediction.panel_gradient import has_panel_gradient, image_with_panel_gradient
 from trainer.prediction.panel_spectra import BESIDE, NOMINAL, irradiance_of, panel_spectra
 from trainer.prediction.pupil_modes import phase_scales, pupil_modes
 from trainer.prediction.samples_at import samples_at
 from trainer.prediction.scene import Scene, Stages, bare_stages
-from trainer.prediction.source_extent import extent_transfer, lit_by_extent
+from trainer.prediction.source_extent import Aside, extent_transfer, lit_by_extent
 from trainer.prediction.stages import Drive, Pupil, Sensor
 
 MODULATION_SAMPLES = 512  # over phase: a linear step between them errs by 1e-5
@@ -185,15 +185,19 @@ class Trace:
         Irradiance before filters, of the source with its extent.
     paths : tuple of LightPath
         Of each capture.
+    asides : tuple of tuple of Aside
+        Of each capture: what light of the extent beside the axis does to the image.
     """
 
     spectra: Tensor
     image: Tensor
     paths: tuple[LightPath, ...]
+    asides: tuple[tuple[Aside, ...], ...]
 
     def of(self, k: int) -> Trace:
         """The results of capture k alone."""
-        return Trace(self.spectra[k : k + 1], self.image[k : k + 1], self.paths[k : k + 1])
+        one = slice(k, k + 1)
+        return Trace(self.spectra[one], self.image[one], self.paths[one], self.asides[one])
 
 
 def trace(
@@ -221,7 +225,7 @@ def trace(
         Patterns shown before, as in `driven_phase`.
     nearby : bool
         The stages are a small step from those of `before`, for a derivative: a changed beam may be taken so roughly as
-        `spectra_of_other_beam` does.
+        `spectra_of_other_beam` does, and behind the same pupil light beside the axis as `lit_by_extent` does.
 
     Returns
     -------
@@ -236,24 +240,38 @@ def trace(
     if known is None or (scales is not None and known.shape[2] == 1):
         phase = driven_phase(path, stages, gray, earlier)
         if scales is None and has_panel_gradient(path, phase):
-            image = _lit(scene, stages, path, lambda p: image_with_panel_gradient(p, phase))
-            return Trace(torch.empty(0), image, (path,) * len(gray))
+            lit = _lit(scene, stages, path, lambda p: image_with_panel_gradient(p, phase))
+            return _traced(torch.empty(0), lit, path, len(gray))
         known = panel_spectra(path, phase, NOMINAL) if known is None else known
         if scales is not None:
             known = torch.cat((known, panel_spectra(path, phase, BESIDE)), 2)
     spectra = known
-    image = _lit(scene, stages, path, lambda p: irradiance_of(p, spectra, scales))
-    return Trace(spectra, image, (path,) * len(gray))
+    near: tuple[Aside, ...] = ()
+    if nearby and before is not None and same(before.paths[0].transfers, path.transfers):
+        near = before.asides[0]
+    lit = _lit(scene, stages, path, lambda p: irradiance_of(p, spectra, scales), near)
+    return _traced(spectra, lit, path, len(gray))
 
 
-def _lit(scene: Scene, stages: Stages, path: LightPath, image: Callable[[LightPath], Tensor]) -> Tensor:
+def _traced(spectra: Tensor, lit: tuple[Tensor, tuple[Aside, ...]], path: LightPath, count: int) -> Trace:
+    image, asides = lit
+    return Trace(spectra, image, (path,) * count, tuple(tuple(a.of(k) for a in asides) for k in range(count)))
+
+
+def _lit(
+    scene: Scene,
+    stages: Stages,
+    path: LightPath,
+    image: Callable[[LightPath], Tensor],
+    near: Sequence[Aside] = (),
+) -> tuple[Tensor, tuple[Aside, ...]]:
     """Irradiance with the source's extent, of a function that gives that of a light path of a point's light."""
 
     def image_of(pupil: Pupil) -> Tensor:
         own = pupil is stages.pupil
         return image(path if own else light_path(scene, replace(stages, pupil=pupil)))
 
-    return lit_by_extent(stages.pupil, image_of)
+    return lit_by_extent(stages.pupil, image_of, near)
 
 
 def light_on_camera(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -18,16 +18,30 @@ NODE = math.sqrt(2)  # rms angles from the axis at which the iris is moved; 1 an
 STEP = 0.05  # rad, over the rms angle: of the differences that stand for the characteristic function's derivatives
 
 
-class _Aside(NamedTuple):
-    """An axis along which light is tilted: pupils for light ahead of and behind the middle, and their factors."""
+class Tilt(NamedTuple):
+    """Light at an angle (rad) to either side along an axis, and the pupils that it goes through."""
 
+    axis: int
+    angle: Tensor
     ahead: Pupil
     behind: Pupil
+
+
+class Aside(NamedTuple):
+    """What tilted light changes, as spectra [..., iy, ix]: the part that changes sign with the tilt, and the rest."""
+
+    tilt: Tilt
     odd: Tensor
     even: Tensor
 
+    def of(self, k: int) -> Aside:
+        """Those of capture k alone."""
+        return Aside(self.tilt, self.odd[k : k + 1], self.even[k : k + 1])
 
-def lit_by_extent(pupil: Pupil, image_of: Callable[[Pupil], Tensor]) -> Tensor:
+
+def lit_by_extent(
+    pupil: Pupil, image_of: Callable[[Pupil], Tensor], near: Sequence[Aside] = ()
+) -> tuple[Tensor, tuple[Aside, ...]]:
     """Irradiance behind a pupil, of a source with the pupil's extent.
 
     Light at an angle t to the axis gives the picture that the axis gives through an iris that is moved by
@@ -40,10 +54,16 @@ def lit_by_extent(pupil: Pupil, image_of: Callable[[Pupil], Tensor]) -> Tensor:
     pupil : Pupil
     image_of : callable
         Irradiance [..., ny, nx] behind a pupil, of a source that is a point.
+    near : sequence of Aside, optional
+        Of a light path that is a small step away behind the same pupil, for a derivative: what tilted light does to the
+        picture is taken from there, which leaves one picture of five. A derivative with respect to what the panel does
+        errs by a few percent, and one with respect to the extent by what a parabola may.
 
     Returns
     -------
     Tensor [..., ny, nx]
+    tuple of Aside
+        Of the axes along which light is tilted.
 
     References
     ----------
@@ -51,13 +71,19 @@ def lit_by_extent(pupil: Pupil, image_of: Callable[[Pupil], Tensor]) -> Tensor:
     """
     image = image_of(pupil)
     if pupil.extent is None:
-        return image
+        return image, ()
+    known, asides = {one.tilt.axis: one for one in near}, []
     spectrum = rfft2(image) * extent_transfer(pupil)
-    for one in _asides(pupil):
-        ahead, behind = image_of(one.ahead), image_of(one.behind)
-        spectrum = spectrum + rfft2(ahead - behind) * one.odd + rfft2(ahead + behind - 2 * image) * one.even
+    for tilt in _tilts(pupil):
+        aside = known.get(tilt.axis)
+        if aside is None:
+            ahead, behind = image_of(tilt.ahead), image_of(tilt.behind)
+            aside = Aside(tilt, rfft2(ahead - behind), rfft2(ahead + behind - 2 * image))
+        odd, even = _aside_transfers(pupil, aside.tilt)
+        spectrum = spectrum + aside.odd * odd + aside.even * even
+        asides.append(aside)
     blurred: Tensor = irfft2(spectrum, (image.shape[-2], image.shape[-1]))
-    return blurred
+    return blurred, tuple(asides)
 
 
 @kept_for_same(2)  # of a fit's model and of its trial
@@ -69,33 +95,35 @@ def extent_transfer(pupil: Pupil) -> Tensor:
 
 
 @kept_for_same(2)  # of a fit's model and of its trial
-def _asides(pupil: Pupil) -> list[_Aside]:
-    extent: SourceExtent | None = pupil.extent
-    assert extent is not None
-    down, across = _turns(pupil)
-    core = extent.core(down, across)
+def _tilts(pupil: Pupil) -> list[Tilt]:
+    """Tilted light that stands for the extent's, of each axis that has an extent."""
+    assert pupil.extent is not None
     found = []
-    for axis in (0, 1):
-        rms = extent.rms[axis]
+    for axis, rms in enumerate(pupil.extent.rms):
         if float(rms.detach()) == 0:
             continue
         # Shares of the band. The iris's edge goes through frequency samples: less than one tells no curvature.
         unit, sample = 2 * pupil.pitch / pupil.wavelength, _spacing((pupil.v, pupil.u)[axis])
         moved = torch.clamp(NODE * unit * rms, min=sample)
-        angle, step = moved / unit, STEP / rms
-        above, below = (
-            extent.core(down + s, across) if axis == 0 else extent.core(down, across + s)
-            for s in (step, -step)
-        )
-        found.append(
-            _Aside(
-                _with_iris_moved(pupil, axis, -moved),
-                _with_iris_moved(pupil, axis, moved),
-                1j * (above - below) / (4 * step * angle),
-                (2 * core - above - below) / (2 * (step * angle) ** 2),
-            )
-        )
+        ahead, behind = (_with_iris_moved(pupil, axis, by) for by in (-moved, moved))
+        found.append(Tilt(axis, moved / unit, ahead, behind))
     return found
+
+
+@kept_for_same(4)  # of both axes
+def _aside_transfers(pupil: Pupil, tilt: Tilt) -> tuple[Tensor, Tensor]:
+    """What the extent does to what tilted light does to the picture, over (iy, ix): to its odd and its even part."""
+    extent: SourceExtent | None = pupil.extent
+    assert extent is not None
+    down, across = _turns(pupil)
+    step = STEP / extent.rms[tilt.axis]
+    above, below = (
+        extent.core(down + s, across) if tilt.axis == 0 else extent.core(down, across + s)
+        for s in (step, -step)
+    )
+    odd = 1j * (above - below) / (4 * step * tilt.angle)
+    even = (2 * extent.core(down, across) - above - below) / (2 * (step * tilt.angle) ** 2)
+    return odd, even
 
 
 def _turns(pupil: Pupil) -> tuple[Tensor, Tensor]:
