@@ -34,7 +34,8 @@ from trainer.fitting.gauss_newton import fit
 from trainer.fitting.predictor import evaluate_captures
 from trainer.model.model import Model, absent
 from trainer.model.model_stages import scene_for, stages_for
-from trainer.prediction.predict import light_on_camera, trace
+from trainer.prediction.camera_light import light_on_camera
+from trainer.prediction.predict import trace
 
 HOLOLOOP = Path(sys.executable).with_name("hololoop-trainer")
 ROWS: list[tuple[str, str]] = []

@@ -7,7 +7,8 @@ import torch
 
 from tests.trainer.test_effects import gray, predicted, present, scene_of
 from trainer.model.model_stages import stages_for
-from trainer.prediction.predict import counts, light_on_camera, trace
+from trainer.prediction.camera_light import counts, light_on_camera
+from trainer.prediction.predict import trace
 
 
 def test_laser_drift_is_a_switch_and_the_gain_is_measured() -> None:

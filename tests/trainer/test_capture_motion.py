@@ -77,7 +77,7 @@ def test_near_a_model_a_captures_motion_takes_up_what_looks_like_more_of_it(
     measured = (3 * torch.as_tensor(seen)[None], torch.ones_like(sharp))
     spectrum = torch.fft.rfft2(sharp)
     motion = measured_motion(sensor, spectrum, read, measured)
-    near = motion_nearby(sensor, spectrum, read, measured)
+    near = motion_nearby(sensor, spectrum, read, measured, motion)
     before = read(spectrum * motion.filter(sensor))
     assert torch.allclose(near.light_of(sensor, spectrum, read), before, atol=1e-6)
 

@@ -22,7 +22,8 @@ from trainer.effects import catalogue
 from trainer.effects.zernike import zernike_count, zernike_surface
 from trainer.model.model import EffectInstance, Model, absent
 from trainer.model.model_stages import scene_for, stages_for
-from trainer.prediction.predict import counts, light_on_camera, light_path, trace
+from trainer.prediction.camera_light import counts, light_on_camera
+from trainer.prediction.predict import light_path, trace
 from trainer.prediction.scene import Scene, Stages
 
 TABLE = {

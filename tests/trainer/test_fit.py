@@ -137,3 +137,21 @@ def test_a_value_that_changes_nothing_holds_no_other_up(tmp_path: Path) -> None:
         start = instance_with(KNOWN["distance"], captures.bench, {"offset": offset})
         found = fit(drifting.having(start), ["distance", "laser_drift"], batches_of(captures)).model
         assert float(found.instance("distance").values["offset"]) == pytest.approx(0.1, abs=0.005)
+
+
+def test_a_fit_that_will_not_come_near_is_given_up_and_no_other(tmp_path: Path) -> None:
+    effect = KNOWN["ghost"]
+    captures = captures_with(tmp_path, effect, {"amplitude": 0.05, "shift_y": -3.3, "shift_x": 6.4}, 3)
+    right = instance_with(effect, captures.bench, {"amplitude": 0.02, "shift_y": -3.0, "shift_x": 6.0})
+    wrong = absent(KNOWN["illumination"], captures.bench)
+    batches = batches_of(captures)
+    for start, is_right in ((right, True), (wrong, False)):
+        model, names = Model(captures.bench).having(start), [start.effect.name]
+        patient, hasty = fit(model, names, batches), fit(model, names, batches, enough=1e-4)
+        assert (patient.errors.excess < 1e-4) == is_right
+        if is_right:
+            assert hasty.errors.excess == patient.errors.excess
+        else:
+            assert not hasty.settled
+            assert hasty.errors.excess > 0.9 * patient.errors.excess
+            assert plain(hasty.model.present[0].values) == plain(start.values)

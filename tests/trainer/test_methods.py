@@ -16,7 +16,8 @@ from trainer.captures.bench_file import Bench, read_bench
 from trainer.model.bundle_export import export_bundle
 from trainer.model.model import Model
 from trainer.model.model_stages import scene_for, stages_for
-from trainer.prediction.predict import light_on_camera, light_path, trace
+from trainer.prediction.camera_light import light_on_camera
+from trainer.prediction.predict import light_path, trace
 
 
 def bench(side: int, distance_mm: float) -> Bench:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -103,12 +104,20 @@ def try_on_few(
     return fitted.model, fitted.errors.excess, further
 
 
-def try_together_on_few(folder: Path, ids: tuple[str, ...], model: Model, start: EffectInstance) -> float:
-    """The excess on a few captures of one effect and the present ones, all fitted to these alone."""
+def try_together_on_few(
+    folder: Path, ids: tuple[str, ...], model: Model, start: EffectInstance, enough: float = math.inf
+) -> float:
+    """The excess on a few captures of one effect and the present ones, all fitted to these alone.
+
+    Parameters
+    ----------
+    enough : float
+        Excess of interest: a fit that will hardly come near is given up.
+    """
     captures = opened(folder)
     batches = load(captures, chosen(captures, ids))
     started = fit_from(model, start, batches, iterations=8).model
-    return fit(started, started.names, batches, iterations=8).errors.excess
+    return fit(started, started.names, batches, iterations=8, enough=enough).errors.excess
 
 
 def try_further(

@@ -182,7 +182,9 @@ def _promising(
     few = telling_captures(roles.captures, roles.fitted, model)
     enough = most(evaluate_captures(roles.captures, few, model).excess)
     ids = ids_of(few)
-    on_few = pool.map_here_if_one(try_together_on_few, [(roles.folder, ids, *trial) for trial in trials])
+    on_few = pool.map_here_if_one(
+        try_together_on_few, [(roles.folder, ids, *trial, enough) for trial in trials]
+    )
     promising = [k for k, excess in enumerate(on_few) if excess < enough]
     tasks = [(roles.folder, roles.ids, *trials[k]) for k in promising]
     fits = pool.map_here_if_one(all_refitted, tasks)

@@ -36,7 +36,7 @@ from trainer.effects.own_effect import OwnEffectError
 from trainer.fitting.jacobian import columns, keys_of
 from trainer.fitting.predictor import Predictor
 from trainer.model.model import Model
-from trainer.prediction.predict import counts
+from trainer.prediction.camera_light import counts
 
 PIXELS = 30_000  # of a picture that are looked at, spread at random; what they say stands for all
 KNOWN_SCALES = 20.0  # scales of a number within which it is known before any capture

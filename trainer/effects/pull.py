@@ -17,7 +17,8 @@ from torch import Tensor
 
 from trainer.device import array_of
 from trainer.effects.evidence import Evidence
-from trainer.prediction.predict import light_on_camera, trace
+from trainer.prediction.camera_light import light_on_camera
+from trainer.prediction.predict import trace
 from trainer.prediction.scene import bare_stages
 
 MOST_CAPTURES = 3

@@ -18,7 +18,8 @@ from trainer.device import array_of
 from trainer.effects.definition import Effect
 from trainer.model.model import EffectInstance, Model, absent, instance_with
 from trainer.model.model_stages import scene_for, stages_for
-from trainer.prediction.predict import counts, light_on_camera, trace
+from trainer.prediction.camera_light import counts, light_on_camera
+from trainer.prediction.predict import trace
 
 BRIGHTNESS = 0.13  # mean signal, share of full scale
 SECOND = Moment(1.0, 1.0)  # when predictions stand that are of no capture

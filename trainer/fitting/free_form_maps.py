@@ -17,8 +17,9 @@ from trainer.captures.batches import Batch
 from trainer.fitting.predictor import Predictor
 from trainer.fitting.side_by_side import side_by_side
 from trainer.model.model import Model
+from trainer.prediction.camera_light import counts, light_on_camera, motion_on_camera
 from trainer.prediction.free_stages import FreeFormStage, Tensors
-from trainer.prediction.predict import counts, light_on_camera, trace
+from trainer.prediction.predict import trace
 
 HISTORY = 10  # steps that L-BFGS keeps
 PATIENCE = 3  # rounds without progress on the captures that say when to stop
@@ -54,7 +55,7 @@ class FreeFormBatch:
         else:
             image = free.irradiance(scene, stages, gray, tensors)
         measured = (self.batch.signal[k : k + 1], self.batch.mask[k : k + 1])
-        light = light_on_camera(scene, stages, image, measured)
+        light = light_on_camera(scene, stages, image, motion_on_camera(scene, stages, image, measured))
         return counts(scene, stages, light, self.gain[k : k + 1], measured)
 
     def squared_error(self, free: FreeFormStage, tensors: Tensors, k: int) -> Tensor:

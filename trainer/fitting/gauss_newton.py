@@ -10,6 +10,7 @@ An effect of more than 100 numbers has no such table: its part of each step come
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
@@ -31,6 +32,8 @@ from trainer.fitting.predictor import Predictor, lights_of
 from trainer.model.model import Model, Values
 
 HOLD = 0.01  # `hold` of fits far from the truth
+# A fit is given up where a step is expected to leave more than so many times enough, and this share of what there is.
+FAR, SLOW = 10.0, 0.5
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,7 @@ def fit(
     progress: Progress | None = None,
     hold: float = 0.0,
     fixed: Collection[tuple[str, str]] = (),
+    enough: float = math.inf,
 ) -> FitResult:
     """Fit the named effects of a model, and the gains, to batches.
 
@@ -86,12 +90,14 @@ def fit(
         well, those nearest to "absent" are found. For tables of derivatives only, as `fixed` is.
     fixed : collection of (str, str)
         Effects and those of their parameters that keep their values.
+    enough : float
+        Excess at which the fit is of use: it is given up where it will hardly come near. As `hold`, for tables only.
     """
     with torch.no_grad():
         many = tuple(n for n in free if has_many(model.instance(n)))
         if many:
             return _fit_many(model, tuple(free), many, batches, iterations, tolerance, progress)
-        return _fit(model, tuple(free), batches, iterations, tolerance, progress, hold, fixed)
+        return _fit(model, tuple(free), batches, iterations, tolerance, progress, hold, fixed, enough)
 
 
 def _fit(
@@ -103,6 +109,7 @@ def _fit(
     progress: Progress | None,
     hold: float,
     fixed: Collection[tuple[str, str]],
+    enough: float,
 ) -> FitResult:
     predictors = [Predictor(model, b) for b in batches]
     keys = tuple(key for key in keys_of(model, free) if key[:2] not in fixed)
@@ -121,6 +128,10 @@ def _fit(
             progress(iteration / iterations)
         before = errors.excess
         normal, gradient = _normal(slopes), _gradient(slopes, residuals)
+        left = before - float(gradient @ _solve(normal, gradient, 0.0)) / scale
+        if fresh and left > max(FAR * enough, SLOW * before):
+            settled = False
+            break
         pull = hold * max(before, 0.0)
         away = _away(model, keys, ranges)
         if pull:

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from trainer.fitting.predictor import Predictor
 from trainer.model.model import Model
+from trainer.prediction.camera_light import counts
 from trainer.prediction.capture_gain import SETTLED, STEPS, brightness_step, brightness_terms
-from trainer.prediction.predict import counts
 
 
 def with_gain(model: Model, predictors: Sequence[Predictor], lights: Sequence[Tensor] | None = None) -> Model:

@@ -22,7 +22,8 @@ from trainer.fitting.jacobian import STEP
 from trainer.fitting.predictor import Predictor
 from trainer.model.model import EffectInstance, Model
 from trainer.model.model_stages import stages_of
-from trainer.prediction.predict import Trace, counts, light_on_camera, trace
+from trainer.prediction.camera_light import counts, light_on_camera, motion_on_camera
+from trainer.prediction.predict import Trace, trace
 
 MANY = 100  # numbers of an effect from which on it is fitted without a table of its derivatives
 PASSES = 10  # most products with the table and its transpose, for one step
@@ -183,7 +184,8 @@ class ManySlopes:
             image = trace(q.scene, stages, batch.gray[k : k + 1], self.first, before, earlier).image
             gain = self.model.gain[batch.channel] * batch.exposure[k : k + 1, None, None]
             measured = (batch.signal[k : k + 1], batch.mask[k : k + 1])
-            light = light_on_camera(q.scene, stages, image, measured)
+            motion = motion_on_camera(q.scene, stages, image, measured)
+            light = light_on_camera(q.scene, stages, image, motion)
             total = (weights[k : k + 1] * counts(q.scene, stages, light, gain, measured)).sum()
             leaves = [tensors[name][parameter] for name, parameter, _, _ in self._parts]
             slopes = torch.autograd.grad(total, leaves, allow_unused=True)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import weakref
+from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -14,11 +17,23 @@ from trainer.captures.capture_table import Capture
 from trainer.fitting.side_by_side import side_by_side
 from trainer.model.model import Model
 from trainer.model.model_stages import scene_for, stages_of
-from trainer.prediction.capture_motion import MotionNearby
-from trainer.prediction.predict import Trace, counts, light_on_camera, motion_on_camera, trace
+from trainer.prediction.camera_light import counts, light_on_camera, motion_near, motion_on_camera
+from trainer.prediction.capture_motion import Motion, MotionNearby
+from trainer.prediction.predict import Trace, trace
 from trainer.prediction.scene import Scene, Stages
 
-Motions = list[MotionNearby | None]
+NearMotions = list[MotionNearby | None]  # of each part of a batch
+
+
+@dataclass
+class _Moving:
+    """The captures' motions under a model, of each part of a batch; `near` is made when it is first asked for."""
+
+    present: object
+    learned: object
+    point: weakref.ref[Trace]
+    motions: list[Motion | None]
+    near: NearMotions | None = None
 
 
 class Predictor:
@@ -27,6 +42,7 @@ class Predictor:
     def __init__(self, model: Model, batch: Batch) -> None:
         self.scene: Scene = scene_for(model, batch.channel, batch.plane_mm, batch.signal.dtype)
         self.batch = batch
+        self._kept: deque[_Moving] = deque(maxlen=2)
 
     def stages(self, model: Model, k: int = 0) -> Stages:
         """The scene's stages under a model, at the moment of capture k."""
@@ -75,30 +91,56 @@ class Predictor:
         """Patterns shown before capture k [1, n, H, W], where the panel still shows something of them."""
         return None if stages.drive.persistence is None else self.batch.shown_before()[k : k + 1]
 
-    def motions(self, model: Model, point: Trace) -> Motions:
-        """What `light` needs of models that are a small step away, a part of the batch each."""
-        batch = self.batch
-        return [
-            motion_on_camera(self.scene, stages, point.image[part], (batch.signal[part], batch.mask[part]))
-            for part, stages in self.parts(model)
-        ]
+    def motions(self, model: Model, point: Trace) -> NearMotions:
+        """What `light` needs of models that are a small step away."""
+        moving = self._moving(model, point)
+        if moving.near is None:
+            moving.near = [
+                None
+                if motion is None
+                else motion_near(self.scene, stages, point.image[part], self._seen(part), motion)
+                for (part, stages), motion in zip(self.parts(model), moving.motions, strict=True)
+            ]
+        return moving.near
 
-    def light(self, model: Model, point: Trace, near: Motions | None = None) -> Tensor:
+    def light(self, model: Model, point: Trace, near: NearMotions | None = None) -> Tensor:
         """Irradiance on the camera [B, h, w].
 
         Parameters
         ----------
         near : list, optional
-            The motions of a model that is a small step away, for derivatives.
+            The motions of a model that is a small step away, for derivatives and for a search.
         """
-        batch, parts = self.batch, self.parts(model)
+        parts = self.parts(model)
+        motions: Sequence[Motion | MotionNearby | None]
+        if near is None:
+            motions = self._moving(model, point).motions
+        else:
+            motions = [
+                one if one is not None and one.suits(stages.sensor) else self._motion(stages, point, part)
+                for (part, stages), one in zip(parts, near, strict=True)
+            ]
         found = [
-            light_on_camera(
-                self.scene, stages, point.image[part], (batch.signal[part], batch.mask[part]), motion
-            )
-            for (part, stages), motion in zip(parts, near or [None] * len(parts), strict=True)
+            light_on_camera(self.scene, stages, point.image[part], motion)
+            for (part, stages), motion in zip(parts, motions, strict=True)
         ]
         return found[0] if len(found) == 1 else torch.cat(found)
+
+    def _moving(self, model: Model, point: Trace) -> _Moving:
+        """The captures' motions: measuring them is most of the work, so those of the last two models are kept."""
+        for one in self._kept:
+            if one.present is model.present and one.learned is model.learned and one.point() is point:
+                return one
+        motions = [self._motion(stages, point, part) for part, stages in self.parts(model)]
+        one = _Moving(model.present, model.learned, weakref.ref(point), motions)
+        self._kept.append(one)
+        return one
+
+    def _motion(self, stages: Stages, point: Trace, part: slice) -> Motion | None:
+        return motion_on_camera(self.scene, stages, point.image[part], self._seen(part))
+
+    def _seen(self, part: slice) -> tuple[Tensor, Tensor]:
+        return self.batch.signal[part], self.batch.mask[part]
 
     def counts(self, model: Model, light: Tensor) -> Tensor:
         """Counts above black [B, h, w], from the irradiance on the camera [B, h, w]."""
@@ -114,15 +156,23 @@ class Predictor:
         """Counts above black [B, h, w]."""
         return self.counts(model, self.light(model, self.trace(model)))
 
-    def predict_nearby(self, model: Model, start: str, before: Trace, near: Motions | None = None) -> Tensor:
+    def predict_nearby(
+        self, model: Model, start: str, before: Trace, near: NearMotions | None = None
+    ) -> Tensor:
         """Counts above black [B, h, w] of a model that is a small step away from stage `start` on."""
         point = self.trace(model, start, before, nearby=True)
         return self.counts(model, self.light(model, point, near))
 
 
-def lights_of(model: Model, predictors: Sequence[Predictor], points: Sequence[Trace]) -> list[Tensor]:
-    """Irradiance on the camera [B, h, w] of each predictor's batch."""
-    return [p.light(model, t) for p, t in zip(predictors, points, strict=True)]
+def lights_of(
+    model: Model,
+    predictors: Sequence[Predictor],
+    points: Sequence[Trace],
+    near: Sequence[NearMotions | None] | None = None,
+) -> list[Tensor]:
+    """Irradiance on the camera [B, h, w] of each predictor's batch; `near` as in `Predictor.light`."""
+    near = [None] * len(predictors) if near is None else near
+    return [p.light(model, t, n) for p, t, n in zip(predictors, points, near, strict=True)]
 
 
 def evaluate_captures(captures: CaptureSet, rows: Sequence[Capture], model: Model) -> PredictionErrors:

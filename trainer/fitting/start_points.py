@@ -63,10 +63,11 @@ def pattern_search(
 def start_cost(
     model: Model, predictors: Sequence[Predictor], points: Sequence[Trace], start: EffectInstance
 ) -> float:
-    """Squared error of a model with an effect at a start, gains fitted."""
+    """Squared error of a model with an effect at a start, gains fitted; the captures move about as without it."""
     trial = model.having(start)
+    near = [p.motions(model, t) for p, t in zip(predictors, points, strict=True)]
     moved = [p.trace(trial, start.effect.stage, t) for p, t in zip(predictors, points, strict=True)]
-    lights = lights_of(trial, predictors, moved)
+    lights = lights_of(trial, predictors, moved, near)
     trial = with_gain(trial, predictors, lights)
     return sum(_cost(p, p.counts(trial, light)) for p, light in zip(predictors, lights, strict=True))
 

@@ -50,6 +50,10 @@ class Motion:
             parts.append(torch.stack([sensor.capture_blur(b**2) for b in self.blur]))
         return reduce(torch.mul, parts)
 
+    def light_of(self, sensor: Sensor, spectrum: Tensor, read: Callable[[Tensor], Tensor]) -> Tensor:
+        """Light on the camera's pixels [B, h, w] of a spectrum before its motion."""
+        return read(spectrum * self.filter(sensor))
+
 
 def measured_motion(
     sensor: Sensor, spectrum: Tensor, read: Callable[[Tensor], Tensor], measured: tuple[Tensor, Tensor]
@@ -137,10 +141,13 @@ class MotionNearby:
 
 
 def motion_nearby(
-    sensor: Sensor, spectrum: Tensor, read: Callable[[Tensor], Tensor], measured: tuple[Tensor, Tensor]
+    sensor: Sensor,
+    spectrum: Tensor,
+    read: Callable[[Tensor], Tensor],
+    measured: tuple[Tensor, Tensor],
+    motion: Motion,
 ) -> MotionNearby:
-    """What derivatives need of a model's motions; the parameters are those of `measured_motion`."""
-    motion = measured_motion(sensor, spectrum, read, measured)
+    """What derivatives need of a model's motions; the parameters are those of `measured_motion`, and what it gave."""
     moving = motion.filter(sensor)
     moved, slopes = spectrum * moving, []
     light = read(moved)

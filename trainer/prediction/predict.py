@@ -14,34 +14,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from runtime.camera.sampling import (
-    finer_picture,
-    pixel_area,
-    registered_samples,
-    sample_places,
-    spline_filter,
-)
-from runtime.lightpath.fft import rfft2
 from runtime.lightpath.gray_levels import shown_as
 from runtime.lightpath.host_arrays import unit_phasor
 from runtime.lightpath.light_path import LightPath, panel_phase
 from runtime.lightpath.modulation import Modulation
 from runtime.lightpath.propagation import far_field_matrix
 from trainer.device import array_of
-from trainer.kept_results import kept_by_device, kept_for_same
-from trainer.prediction.capture_gain import own_gain
-from trainer.prediction.capture_motion import MotionNearby, measured_motion, motion_nearby
+from trainer.prediction.camera_light import light_on_camera
 from trainer.prediction.other_beam import same, spectra_of_other_beam
 from trainer.prediction.panel_gradient import has_panel_gradient, image_with_panel_gradient
 from trainer.prediction.panel_spectra import BESIDE, NOMINAL, irradiance_of, panel_spectra
 from trainer.prediction.pupil_modes import phase_scales, pupil_modes
-from trainer.prediction.samples_at import samples_at
 from trainer.prediction.scene import Scene, Stages, bare_stages
 from trainer.prediction.source_extent import Aside, extent_transfer, lit_by_extent
-from trainer.prediction.stages import Drive, Pupil, Sensor
+from trainer.prediction.stages import Drive, Pupil
 
 MODULATION_SAMPLES = 512  # over phase: a linear step between them errs by 1e-5
-FINER = 2  # times as many samples for the splines: exact up to half of the band that they hold
 
 
 def light_path(scene: Scene, stages: Stages) -> LightPath:
@@ -272,137 +260,3 @@ def _lit(
         return image(path if own else light_path(scene, replace(stages, pupil=pupil)))
 
     return lit_by_extent(stages.pupil, image_of, near)
-
-
-def light_on_camera(
-    scene: Scene,
-    stages: Stages,
-    image: Tensor,
-    measured: tuple[Tensor, Tensor] | None = None,
-    near: MotionNearby | None = None,
-) -> Tensor:
-    """Irradiance that the camera's pixels integrate, before gain, offset and response.
-
-    Parameters
-    ----------
-    scene : Scene
-    stages : Stages
-    image : Tensor
-        Irradiance on the fine image grid, as in `Trace`.
-    measured : (Tensor, Tensor), optional
-        Signal and weight [B, h, w]: where the camera moves, each capture's own displacement and blur follow from them.
-    near : MotionNearby, optional
-        Of a model that is a small step away: the motions follow from that model's, for derivatives.
-
-    Returns
-    -------
-    Tensor [B, h, w]
-    """
-    sensor = stages.sensor
-    spectrum, read = _before_motion(scene, stages, image)
-    if near is not None and near.suits(sensor):
-        return near.light_of(sensor, spectrum, read)
-    if measured is not None and sensor.moves:
-        spectrum = spectrum * measured_motion(sensor, spectrum, read, measured).filter(sensor)
-    elif (blur := sensor.usual_blur) is not None:
-        spectrum = spectrum * blur
-    return read(spectrum)
-
-
-def motion_on_camera(
-    scene: Scene, stages: Stages, image: Tensor, measured: tuple[Tensor, Tensor]
-) -> MotionNearby | None:
-    """What `light_on_camera` needs of models a small step away; None where the camera does not move.
-
-    Parameters are those of `light_on_camera`.
-    """
-    if not stages.sensor.moves:
-        return None
-    return motion_nearby(stages.sensor, *_before_motion(scene, stages, image), measured)
-
-
-def _before_motion(scene: Scene, stages: Stages, image: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-    """Spectrum of the irradiance on the camera before the captures' motions, and how its pixels read it."""
-    grid, camera = scene.grid, scene.bench.camera
-    sensor = stages.sensor
-    if sensor.displacement is not None:
-        dy, dx = sensor.displacement
-        rows = torch.arange(dy.shape[-2], dtype=dy.dtype)[:, None]
-        places = camera.on_panel(rows + dy, torch.arange(dy.shape[-1], dtype=dy.dtype) + dx)
-    elif not camera.registered:
-        places = camera_positions(scene)
-    else:
-        places = None
-
-    def read(spectrum: Tensor) -> Tensor:
-        if places is None:
-            return registered_samples(grid, spectrum)
-        finer = spectrum / spline_filter(sensor.iy, sensor.ix, grid.fine * FINER)
-        fine = finer_picture(finer, grid.image_shape, FINER)
-        return samples_at(fine, *sample_places(grid, *places, FINER))
-
-    return rfft2(image) * _camera_transfer(scene, stages.pupil, sensor), read
-
-
-@kept_for_same(2)  # of a fit's model and of its trial
-def _camera_transfer(scene: Scene, pupil: Pupil, sensor: Sensor) -> Tensor:
-    """Transfer function of all that filters irradiance in the image: the pixel's area, ghosts, the camera."""
-    transfer = _pixel_area(scene, sensor)
-    for extra in (pupil.irradiance_filter, sensor.irradiance_filter, sensor.blur):
-        if extra is not None:
-            transfer = transfer * extra
-    return transfer
-
-
-def counts(
-    scene: Scene, stages: Stages, light: Tensor, gain: Tensor, measured: tuple[Tensor, Tensor] | None
-) -> Tensor:
-    """Counts above black for light on the camera.
-
-    Parameters
-    ----------
-    scene : Scene
-    stages : Stages
-    light : Tensor [B, h, w]
-        As from `light_on_camera`.
-    gain : Tensor [B, 1, 1]
-        Counts for one unit of light.
-    measured : (Tensor, Tensor) or None
-        Signal and weight [B, h, w], from which each capture's own gain is computed where laser power drifts.
-
-    Returns
-    -------
-    Tensor [B, h, w], counts above black
-    """
-    sensor = stages.sensor
-    signal = light * gain
-    if sensor.gain is not None:
-        signal = signal * sensor.gain
-    if sensor.free_capture_gain and measured is not None:
-        signal = signal * own_gain(sensor, signal, measured)
-    if sensor.offset is not None:
-        signal = signal + sensor.offset
-    if sensor.response is not None:
-        signal = sensor.response(signal / sensor.full_scale) * sensor.full_scale
-    return signal
-
-
-@kept_by_device(32)
-def camera_positions(scene: Scene) -> tuple[Tensor, Tensor]:
-    """Where each camera pixel's centre looks.
-
-    Returns
-    -------
-    y, x : Tensor [h, w], panel pixels
-    """
-    y, x = scene.bench.camera.looks_at()
-    return torch.as_tensor(y, dtype=scene.dtype), torch.as_tensor(x, dtype=scene.dtype)
-
-
-def _pixel_area(scene: Scene, sensor: Sensor) -> Tensor:
-    """Transfer function of the camera pixel's area."""
-    camera = scene.bench.camera
-    if camera.homography is None:
-        side = camera.pixel_um / scene.bench.panel.pitch_um
-        return torch.sinc(sensor.iy * side) * torch.sinc(sensor.ix * side)
-    return pixel_area(sensor.iy, sensor.ix, *camera_positions(scene))

@@ -26,7 +26,8 @@ from trainer.effects.own_effect import parameters_of
 from trainer.model.bundle_export import baked_path
 from trainer.model.model import EffectInstance, Model, Values, absent, instance_with
 from trainer.model.model_stages import scene_for, stages_for
-from trainer.prediction.predict import Trace, counts, light_on_camera, trace
+from trainer.prediction.camera_light import counts, light_on_camera
+from trainer.prediction.predict import Trace, trace
 from trainer.prediction.scene import Scene, Stages, bare_stages
 
 ROWS, COLUMNS = 96, 128

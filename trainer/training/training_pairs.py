@@ -27,8 +27,9 @@ from trainer.fitting.predictor import Predictor
 from trainer.model.bundle_export import acting_on_display
 from trainer.model.model import Model
 from trainer.model.model_stages import scene_for, stages_of
+from trainer.prediction.camera_light import counts
 from trainer.prediction.capture_gain import own_gain
-from trainer.prediction.predict import counts, light_path
+from trainer.prediction.predict import light_path
 from trainer.prediction.scene import Scene, Stages
 from trainer.training.camera_to_panel import onto_panel
 

@@ -1,0 +1,162 @@
+"""Light on the camera, for light in the image, and the counts that the camera makes of it: all that follows `trace`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from runtime.camera.sampling import (
+    finer_picture,
+    pixel_area,
+    registered_samples,
+    sample_places,
+    spline_filter,
+)
+from runtime.lightpath.fft import rfft2
+from trainer.kept_results import kept_by_device, kept_for_same
+from trainer.prediction.capture_gain import own_gain
+from trainer.prediction.capture_motion import Motion, MotionNearby, measured_motion, motion_nearby
+from trainer.prediction.samples_at import samples_at
+from trainer.prediction.scene import Scene, Stages
+from trainer.prediction.stages import Pupil, Sensor
+
+FINER = 2  # times as many samples for the splines: exact up to half of the band that they hold
+
+
+def light_on_camera(
+    scene: Scene, stages: Stages, image: Tensor, motion: Motion | MotionNearby | None = None
+) -> Tensor:
+    """Irradiance that the camera's pixels integrate, before gain, offset and response.
+
+    Parameters
+    ----------
+    scene : Scene
+    stages : Stages
+    image : Tensor
+        Irradiance on the fine image grid, as in `Trace`.
+    motion : Motion or MotionNearby, optional
+        Of each capture, where the camera moves; without it all blur as the effect says.
+
+    Returns
+    -------
+    Tensor [B, h, w]
+    """
+    sensor = stages.sensor
+    spectrum, read = _before_motion(scene, stages, image)
+    if motion is not None:
+        return motion.light_of(sensor, spectrum, read)
+    if (blur := sensor.usual_blur) is not None:
+        spectrum = spectrum * blur
+    return read(spectrum)
+
+
+def motion_on_camera(
+    scene: Scene, stages: Stages, image: Tensor, measured: tuple[Tensor, Tensor]
+) -> Motion | None:
+    """The captures' motions as they show themselves; None where the camera does not move.
+
+    Parameters
+    ----------
+    measured : (Tensor, Tensor)
+        Signal and weight of the captures, [B, h, w].
+    """
+    if not stages.sensor.moves:
+        return None
+    with torch.no_grad():
+        return measured_motion(stages.sensor, *_before_motion(scene, stages, image), measured)
+
+
+def motion_near(
+    scene: Scene, stages: Stages, image: Tensor, measured: tuple[Tensor, Tensor], motion: Motion
+) -> MotionNearby:
+    """The captures' motions in models a small step from one where they are known."""
+    return motion_nearby(stages.sensor, *_before_motion(scene, stages, image), measured, motion)
+
+
+def _before_motion(scene: Scene, stages: Stages, image: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+    """Spectrum of the irradiance on the camera before the captures' motions, and how its pixels read it."""
+    grid, camera = scene.grid, scene.bench.camera
+    sensor = stages.sensor
+    if sensor.displacement is not None:
+        dy, dx = sensor.displacement
+        rows = torch.arange(dy.shape[-2], dtype=dy.dtype)[:, None]
+        places = camera.on_panel(rows + dy, torch.arange(dy.shape[-1], dtype=dy.dtype) + dx)
+    elif not camera.registered:
+        places = camera_positions(scene)
+    else:
+        places = None
+
+    def read(spectrum: Tensor) -> Tensor:
+        if places is None:
+            return registered_samples(grid, spectrum)
+        finer = spectrum / spline_filter(sensor.iy, sensor.ix, grid.fine * FINER)
+        fine = finer_picture(finer, grid.image_shape, FINER)
+        return samples_at(fine, *sample_places(grid, *places, FINER))
+
+    return rfft2(image) * _camera_transfer(scene, stages.pupil, sensor), read
+
+
+@kept_for_same(2)  # of a fit's model and of its trial
+def _camera_transfer(scene: Scene, pupil: Pupil, sensor: Sensor) -> Tensor:
+    """Transfer function of all that filters irradiance in the image: the pixel's area, ghosts, the camera."""
+    transfer = _pixel_area(scene, sensor)
+    for extra in (pupil.irradiance_filter, sensor.irradiance_filter, sensor.blur):
+        if extra is not None:
+            transfer = transfer * extra
+    return transfer
+
+
+def counts(
+    scene: Scene, stages: Stages, light: Tensor, gain: Tensor, measured: tuple[Tensor, Tensor] | None
+) -> Tensor:
+    """Counts above black for light on the camera.
+
+    Parameters
+    ----------
+    scene : Scene
+    stages : Stages
+    light : Tensor [B, h, w]
+        As from `light_on_camera`.
+    gain : Tensor [B, 1, 1]
+        Counts for one unit of light.
+    measured : (Tensor, Tensor) or None
+        Signal and weight [B, h, w], from which each capture's own gain is computed where laser power drifts.
+
+    Returns
+    -------
+    Tensor [B, h, w], counts above black
+    """
+    sensor = stages.sensor
+    signal = light * gain
+    if sensor.gain is not None:
+        signal = signal * sensor.gain
+    if sensor.free_capture_gain and measured is not None:
+        signal = signal * own_gain(sensor, signal, measured)
+    if sensor.offset is not None:
+        signal = signal + sensor.offset
+    if sensor.response is not None:
+        signal = sensor.response(signal / sensor.full_scale) * sensor.full_scale
+    return signal
+
+
+@kept_by_device(32)
+def camera_positions(scene: Scene) -> tuple[Tensor, Tensor]:
+    """Where each camera pixel's centre looks.
+
+    Returns
+    -------
+    y, x : Tensor [h, w], panel pixels
+    """
+    y, x = scene.bench.camera.looks_at()
+    return torch.as_tensor(y, dtype=scene.dtype), torch.as_tensor(x, dtype=scene.dtype)
+
+
+def _pixel_area(scene: Scene, sensor: Sensor) -> Tensor:
+    """Transfer function of the camera pixel's area."""
+    camera = scene.bench.camera
+    if camera.homography is None:
+        side = camera.pixel_um / scene.bench.panel.pitch_um
+        return torch.sinc(sensor.iy * side) * torch.sinc(sensor.ix * side)
+    return pixel_area(sensor.iy, sensor.ix, *camera_positions(scene))
