@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import convolve1d, gaussian_filter
 
 from runtime.excess import prediction_errors
 from tests.trainer.hidden import captured, ran
@@ -77,6 +78,24 @@ def test_a_shaken_repeat_is_not_taken_for_noise() -> None:
     first, second = pictures(rng)
     repeats = compare_repeats(first, np.roll(second, 1, axis=1), camera())
     assert repeats is not None and repeats.ratio > 3
+    assert camera_by_repeats(camera(), [repeats]) == camera()
+
+
+@pytest.mark.parametrize(("speckle_px", "axes"), [(0.6, (0,)), (0.5, (0, 1))])
+def test_a_repeat_that_is_a_little_more_blurred_is_not_taken_for_noise(
+    speckle_px: float, axes: tuple[int, ...]
+) -> None:
+    """The variance of the difference rises with brightness, and neighbouring pixels hardly differ alike."""
+    rng = np.random.default_rng(6)
+    light = gaussian_filter(0.15 * 10500 * rng.exponential(1, SHAPE), speckle_px)
+    taken = []
+    for share in (0.0, 0.02):  # of a pixel's light that goes to each neighbour
+        for axis in axes:
+            light = convolve1d(light, [share, 1 - 2 * share, share], axis)
+        counted = rng.poisson(light) + 5 * rng.normal(size=SHAPE)
+        taken.append(np.rint(64 + (4095 - 64) / 10500 * counted).astype(np.uint16))
+    repeats = compare_repeats(*taken, camera())
+    assert repeats is not None and repeats.ratio > 1.1
     assert camera_by_repeats(camera(), [repeats]) == camera()
 
 

@@ -19,6 +19,10 @@ BINS = 32
 SLOPE_DOUBT = 0.008  # relative standard error that a stated full well has at best
 SURE = 4.0  # standard errors from which a slope or a bend counts
 CORRELATED = 0.05  # correlation of neighbouring pixels from which a difference is no noise
+MOVED = 0.01  # share of a difference that looks like a motion, from which it is no noise
+BY_CHANCE = (
+    25.0  # share of noise that looks so at most, over the number of pixels: once in ten thousand pairs
+)
 BEND = 0.25  # of the variance at the brightest bin that a bend may add before it is no line
 
 
@@ -38,6 +42,8 @@ class RepeatNoise:
         The stated one.
     correlation : float
         Of the difference of the two pictures from pixel to pixel, along rows and columns. A camera's noise has none.
+    moved : float
+        Share of the difference that a displacement or another blur of the picture explains, beyond what chance may.
     """
 
     mean: np.ndarray
@@ -47,11 +53,12 @@ class RepeatNoise:
     ratio_error: float
     black_level: float
     correlation: float = 0.0
+    moved: float = 0.0
 
     @property
     def is_noise(self) -> bool:
-        """Whether the pictures differ by the camera's noise alone, as far as neighbouring pixels tell."""
-        return abs(self.correlation) < CORRELATED
+        """Whether the pictures differ by the camera's noise alone, as far as their own structure tells."""
+        return abs(self.correlation) < CORRELATED and self.moved < MOVED
 
     def ratio_to(self, camera: Camera) -> float:
         """Measured noise over that of a camera with other numbers than the stated."""
@@ -149,6 +156,7 @@ def compare_repeats(first: np.ndarray, second: np.ndarray, camera: Camera) -> Re
         spread / expected,
         camera.black_level,
         _neighbours_correlation(use, difference),
+        _share_moved(use, (first.astype(np.float64) + second) / 2, difference) - BY_CHANCE / halved.size,
     )
 
 
@@ -162,6 +170,22 @@ def _neighbours_correlation(use: np.ndarray, values: np.ndarray) -> float:
         both = max(int((use[one] & use[next_one]).sum()), 1)
         found.append(float((picture[one] * picture[next_one]).sum()) / both / max(power, 1e-30))
     return max(found, key=abs)
+
+
+def _share_moved(use: np.ndarray, mean: np.ndarray, difference: np.ndarray) -> float:
+    """Share of a difference, given where `use` is set, that lies in the span of the mean picture's derivatives.
+
+    To first order a displacement adds first derivatives of a picture, and a little more blur second ones.
+    """
+    down, across = np.gradient(mean)
+    bends = (
+        np.diff(np.pad(mean, ((1, 1), (0, 0)), "edge"), 2, 0),
+        np.diff(np.pad(mean, ((0, 0), (1, 1)), "edge"), 2, 1),
+    )
+    terms = np.stack([one[use] for one in (down, across, np.gradient(down, axis=1), *bends)])
+    normal, along = terms @ terms.T, terms @ difference
+    explained = along @ np.linalg.pinv(normal, hermitian=True) @ along
+    return float(explained / max(float(difference @ difference), 1e-30))
 
 
 def straight_line(repeats: Sequence[RepeatNoise], camera: Camera) -> NoiseLine | None:
