@@ -100,3 +100,16 @@ def test_of_two_that_look_alike_the_one_that_few_benches_have_comes_second(leak:
     ]
     ranking = rank(errors(0.5), fits, KNOWN, Thresholds(), 0.5, len(KNOWN))
     assert ranking[0].effect.name == first
+
+
+def test_a_plainer_one_that_is_not_worth_adding_does_not_come_first() -> None:
+    """The two differ by less than makes a difference; what the better one removes is just more than that."""
+    fits = [
+        CandidateFit(name, Model(BENCH).having(absent(KNOWN[name], BENCH)), errors(excess))
+        for name, excess in (("polarisation_leak", 0.00025), ("phase_response", 0.0004))
+    ]
+    ranking = rank(errors(0.0005), fits, KNOWN, Thresholds(), 0.0005, len(KNOWN))
+    assert [(r.effect.name, r.worth_adding) for r in ranking] == [
+        ("polarisation_leak", True),
+        ("phase_response", False),
+    ]

@@ -300,17 +300,23 @@ def rank(
     candidates : int
         How many were screened, which the test of each is corrected for.
     """
+
+    def is_worth_adding(one: CandidateFit) -> bool:
+        removed = removed_excess(before, one.held_out)
+        per_pixel = any(p.per_pixel for p in known[one.effect].parameters)
+        enough = not per_pixel or removed.value > PIXEL_SHARE * before.excess
+        return enough and thresholds.worth_adding(removed, ideal_excess, candidates)
+
     ordered = sorted(fits, key=lambda f: f.held_out.excess)
-    plainer = next((f for f in ordered[1:] if _is_plainer(f, ordered[0], before, thresholds)), None)
-    if plainer is not None:  # of two that the captures cannot tell apart
-        ordered.remove(plainer)
-        ordered.insert(0, plainer)
+    worth = {f.effect: is_worth_adding(f) for f in ordered}
+    for one in ordered[1:]:  # of two that the captures cannot tell apart, the plainer comes first
+        if worth[one.effect] >= worth[ordered[0].effect] and _is_plainer(one, ordered[0], before, thresholds):
+            ordered.remove(one)
+            ordered.insert(0, one)
+            break
     ranked = []
     for one in ordered:
-        removed = removed_excess(before, one.held_out)
-        worth_adding = thresholds.worth_adding(removed, ideal_excess, candidates)
-        if any(p.per_pixel for p in known[one.effect].parameters):
-            worth_adding = worth_adding and removed.value > PIXEL_SHARE * before.excess
+        removed, worth_adding = removed_excess(before, one.held_out), worth[one.effect]
         alike = tuple(
             other.effect
             for other in ordered

@@ -32,6 +32,7 @@ from trainer.prediction.predict import Trace
 # A candidate starts with values for each colour where these are expected to remove this share of what common ones
 # leave, and this share of what is there.
 OWN, LEAST_OWN = 0.7, 0.01
+WIDENED = 3  # how often the band is widened for starts that open the iris farther: twice as far in all
 
 
 @dataclass(frozen=True)
@@ -92,11 +93,16 @@ def screen_batches(batches: list[Batch], model: Model, effects: tuple[Effect, ..
     for effect in effects:
         predictors, points = narrow
         if effect.touches_iris:
-            wide = wide or _with_wider_band(model, effect, batches)
+            wide = wide or _with_band_for(model, absent(effect, model.bench), batches)
             predictors, points = wide
+        starts = _starts(effect, model, predictors, points)
+        for _ in range(WIDENED):
+            if not effect.touches_iris or not _needs_wider_band(model, starts[0], predictors):
+                break
+            predictors, points = _with_band_for(model, starts[0], batches)
+            starts = _starts(effect, model, predictors, points)
         expected = [
-            (start, (_left(model, start, predictors, points, present) - noise) / scale)
-            for start in _starts(effect, model, predictors, points)
+            (start, (_left(model, start, predictors, points, present) - noise) / scale) for start in starts
         ]
         start, after = expected[0]
         if len(expected) > 1 and after - expected[1][1] > max(OWN * after, LEAST_OWN * before):
@@ -118,12 +124,18 @@ def _left(
     return remaining(residual, torch.cat([slopes, present]))
 
 
-def _with_wider_band(
-    model: Model, effect: Effect, batches: list[Batch]
+def _with_band_for(
+    model: Model, start: EffectInstance, batches: list[Batch]
 ) -> tuple[list[Predictor], list[Trace]]:
     """Predictors whose band has room for what an effect opens, and the model's light there."""
-    predictors = [Predictor(model.having(absent(effect, model.bench)), b) for b in batches]
+    predictors = [Predictor(model.having(start), b) for b in batches]
     return predictors, [p.trace(model) for p in predictors]
+
+
+def _needs_wider_band(model: Model, start: EffectInstance, predictors: Sequence[Predictor]) -> bool:
+    """Whether an effect opens the iris farther than there is room: then wider starts looked like this one."""
+    needed = Predictor(model.having(start), predictors[0].batch).scene.grid.band
+    return max(needed) > max(predictors[0].scene.grid.band)
 
 
 def shares_of_work(effects: Sequence[Effect], model: Model, count: int) -> list[list[Effect]]:

@@ -19,10 +19,13 @@ from trainer.model.model import EffectInstance, Model
 from trainer.prediction.free_stages import with_learned
 from trainer.prediction.predict import bare_irradiance
 from trainer.prediction.scene import Scene, Stages, bare_stages, scene_at
+from trainer.prediction.stages import Pupil
 
 REACH_ROOM = 1.05  # how far beyond the stated plane the grid's own room suffices
 LEAST_IRIS = 0.02  # half width whose figure still gets room: an effect of one's own may give none
-IRIS_ROOM = 1.25  # how far an effect may open or move the iris, in units of what the bench says
+IRIS_ROOM = (
+    1.25  # how far an effect may open or move the iris, in units of what the bench says or of where it is
+)
 
 
 def scene_for(model: Model, channel: str, plane_mm: float, dtype: torch.dtype = torch.float32) -> Scene:
@@ -33,17 +36,27 @@ def scene_for(model: Model, channel: str, plane_mm: float, dtype: torch.dtype = 
     InputError
         Where the propagation method's sampling does not reach the plane.
     """
-    opened = IRIS_ROOM if any(p.effect.touches_iris for p in model.present) else 1.0
+    touched, stated = any(p.effect.touches_iris for p in model.present), model.bench.iris.half_width
+    opened = IRIS_ROOM if touched else 1.0
     scene = scene_at(model.bench, channel, plane_mm, model.method, opened, dtype)
     pupil_effects = tuple(p for p in model.present if p.effect.stage == "pupil")
     pupil = stages_for(scene, pupil_effects).pupil
+    if touched and (wider := _steps(_outermost(pupil) / stated, IRIS_ROOM)):
+        opened *= IRIS_ROOM**wider
+        scene = scene_at(model.bench, channel, plane_mm, model.method, opened, dtype)
     # In steps, so that fits whose distance or iris varies a little share their grids.
     farther = _steps(1e3 * abs(float(pupil.distance)) / abs(plane_mm), REACH_ROOM)
-    closer = _steps(model.bench.iris.half_width / max(float(pupil.half_width), LEAST_IRIS), IRIS_ROOM)
+    closer = _steps(stated / max(float(pupil.half_width), LEAST_IRIS), IRIS_ROOM)
     if farther == closer == 0:
         return scene
     reach_mm = abs(plane_mm) * REACH_ROOM**farther if farther else None
     return scene_at(model.bench, channel, plane_mm, model.method, opened, dtype, reach_mm, IRIS_ROOM**-closer)
+
+
+def _outermost(pupil: Pupil) -> float:
+    """How far from the axis the iris reaches along v or u, share of the band; a turned one may reach farther."""
+    stretch, (v, u) = float(pupil.stretch), (abs(float(c)) for c in pupil.centre)
+    return max(float(pupil.half_width) * (1 - stretch) + v, float(pupil.half_width) * (1 + stretch) + u)
 
 
 def _steps(ratio: float, step: float) -> int:
