@@ -20,9 +20,7 @@ SLOPE_DOUBT = 0.008  # relative standard error that a stated full well has at be
 SURE = 4.0  # standard errors from which a slope or a bend counts
 CORRELATED = 0.05  # correlation of neighbouring pixels from which a difference is no noise
 MOVED = 0.01  # share of a difference that looks like a motion, from which it is no noise
-BY_CHANCE = (
-    25.0  # share of noise that looks so at most, over the number of pixels: once in ten thousand pairs
-)
+BY_CHANCE = 25.0  # over the pixels: share of noise that looks so in one of seven thousand pairs
 BEND = 0.25  # of the variance at the brightest bin that a bend may add before it is no line
 
 

@@ -32,7 +32,7 @@ from trainer.prediction.predict import Trace
 # A candidate starts with values for each colour where these are expected to remove this share of what common ones
 # leave, and this share of what is there.
 OWN, LEAST_OWN = 0.7, 0.01
-WIDENED = 3  # how often the band is widened for starts that open the iris farther: twice as far in all
+WIDENED = 3  # how often the band is widened at most, each time as far as the best start opens the iris
 
 
 @dataclass(frozen=True)

@@ -128,10 +128,11 @@ def _fit(
             progress(iteration / iterations)
         before = errors.excess
         normal, gradient = _normal(slopes), _gradient(slopes, residuals)
-        left = before - float(gradient @ _solve(normal, gradient, 0.0)) / scale
-        if fresh and left > max(FAR * enough, SLOW * before):
-            settled = False
-            break
+        if fresh and before > FAR * enough:
+            left = before - float(gradient @ _solve(normal, gradient, 0.0)) / scale
+            if left > max(FAR * enough, SLOW * before):
+                settled = False
+                break
         pull = hold * max(before, 0.0)
         away = _away(model, keys, ranges)
         if pull:

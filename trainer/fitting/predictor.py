@@ -147,7 +147,7 @@ class Predictor:
         batch = self.batch
         gain = model.gain[batch.channel] * batch.exposure[:, None, None]
         found = [
-            counts(self.scene, stages, light[part], gain[part], (batch.signal[part], batch.mask[part]))
+            counts(self.scene, stages, light[part], gain[part], self._seen(part))
             for part, stages in self.parts(model)
         ]
         return batch.as_compared(found[0] if len(found) == 1 else torch.cat(found))

@@ -23,9 +23,7 @@ from trainer.prediction.stages import Pupil
 
 REACH_ROOM = 1.05  # how far beyond the stated plane the grid's own room suffices
 LEAST_IRIS = 0.02  # half width whose figure still gets room: an effect of one's own may give none
-IRIS_ROOM = (
-    1.25  # how far an effect may open or move the iris, in units of what the bench says or of where it is
-)
+IRIS_ROOM = 1.25  # how far an effect may open or move the iris, over what the bench says or where it is
 
 
 def scene_for(model: Model, channel: str, plane_mm: float, dtype: torch.dtype = torch.float32) -> Scene:
@@ -36,21 +34,20 @@ def scene_for(model: Model, channel: str, plane_mm: float, dtype: torch.dtype = 
     InputError
         Where the propagation method's sampling does not reach the plane.
     """
-    touched, stated = any(p.effect.touches_iris for p in model.present), model.bench.iris.half_width
-    opened = IRIS_ROOM if touched else 1.0
+    stated = model.bench.iris.half_width
+    opened = IRIS_ROOM if any(p.effect.touches_iris for p in model.present) else 1.0
     scene = scene_at(model.bench, channel, plane_mm, model.method, opened, dtype)
     pupil_effects = tuple(p for p in model.present if p.effect.stage == "pupil")
     pupil = stages_for(scene, pupil_effects).pupil
-    if touched and (wider := _steps(_outermost(pupil) / stated, IRIS_ROOM)):
-        opened *= IRIS_ROOM**wider
-        scene = scene_at(model.bench, channel, plane_mm, model.method, opened, dtype)
     # In steps, so that fits whose distance or iris varies a little share their grids.
+    wider = _steps(_outermost(pupil) / stated, IRIS_ROOM) if opened > 1 else 0
     farther = _steps(1e3 * abs(float(pupil.distance)) / abs(plane_mm), REACH_ROOM)
     closer = _steps(stated / max(float(pupil.half_width), LEAST_IRIS), IRIS_ROOM)
-    if farther == closer == 0:
+    if farther == closer == wider == 0:
         return scene
     reach_mm = abs(plane_mm) * REACH_ROOM**farther if farther else None
-    return scene_at(model.bench, channel, plane_mm, model.method, opened, dtype, reach_mm, IRIS_ROOM**-closer)
+    opened, closed = opened * IRIS_ROOM**wider, IRIS_ROOM**-closer
+    return scene_at(model.bench, channel, plane_mm, model.method, opened, dtype, reach_mm, closed)
 
 
 def _outermost(pupil: Pupil) -> float:
