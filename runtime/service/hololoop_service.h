@@ -13,8 +13,11 @@
  *   CAPTURE          -> PICTURE + memfd
  *   REFINE           -> DONE        later, with serial 0: REFINED
  *
- * Any request may be answered by ERROR. Times are CLOCK_MONOTONIC in ns. A slot of the ring holds linear irradiance,
- * uint16_t [channels][height][width], 65535 for the brightest; `crc` is zlib's crc32 of its bytes.
+ * Any request may be answered by ERROR. Where recv fails with ECONNRESET, call it once more: the service closed the
+ * connection without reading all, and what it had sent, such as the ERROR that says why, is still to come.
+ *
+ * Times are CLOCK_MONOTONIC in ns. A slot of the ring holds linear irradiance, uint16_t [channels][height][width],
+ * 65535 for the brightest; `crc` is zlib's crc32 of its bytes.
  */
 #ifndef HOLOLOOP_SERVICE_H
 #define HOLOLOOP_SERVICE_H
