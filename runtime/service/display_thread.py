@@ -133,6 +133,7 @@ class DisplayThread(threading.Thread):
         self._open, self._clock, self._stale_ns, self._events = open_panel, clock, stale_ns, events
         self._lock = threading.Lock()
         self._waiting: dict[int, DisplayPattern] = {}  # by job
+        self._done: int | None = None  # job that was shown last; a better pattern comes too late for it
         self._panel: Any = None
         self._out = False  # it was lost, and has not answered since
         self._stopping = threading.Event()
@@ -152,9 +153,10 @@ class DisplayThread(threading.Thread):
         return self._panel is not None
 
     def put(self, pattern: DisplayPattern) -> None:
-        """Show this at its display time; it replaces an earlier pattern of the same job."""
+        """Show this at its display time; it replaces an earlier pattern of the same job, unless that was shown."""
         with self._lock:
-            self._waiting[pattern.job] = pattern
+            if pattern.job != self._done:
+                self._waiting[pattern.job] = pattern
 
     def forget(self) -> None:
         """Discard all waiting patterns: their program has disconnected."""
@@ -248,6 +250,9 @@ class DisplayThread(threading.Thread):
 
     def _shown(self, pattern: DisplayPattern, tick: int, began_ns: int) -> None:
         now = time.monotonic_ns()
+        with self._lock:
+            self._done = pattern.job
+            self._waiting.pop(pattern.job, None)  # came during the transfer
         took = now - began_ns
         self.transfer_ns = min(int(0.9 * self.transfer_ns + 0.1 * took), self._clock.period_ns // 2)
         self.answered_ns = now

@@ -102,6 +102,39 @@ def test_the_best_pattern_by_the_display_time_is_shown(running) -> None:
     assert panel.shown == [9]
 
 
+def test_a_better_pattern_that_comes_too_late_does_not_replace_the_one_that_was_announced(running) -> None:
+    panel, display, events = running
+    first, better = ready(1, 0, value=7, final=False), ready(1, 0, value=9)
+
+    def show(gray: np.ndarray) -> None:
+        panel.shown.append(int(gray[0, 0]))
+        if len(panel.shown) == 1:
+            display.put(better)  # during the transfer
+
+    panel.show = show
+    display.put(first)
+    until(lambda: events.shown_jobs == [1])
+    display.put(better)
+    display.put(ready(2, 4 * PERIOD_NS, value=20))
+    until(lambda: events.shown_jobs[-1] == 2)
+    assert panel.shown == [7, 20] and events.shown_jobs == [1, 2]
+
+
+def test_a_better_pattern_takes_the_place_of_one_that_the_panel_did_not_accept(running) -> None:
+    panel, display, events = running
+
+    def show(gray: np.ndarray) -> None:
+        if gray[0, 0] == 7:
+            display.put(ready(1, 0, value=9))
+            raise DeviceError("short")
+        panel.shown.append(int(gray[0, 0]))
+
+    panel.show = show
+    display.put(ready(1, 0, value=7, final=False))
+    until(lambda: events.shown_jobs == [1])
+    assert panel.shown == [9]
+
+
 def test_a_pattern_that_the_panel_did_not_accept_is_tried_again(running) -> None:
     panel, display, events = running
     panel.failures = [DeviceError("short"), DeviceError("garbage")]
