@@ -36,9 +36,9 @@ class Tilt:
     Attributes
     ----------
     turned : list of float array [H], [W], rad
-        Phase of the light in the image, of rows and of columns (see `tilted`).
+        Phase of the light in the image, of rows and of columns (see `tilted`); in the host's memory.
     ramp : list of complex array [H], [W]
-        The same, as factors.
+        The same, as factors; where the solver computes.
     rising : (slice, slice)
         Rows and columns over which the tilt rises.
     lift : float array [H, W] or None
@@ -49,7 +49,7 @@ class Tilt:
     """
 
     turned: list[np.ndarray]
-    ramp: list[np.ndarray]
+    ramp: list[Array]
     rising: tuple[slice, slice]
     lift: Array = None
     edges: tuple[int, int] = (0, 0)
@@ -212,7 +212,7 @@ class Start:
     def _tilt(self, cycles: list[np.ndarray], half_open: bool) -> Tilt:
         """The tilt of light with these frequencies, cycles a pixel, at each row and each column of the image."""
         turned = [2 * math.pi * (np.cumsum(along) - along[0]) for along in cycles]
-        ramp = [np.exp(1j * one).astype(self.wave.dtype) for one in turned]
+        ramp = [self.backend.xp.asarray(np.exp(1j * one).astype(self.wave.dtype)) for one in turned]
         tilt = Tilt(turned, ramp, (_rising(cycles[0]), _rising(cycles[1])))
         if not half_open:
             return tilt

@@ -3,8 +3,9 @@
     python -m tests.benchmarks.frame_rate [--shape 1080x1920] [--seconds 20] [--json]
 
 A video that pans over a photograph, a pattern for each of three colours, as the service asks for them: the first
-pattern of every picture, for an iris of half the panel's band and an open one. Each number of cores of this machine
-has its turn, frame by frame, so that other work slows all of them alike. Times are medians.
+pattern of every picture, for an iris of half the panel's band and an open one. One core of this machine, two, four and
+so on, and a GPU where CuPy finds one, have their turns, frame by frame, so that other work slows all of them alike.
+Times are medians.
 
 From the times t(k) = a + b / k of k cores (Amdahl 1967) follow the share that no core adds to, and the rate of more
 cores. The latter is what the measured scaling gives, not a measurement: memory that is shared gives less.
@@ -15,29 +16,43 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from contextlib import suppress
+from typing import Any
 
 import numpy as np
 
+from firmware_iface.errors import InputError
 from runtime.benchmark.measure import DISTANCE, PITCH, WAVELENGTH, picture
 from runtime.lightpath import fft
 from runtime.lightpath.ideal_path import ideal_path, single
 from runtime.program.large_blocks import keep_large_blocks
 from runtime.service.frame_solver import PatternSolver
-from runtime.solver.array_backend import Backend
+from runtime.solver.array_backend import Backend, backend
 
 COLOURS = ("red", "green", "blue")
 IRISES = {"half": 0.5, "open": 1.0}  # half-width, as a share of the panel's band
 PAN = (0, 2)  # pixels a frame
 MORE = (4, 8, 16)  # cores
+GPU = "gpu"
 
 
-def times(shape: tuple[int, int], iris: float, seconds: float) -> dict[int, list[float]]:
+def machines() -> dict[int | str, Backend]:
+    """What may compute: powers of two of this machine's cores, all of them, and the GPU."""
+    counts = sorted({*(2**k for k in range(fft.THREADS.bit_length())), fft.THREADS})
+    found: dict[int | str, Backend] = {k: Backend(k) for k in counts}
+    with suppress(InputError):  # without CuPy or a GPU
+        found[GPU] = backend("cupy")
+    return found
+
+
+def times(shape: tuple[int, int], iris: float, seconds: float) -> dict[int | str, list[float]]:
     """Times (s) of a picture's first patterns by cores, the cold first picture left out."""
     path = single(ideal_path(shape, PITCH, WAVELENGTH, DISTANCE * shape[0] / 1080, iris))
-    counts = range(1, fft.THREADS + 1)
-    solvers = {k: PatternSolver(dict.fromkeys(COLOURS, path), grid="panel", on=Backend(k)) for k in counts}
+    solvers = {
+        k: PatternSolver(dict.fromkeys(COLOURS, path), grid="panel", on=b) for k, b in machines().items()
+    }
     content = np.stack([picture("astronaut", shape) * light for light in (1.0, 0.7, 0.4)])
-    found: dict[int, list[float]] = {k: [] for k in counts}
+    found: dict[int | str, list[float]] = {k: [] for k in solvers}
     end, frame = time.monotonic() + seconds, 0
     while time.monotonic() < end or frame < 3:
         target = np.roll(content, (PAN[0] * frame, PAN[1] * frame), (1, 2))
@@ -73,16 +88,17 @@ def main() -> None:
         found = times((height, width), iris, args.seconds)
         medians = {k: float(np.median(each)) for k, each in found.items()}
         rates = {k: 1 / t for k, t in medians.items()}
-        row = {"iris": name, "frames": len(found[1]), "pictures_per_s": rates}
-        if len(medians) > 1:
-            a, b = scaling(medians)
+        row: dict[str, Any] = {"iris": name, "frames": len(found[1]), "pictures_per_s": rates}
+        by_cores = {k: t for k, t in medians.items() if isinstance(k, int)}
+        if len(by_cores) > 1:
+            a, b = scaling(by_cores)
             row["alone_share"] = max(a, 0.0) / medians[1]
-            row["expected_per_s"] = {k: 1 / (max(a, 0.0) + b / k) for k in MORE if k > max(medians)}
+            row["expected_per_s"] = {k: 1 / (max(a, 0.0) + b / k) for k in MORE if k > max(by_cores)}
         rows.append(row)
         if not args.json:
             measured = ", ".join(f"{rate:.2f} with {k}" for k, rate in rates.items())
             print(f"iris {name}: pictures a second, cores: {measured}", flush=True)
-            if "alone_share" in row:
+            if row.get("expected_per_s"):
                 more = ", ".join(f"{rate:.1f} with {k}" for k, rate in row["expected_per_s"].items())
                 print(f"    {row['alone_share']:.2f} of one core's time is not shared out; expected: {more}")
     if args.json:

@@ -159,35 +159,3 @@ def test_a_backend_that_is_not_there_is_refused() -> None:
     except ImportError:
         with pytest.raises(InputError, match="CuPy backend cannot start"):
             backend("cupy")
-
-
-def test_the_gpus_code_gives_the_same_pattern(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With NumPy in CuPy's place: whole arrays for strips and the other transforms, the same result."""
-    import sys
-    import types
-
-    import scipy.fft
-
-    from runtime.solver import Solver
-    from runtime.solver.array_backend import CupyBackend
-    from tests.runtime.benches import scene
-
-    cupy = types.ModuleType("cupy")
-    cupy.__getattr__ = lambda name: getattr(np, name)  # type: ignore[method-assign]
-    cupy.asnumpy = np.asarray  # type: ignore[attr-defined]
-    cupyx, inner = types.ModuleType("cupyx"), types.ModuleType("cupyx.scipy")
-    cupyx.scipy, inner.fft = inner, scipy.fft  # type: ignore[attr-defined]
-    parts = (("cupy", cupy), ("cupyx", cupyx), ("cupyx.scipy", inner), ("cupyx.scipy.fft", scipy.fft))
-    for name, module in parts:
-        monkeypatch.setitem(sys.modules, name, module)
-    unfiltered = random_path(irradiance_filter=None)  # a random filter would make light negative
-    for path in (unfiltered, PATHS["ideal"], random_path((21, 25), 0.5, irradiance_filter=None)):
-        target = scene(path.grid.shape).astype(float)
-        curves = [Solver(path, on=on).solve(target, 5).psnr_db for on in (Backend(2), CupyBackend())]
-        assert np.isfinite(curves[0]).all()
-        np.testing.assert_allclose(curves[0], curves[1], atol=1e-6)
-        frames = [Solver(path, on=on) for on in (Backend(1), CupyBackend())]
-        for solver in frames:
-            solver.frame(target, 2)
-        seen = [solver.frame(np.roll(target, 2, 1), 1, motion=(0, 2)).gray for solver in frames]
-        assert np.mean(seen[0] != seen[1]) < 0.01

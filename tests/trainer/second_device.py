@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.overrides import _get_current_function_mode_stack
-from torch.utils._device import DeviceContext
+from torch.utils._device import DeviceContext, _device_constructors
 from torch.utils._mode_utils import no_dispatch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
@@ -116,6 +116,8 @@ def second_device() -> Iterator[None]:
             (array_api_compat.torch, "asarray"),
         ):
             patches.enter_context(patch.object(module, name, _from_numbers(getattr(module, name))))
+        # torch keeps a list of what makes tensors, with the patched functions where it was first asked in here
+        patches.callback(_device_constructors.cache_clear)
         yield
 
 
