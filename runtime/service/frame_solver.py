@@ -107,7 +107,7 @@ class PatternSolver:
         self.overdrive = np.stack(tables) if slow_share else None
         self._solvers = [Solver(path, frames=frames, **options) for path in self._paths]
         # What one colour's solver does on one core alone, another's is computed beside.
-        several = len(paths) > 1 and self._solvers[0].on.threads > 1
+        several = len(paths) > 1 and self._solvers[0].on.host_cores > 1
         self._pool = ThreadPoolExecutor(len(paths), "colours") if several else None
         self._white = 0.0  # what a white picture gets in the colour that gets least, once that is known
 

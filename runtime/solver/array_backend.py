@@ -26,13 +26,21 @@ BACKENDS = ("numpy", "cupy")
 
 
 class Backend:
-    """NumPy arrays, processed by all of the machine's cores."""
+    """NumPy arrays, processed by all of the machine's cores.
+
+    Attributes
+    ----------
+    threads : int
+        Strips that are worked on at a time.
+    host_cores : int
+        Cores of the host for what it does itself, such as finding the motion in a video.
+    """
 
     name = "numpy"
     xp: Any = np
 
     def __init__(self, threads: int = fft.THREADS) -> None:
-        self.threads = threads
+        self.threads = self.host_cores = threads
         self.pool = ThreadPoolExecutor(threads - 1, "strips") if threads > 1 else None
 
     def strip_rows(self, width: int) -> int:
@@ -147,7 +155,7 @@ class CupyBackend(Backend):
         import cupyx.scipy.fft
 
         self.xp, self._fft = cupy, cupyx.scipy.fft
-        self.threads, self.pool = 1, None
+        self.threads, self.host_cores, self.pool = 1, fft.THREADS, None
 
     def strip_rows(self, width: int) -> int:
         return 1 << 30

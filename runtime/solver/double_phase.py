@@ -117,7 +117,7 @@ class Start:
 
     def double_phase(
         self,
-        amplitude: np.ndarray,
+        amplitude: Array,
         phase: Array,
         others: Sequence[Array] = (),
         moved: tuple[int, int] = (0, 0),
@@ -195,7 +195,7 @@ class Start:
         last = max(min(height - edge, rows.stop), first)
         return slice(first - rows.start, last - rows.start), slice(side, width - side)
 
-    def flat_phase(self, amplitude: np.ndarray, phase: Array) -> None:
+    def flat_phase(self, amplitude: Array, phase: Array) -> None:
         """Fill `phase` with that of the amplitude with flat phase, back at the panel; its amplitude there is lost.
 
         A better start than double phase where the panel does not reach a whole turn.
@@ -225,7 +225,7 @@ class Start:
         The field that goes forward is complex: the mean of the fields of the two phases that double phase is made of.
         """
         xp, optics, wave = self.backend.xp, self.optics, self.wave
-        self._wave(np.ones(wave.shape, np.float32), tilt)
+        self._wave(xp.ones(wave.shape, np.float32), tilt)
         size, angle = xp.abs(wave), xp.arctan2(wave.imag, wave.real)
         size /= size.max()
         xp.arccos(size, out=size)
@@ -242,13 +242,13 @@ class Start:
         xp.clip(reached, FAINTEST, 1 / FAINTEST, out=reached)
         return 1 / reached, (rows, columns)
 
-    def _wave(self, amplitude: np.ndarray, light: Tilt) -> None:
+    def _wave(self, amplitude: Array, light: Tilt) -> None:
         """Fill `wave` with the factor on the beam that each pixel would need, of any scale."""
         xp, wave, over = self.backend.xp, self.wave, self.over_source
-        given, lift = xp.asarray(amplitude), light.lift
+        lift = light.lift
 
         def tilt(worker: int, rows: slice) -> None:
-            xp.multiply(given[rows], light.ramp[0][rows, None], out=wave[rows])
+            xp.multiply(amplitude[rows], light.ramp[0][rows, None], out=wave[rows])
             wave[rows] *= light.ramp[1]
             if lift is not None:
                 wave[rows] *= lift[rows]

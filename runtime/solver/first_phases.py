@@ -76,14 +76,14 @@ class FirstPhases:
         if self.frames > 1:
             noise = np.random.default_rng(0).normal(scale=NOISE, size=self.shape)
             self.noise = noise.astype(stacks[0][0].response.dtype)
-        self.amplitude = np.zeros(self.shape, stacks[0][0].response.dtype)
+        self.amplitude = objective.backend.xp.zeros(self.shape, stacks[0][0].response.dtype)
         self.made = objective.backend.xp.zeros(objective.shape, stacks[0][0].response.dtype)
         self.on_fresh = objective.backend.xp.zeros_like(self.made[0])
         self.fits = False
         self.moved = 0, 0
         self.tilt(moves=False)
 
-    def cold(self, targets: np.ndarray, phases: Array, soon: bool = False) -> None:
+    def cold(self, targets: Array, phases: Array, soon: bool = False) -> None:
         """Fill `phases` (rad), a pattern each, from targets [C, K, H, W] alone, not from the picture before.
 
         With `soon`, for few iterations, and for a picture that will move.
@@ -101,13 +101,13 @@ class FirstPhases:
         for start in self.starts:
             start.tilt(moves)
 
-    def _make(self, targets: np.ndarray, phases: Array, soon: bool) -> None:
+    def _make(self, targets: Array, phases: Array, soon: bool) -> None:
+        xp = self.backend.xp
         for c, (drive, start) in enumerate(zip(self.drives, self.starts, strict=True)):
             phase, *others = phases[c * self.frames : (c + 1) * self.frames]
-            np.multiply(
-                targets[c, 0], 1 / float(np.mean(targets[c, 0], dtype=np.float64)), out=self.amplitude
-            )
-            np.sqrt(self.amplitude, out=self.amplitude)
+            mean = float(targets[c, 0].mean(dtype=np.float64))
+            xp.multiply(targets[c, 0], 1 / mean, out=self.amplitude)
+            xp.sqrt(self.amplitude, out=self.amplitude)
             alike: Sequence[Array] = ()
             network = self.initialiser
             if network is None or network.corrects:
@@ -117,11 +117,11 @@ class FirstPhases:
                 else:
                     start.flat_phase(self.amplitude, phase)
             if network is not None:
-                found = network.phase(self.amplitude, self.backend.to_host(phase))
-                phase[...] = self.backend.xp.asarray(found)
+                found = network.phase(*map(self.backend.to_host, (self.amplitude, phase)))
+                phase[...] = xp.asarray(found)
             if drive.bounded:
                 for one in (phase, *alike):
-                    one[...] = self.backend.xp.asarray(drive.held(self.backend.to_host(one)))
+                    one[...] = xp.asarray(drive.held(self.backend.to_host(one)))
             for n, other in enumerate(others[len(alike) :], 1 + len(alike)):
                 self._part(n, drive, phase, other)
 
@@ -139,7 +139,7 @@ class FirstPhases:
         before: Array,
         motion: tuple[int, int],
         parts: Sequence[Part],
-        targets: np.ndarray,
+        targets: Array,
         phases: Array,
         room: Array,
         still: bool,

@@ -101,21 +101,21 @@ class Objective:
         self.asked, self.lit = ([1.0] * len(stacks) for _ in range(2))
         self.loss, self.squared_error, self.peak = math.inf, math.inf, 1.0
 
-    def aim(self, targets: np.ndarray) -> None:
+    def aim(self, targets: Array) -> None:
         """Change to other targets, irradiance [C, K, H, W] of any scale, none of them dark."""
         xp = self.backend.xp
         bare = isinstance(self.penalty, Irradiance)
         for c in range(len(self.stacks)):
-            mean = float(np.mean(targets[c], dtype=np.float64))
+            mean = float(targets[c].mean(dtype=np.float64))
             for k in range(self.wanted.shape[1]):
                 wanted = self.wanted[c, k]
-                wanted[...] = xp.asarray(targets[c, k])
+                wanted[...] = targets[c, k]
                 wanted *= 1 / mean
                 if self.approximator is None and not bare:
                     wanted += FLOOR
                     xp.sqrt(wanted, out=wanted)
-            self.asked[c] = self._mean(xp.asarray(targets[c]))
-            self.brightest[c] = float(np.max(targets[c]))
+            self.asked[c] = mean if self.weight is None else self._mean(targets[c])
+            self.brightest[c] = float(targets[c].max())
             self.contrast[c] = self.brightest[c] / mean
         self._limit()
         self.floor = []

@@ -365,12 +365,15 @@ class Solver:
             before, clock = clock, time.perf_counter()
             self.step.took(1e3 * (clock - before))
 
-    def _aim(self, targets: np.ndarray) -> np.ndarray:
-        """Point the objective at targets; returns those that the optics should show."""
-        shown_by_optics = targets
-        if self.approximator is not None:
-            shown_by_optics = predistorted(self.approximator, targets)
-        self.objective.aim(shown_by_optics if self.through == "predistorted" else targets)
+    def _aim(self, targets: np.ndarray) -> Any:
+        """Point the objective at targets; returns those that the optics should show, where the solver computes."""
+        xp = self.on.xp
+        if self.approximator is None:
+            shown_by_optics = aimed_at = xp.asarray(targets)
+        else:
+            shown_by_optics = xp.asarray(predistorted(self.approximator, targets))
+            aimed_at = shown_by_optics if self.through == "predistorted" else xp.asarray(targets)
+        self.objective.aim(aimed_at)
         return shown_by_optics
 
     def _is_still(self, targets: np.ndarray) -> bool:

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from runtime.lightpath import fft
+
 Array = Any
 
 CUT = 0.7  # of the contrast: a frame that differs by more from the one before, moved, is another scene
@@ -71,9 +73,9 @@ def motion_between(before: np.ndarray, after: np.ndarray) -> tuple[int, int]:
     patch = tuple(slice(f, f + min(n, PATCH)) for f, n in zip(first, before.shape, strict=True))
     window = [np.hanning(p.stop - p.start)[..., None] for p in patch]
     edge = window[0] * window[1].T
-    a, b = (np.fft.rfft2((x[patch] - x[patch].mean()) * edge) for x in (before, after))
+    a, b = (fft.rfft2((x[patch] - x[patch].mean()) * edge) for x in (before, after))
     cross = b * np.conj(a)
-    peak = np.fft.irfft2(cross / np.maximum(np.abs(cross), 1e-12 * np.abs(cross).max() + 1e-300), edge.shape)
+    peak = fft.irfft2(cross / np.maximum(np.abs(cross), 1e-12 * np.abs(cross).max() + 1e-300), edge.shape)
     place = np.unravel_index(int(np.argmax(peak)), edge.shape)
     moved = [int(p) - n if p > n // 2 else int(p) for p, n in zip(place, edge.shape, strict=True)]
     if any(abs(m) > n // 4 for m, n in zip(moved, edge.shape, strict=True)):

@@ -5,7 +5,7 @@
 A video that pans over a photograph, a pattern for each of three colours, as the service asks for them: the first
 pattern of every picture, for an iris of half the panel's band and an open one. One core of this machine, two, four and
 so on, and a GPU where CuPy finds one, have their turns, frame by frame, so that other work slows all of them alike.
-Times are medians.
+Times are medians; the first pictures are left out, of which one starts cold, and at which a GPU's code is compiled.
 
 From the times t(k) = a + b / k of k cores (Amdahl 1967) follow the share that no core adds to, and the rate of more
 cores. The latter is what the measured scaling gives, not a measurement: memory that is shared gives less.
@@ -32,6 +32,7 @@ from runtime.solver.array_backend import Backend, backend
 COLOURS = ("red", "green", "blue")
 IRISES = {"half": 0.5, "open": 1.0}  # half-width, as a share of the panel's band
 PAN = (0, 2)  # pixels a frame
+LEFT_OUT = 2  # pictures
 MORE = (4, 8, 16)  # cores
 GPU = "gpu"
 
@@ -46,7 +47,7 @@ def machines() -> dict[int | str, Backend]:
 
 
 def times(shape: tuple[int, int], iris: float, seconds: float) -> dict[int | str, list[float]]:
-    """Times (s) of a picture's first patterns by cores, the cold first picture left out."""
+    """Times (s) of a picture's first patterns by cores, the first pictures left out."""
     path = single(ideal_path(shape, PITCH, WAVELENGTH, DISTANCE * shape[0] / 1080, iris))
     solvers = {
         k: PatternSolver(dict.fromkeys(COLOURS, path), grid="panel", on=b) for k, b in machines().items()
@@ -54,12 +55,12 @@ def times(shape: tuple[int, int], iris: float, seconds: float) -> dict[int | str
     content = np.stack([picture("astronaut", shape) * light for light in (1.0, 0.7, 0.4)])
     found: dict[int | str, list[float]] = {k: [] for k in solvers}
     end, frame = time.monotonic() + seconds, 0
-    while time.monotonic() < end or frame < 3:
+    while time.monotonic() < end or frame < LEFT_OUT + 2:
         target = np.roll(content, (PAN[0] * frame, PAN[1] * frame), (1, 2))
         for k, solver in solvers.items():
             begun = time.perf_counter()
             next(solver.patterns(target, time.monotonic_ns()))
-            if frame:
+            if frame >= LEFT_OUT:
                 found[k].append(time.perf_counter() - begun)
         frame += 1
     return found
