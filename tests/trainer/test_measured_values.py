@@ -6,9 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
+from scipy.ndimage import shift
 
-from trainer.effects.measured_values import pixel_pattern
+from trainer.effects import measured_values
+from trainer.effects.measured_values import blur_rms, pixel_pattern
 
 SHAPE = (96, 120)
 
@@ -18,6 +21,7 @@ class Pictures:
     signal: torch.Tensor
     noise: torch.Tensor
     mask: torch.Tensor
+    ids: tuple[str, ...] = ("000",)
 
 
 @dataclass
@@ -29,7 +33,7 @@ class Seen:
 def seen(gain: np.ndarray, offset: np.ndarray, pictures: int = 12, noise: float = 1.0) -> Any:
     """Pictures of random light by a camera whose pixels have these gains and offsets."""
     draw = np.random.default_rng(8)
-    light = draw.gamma(1.5, 200.0, (pictures, *SHAPE))
+    light = draw.gamma(1.5, 200.0, (pictures, *gain.shape))
     signal = (1 + gain) * light + offset + draw.normal(0, noise, light.shape)
     as_tensor = [torch.tensor(a) for a in (signal, np.full(light.shape, noise**2), np.ones(light.shape))]
     return Seen(Pictures(*as_tensor), torch.tensor(light))
@@ -53,9 +57,24 @@ def test_fringes_and_shading_are_no_fixed_pattern() -> None:
     assert np.std(found["gain"]) < 0.06 * np.std(fringes + shading)
 
 
-def test_fringes_do_not_hide_a_fixed_pattern() -> None:
-    y, x = np.indices(SHAPE)
+@pytest.mark.parametrize("shape", [SHAPE, (300, 400)])
+def test_fringes_do_not_hide_a_fixed_pattern(shape: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also on a large picture, where the neighbours' weights are found from some of its pixels."""
+    monkeypatch.setattr(measured_values, "WEIGHT_PIXELS", 30_000)
+    y, x = np.indices(shape)
     fringes = 0.05 * np.cos(2 * np.pi * (x + 0.4 * y) / 13)
-    gain = np.random.default_rng(2).normal(0, 0.03, SHAPE)
-    found = pixel_pattern([seen(gain + fringes, np.zeros(SHAPE))])
+    gain = np.random.default_rng(2).normal(0, 0.03, shape)
+    found = pixel_pattern([seen(gain + fringes, np.zeros(shape))])
     assert np.std(found["gain"] - gain) < 0.45 * 0.03
+
+
+def test_the_middle_of_a_large_picture_tells_its_blur() -> None:
+    rms, side = 0.9, measured_values.BLUR_PIXELS + 188
+    sharp = np.random.default_rng(3).gamma(1.5, 200.0, (side, side))
+    swing = [
+        shift(sharp, (0, rms * np.sqrt(2) * np.sin(t)), mode="wrap")
+        for t in np.linspace(0, 2 * np.pi, 13)[:-1]
+    ]
+    blurred, ones = np.mean(swing, 0), np.ones(sharp.shape)
+    one = Seen(Pictures(*(torch.tensor(a[None]) for a in (blurred, ones, ones))), torch.tensor(sharp[None]))
+    assert blur_rms([one])["rms"] == pytest.approx(rms, rel=0.15)

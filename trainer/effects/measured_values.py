@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,6 +22,8 @@ SPREAD_ROUNDS, SETTLED = (
 )  # of the spreads' estimate at most, and the share of them that a last one changes
 SPREAD_PIXELS = 50_000  # that it is made from
 REACH = 3  # pixels each way: the neighbours that a pixel's number is predicted from
+WEIGHT_PIXELS = 500_000  # at most, that the neighbours' weights are found from
+BLUR_PIXELS = 512  # an axis, of the middle of a picture: there, a blur is what it is everywhere
 
 
 def shift_spread(evidence: Sequence[Evidence]) -> dict[str, Any]:
@@ -42,8 +45,13 @@ def blur_rms(evidence: Sequence[Evidence]) -> dict[str, Any]:
         for k in range(len(one.batch.ids)):
             sharp = array_of(one.prediction[k].double())
             blurred, weight = (array_of(t[k].double()) for t in (one.batch.signal, one.batch.mask))
-            variances.append(_blur_variance(sharp, blurred, weight))
+            variances.append(_blur_variance(*map(_middle, (sharp, blurred, weight))))
     return {"rms": max(0.05, float(np.sqrt(np.mean(variances))))}
+
+
+def _middle(picture: np.ndarray) -> np.ndarray:
+    first = [max(0, n - BLUR_PIXELS) // 2 for n in picture.shape]
+    return picture[first[0] : first[0] + BLUR_PIXELS, first[1] : first[1] + BLUR_PIXELS]
 
 
 def _blur_variance(sharp: np.ndarray, blurred: np.ndarray, weight: np.ndarray) -> float:
@@ -126,7 +134,12 @@ def _own(numbers: np.ndarray) -> np.ndarray:
     padded = np.pad(numbers, REACH, mode="reflect", reflect_type="odd")
     span = range(2 * REACH + 1)
     places = [(i, j) for i in span for j in span if (i, j) != (REACH, REACH)]
-    near = np.stack([padded[i : i + height, j : j + width].ravel() for i, j in places])
+    apart = math.ceil(math.sqrt(numbers.size / WEIGHT_PIXELS))
+    near = np.stack([padded[i : i + height : apart, j : j + width : apart].ravel() for i, j in places])
     normal = near @ near.T
     normal += (1e-9 * np.trace(normal) / len(normal) + 1e-30) * np.eye(len(normal))
-    return numbers - (np.linalg.solve(normal, near @ numbers.ravel()) @ near).reshape(height, width)
+    weights = np.linalg.solve(normal, near @ numbers[::apart, ::apart].ravel())
+    own = numbers.copy()
+    for (i, j), share in zip(places, weights, strict=True):
+        own -= share * padded[i : i + height, j : j + width]
+    return own
