@@ -49,7 +49,7 @@ def computing_on(device: str) -> Iterator[None]:
         raise InputError(
             "torch finds no CUDA device on this machine: leave out --device, or install a build of torch with CUDA"
         )
-    with torch.device(device, int(os.environ.get("LOCAL_RANK", "0"))), _whole_single_precision():
+    with torch.device(device, int(os.environ.get("LOCAL_RANK", "0"))), whole_single_precision():
         yield
 
 
@@ -65,7 +65,7 @@ def one_thread() -> Iterator[None]:
 
 
 @contextmanager
-def _whole_single_precision() -> Iterator[None]:
+def whole_single_precision() -> Iterator[None]:
     """Products and convolutions on a GPU keep all 23 bits, where TF32 would leave 10."""
     kinds: tuple[Any, ...] = (torch.backends.cuda.matmul, torch.backends.cudnn)
     before = [kind.allow_tf32 for kind in kinds]

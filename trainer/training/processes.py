@@ -34,7 +34,7 @@ def launched_fabric(folder: Path | None, device: str | None = None) -> Any:
         accelerator="cuda" if gpu else "cpu",
         devices=local,
         num_nodes=machines,
-        precision="bf16-mixed" if gpu else "32-true",
+        precision="32-true",  # a GPU and the processor come to the same network
         loggers=TensorBoardLogger(folder, name="", version="curves") if folder else None,
     )
     if local * machines > 1:

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from firmware_iface.errors import InputError
-from trainer.device import computing_on
+from trainer.device import computing_on, whole_single_precision
 from trainer.networks.approximator import NETWORK, Approximator, Architecture, write_approximator
 from trainer.networks.discriminator import Discriminator
 from trainer.training.checkpoint import read_checkpoint, write_checkpoint
@@ -48,6 +48,7 @@ def refuse_without_loss(recipe: Recipe, pretrained: PretrainedNetworks) -> None:
         )
 
 
+@whole_single_precision()
 @computing_on("cpu")  # Fabric takes to a GPU what it trains
 def train(
     pairs: Pairs,
