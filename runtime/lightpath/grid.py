@@ -25,6 +25,8 @@ FINEST = 4  # behind a wide iris
 # samples a pixel leave an excess of 0.0001 at 1, 0.0003 at 1.25, 0.0006 at 1.4 and 0.0017 at 1.9.
 WIDE = 1.25
 MARGIN = 24  # panel pixels beyond the panel's border for which irradiance is computed
+# How near to midway between two frequency samples an iris's edge is to be, and how much larger a grid may be for that.
+MIDWAY, MOST_LARGER = 0.25, 1.08
 
 
 @dataclass(frozen=True)
@@ -81,8 +83,9 @@ def grid_for(
     half_width: float,
     margin: int = MARGIN,
     narrowest: float | None = None,
+    stated: float | None = None,
 ) -> Grid:
-    """The smallest grid that keeps the light path linear.
+    """The smallest grid that keeps the light path linear, or one not much larger that suits the iris.
 
     A ray at the edge of the iris moves sideways by lambda z half_width / (2 pitch) on its way. Six tenths more
     hold the tails of the aperture's own diffraction. (On a 240 x 320 panel at 30 mm the ideal model's held-out
@@ -100,6 +103,8 @@ def grid_for(
     margin : int, pixels
     narrowest : float or None
         Half width that the iris may be closed to; None: `half_width`.
+    stated : float or None
+        Half width that the iris has as a rule, where `half_width` leaves room for more; None: `half_width`.
 
     Returns
     -------
@@ -107,7 +112,7 @@ def grid_for(
     """
     walk = wavelength * abs(distance) * half_width / (2 * pitch**2)
     room = math.ceil(max(1.6 * walk, 2 * margin / min(narrowest or half_width, 1)))
-    rows, columns = (_even_fast_size(n + room) for n in shape)
+    rows, columns = (_padded_size(n, n + room, stated or half_width) for n in shape)
     band = tuple(_band_edge(half_width, n, padded) for n, padded in zip(shape, (rows, columns), strict=True))
     fine = FINEST if half_width > WIDE else FINE
     return Grid(shape, (rows, columns), margin, (band[0], band[1]), pitch, fine)
@@ -198,6 +203,23 @@ def image_window(grid: Grid) -> tuple[Runs, Runs]:
     first = -grid.fine * grid.margin
     runs = [ring(first, n, period) for n, period in zip(grid.image_shape, grid.image_period, strict=True)]
     return runs[0], runs[1]
+
+
+def _padded_size(count: int, least: int, half_width: float) -> int:
+    """A size with a fast FFT along an axis of `count` pixels, at which the iris's edge lies between two samples.
+
+    What light the iris spreads beyond the padding comes back on the other side. An edge on a sample makes it come back
+    with the wrong sign, which errs up to four times as much as an edge midway: of 240 x 320 pixels at 40 mm behind half
+    of the band 3.2e-4 of the variance with 378 x 450 samples, and 0.5e-4 with 384 x 480.
+    """
+    smallest = size = _even_fast_size(least)
+    while size <= MOST_LARGER * smallest:
+        edge = (half_width + beyond_edge(count)) * size / 2
+        is_open = half_width <= 1 and edge >= size / 2
+        if is_open or abs(edge % 1 - 0.5) <= MIDWAY:
+            return size
+        size = _even_fast_size(size + 1)
+    return smallest
 
 
 def _even_fast_size(n: int) -> int:

@@ -88,7 +88,15 @@ def scene_at(
     # In the far field nothing walks out of the grid: the image has its own, and the panel needs no room.
     spread = 0.0 if method == "fraunhofer" else max(abs(distance), 1e-3 * (reach_mm or 0.0))
     narrowest = min(bench.iris.half_width * closed, half_width)
-    grid = grid_for(panel.shape, panel.pitch, wavelength, spread, half_width, narrowest=narrowest)
+    grid = grid_for(
+        panel.shape,
+        panel.pitch,
+        wavelength,
+        spread,
+        half_width,
+        narrowest=narrowest,
+        stated=bench.iris.half_width,
+    )
     check_sampling(
         method,
         Aperture(panel.shape, grid.padded, panel.pitch),
