@@ -11,7 +11,7 @@ import pytest
 from runtime.excess import PredictionErrors
 from trainer.captures.bench_file import Bench, Camera, Channel, Iris, Panel
 from trainer.diagnosis.candidate_fits import CandidateFit
-from trainer.diagnosis.explanation import _rival
+from trainer.diagnosis.chosen_addition import _rival
 from trainer.diagnosis.ranking import rank
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import catalogue

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from runtime.excess import PredictionErrors, RemovedExcess, removed_excess
+from runtime.excess import PredictionErrors, removed_excess
 from runtime.program.progress import Progress, forward_only, no_progress, part_of
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import CaptureRoles, capture_roles
-from trainer.diagnosis.addition import all_raised, all_refitted, gone_on, with_maps_again
+from trainer.diagnosis.addition import gone_on, with_maps_again
+from trainer.diagnosis.chosen_addition import chosen_addition
 from trainer.diagnosis.colours_in_common import one_in_common
 from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors, screen_candidates
-from trainer.diagnosis.exchange import CLEARLY, exchanged, one_for_two, preferred
+from trainer.diagnosis.exchange import exchanged, one_for_two, preferred
 from trainer.diagnosis.fitted_ranking import expects_the_rest
 from trainer.diagnosis.learned_rest import LearnedRest, learn_rest
-from trainer.diagnosis.ranking import RankedEffect
 from trainer.diagnosis.screen import ScreenResult
+from trainer.diagnosis.second_way import Fork, doubtful, fork_at, is_better
 from trainer.diagnosis.together import explain_together, is_far
 from trainer.diagnosis.unnecessary import without_one
 from trainer.diagnosis.verdict import Thresholds, below_the_noise
@@ -33,8 +33,6 @@ from trainer.model.history import IN_COMMON, form_of, recorded
 from trainer.model.model import EffectInstance, Model
 
 MOST_EFFECTS = 8  # an explanation longer than this explains nothing
-NEAR = 0.7  # of the excess that the best candidate removes: a candidate that removes so much is near
-ABOUT = 1.5  # times the excess that another leaves, or is expected to: about as much
 
 
 @dataclass(frozen=True)
@@ -142,7 +140,8 @@ def explain(
 ) -> Explanation:
     """Diagnose and add, again and again, until nothing more is worth adding.
 
-    Effects that a later one makes unnecessary are taken out again.
+    Effects that a later one makes unnecessary are taken out again. Where nothing more is missing, but enough is left
+    for another explanation to be worth it, a second way is tried: without an effect that a rival came near to.
 
     Parameters
     ----------
@@ -153,8 +152,48 @@ def explain(
     learn : bool
         Learn what nothing named explains, at the stages that the probes name.
     """
-    thresholds = thresholds or Thresholds()
     report = forward_only(progress or no_progress)
+    found, forks, ideal = _one_way(captures, model, known, pool, thresholds, save, report)
+    diagnosis = found.diagnosis
+    fork = doubtful(forks, found.model) if _leaves_much(diagnosis, ideal) else None
+    if fork is not None:
+        others = {name: effect for name, effect in known.items() if name != fork.added}
+        other, *_ = _one_way(
+            captures, fork.before, others, pool, thresholds, None, no_progress, is_second=True
+        )
+        ends = [one.steps[-1].held_out for one in (found, other)]
+        if is_better(ends[0], found.model, ends[1], other.model, 1 - diagnosis.thresholds.level):
+            steps = (*found.steps[: fork.step], *other.steps[1:])
+            diagnoses = (*found.diagnoses[: fork.diagnosis], *other.diagnoses)
+            found = Explanation(steps, other.model, other.diagnosis, diagnoses)
+            if save:
+                save(found.model)
+    if learn and found.diagnosis.verdict != "complete" and not below_the_noise(found.steps[-1].held_out):
+        roles = capture_roles(captures)
+        rest = learn_rest(roles, found.model, found.diagnosis, pool, part_of(report, 0.8, 1.0))
+        found = replace(found, model=rest.model, learned=rest)
+    report(1.0, "done")
+    return found
+
+
+def _leaves_much(found: Diagnosis, ideal: PredictionErrors) -> bool:
+    """Whether nothing is missing, and yet enough is left for an effect to be worth it."""
+    least = found.thresholds.may_be_worth_adding(found.held_out.excess, ideal.excess)
+    return found.verdict == "complete" and least
+
+
+def _one_way(
+    captures: CaptureSet,
+    model: Model,
+    known: Catalogue,
+    pool: Pool,
+    thresholds: Thresholds | None,
+    save: Callable[[Model], None] | None,
+    report: Progress,
+    is_second: bool = False,
+) -> tuple[Explanation, list[Fork], PredictionErrors]:
+    """An explanation by the best candidate at each step, where others came near, and the ideal model's errors."""
+    thresholds = thresholds or Thresholds()
     roles = capture_roles(captures)
     model = with_gains(captures, model, roles.fitted)
     errors = evaluate_captures(captures, roles.held_out, model)
@@ -163,6 +202,7 @@ def explain(
     # By each effect that was added, those that could have been added in its place.
     rivals: dict[str, dict[str, EffectInstance]] = {}
     diagnoses: list[Diagnosis] = []
+    forks: list[Fork] = []
 
     def took(model: Model, *new: ExplanationStep) -> None:
         """Note the steps that led to a model, and save it."""
@@ -170,7 +210,8 @@ def explain(
         if save:
             save(model)
 
-    model = recorded(model, None, errors)
+    if not is_second:  # which has its history
+        model = recorded(model, None, errors)
     took(model, ExplanationStep(None, errors))
 
     def without_unnecessary(
@@ -240,7 +281,7 @@ def explain(
             took(model, ExplanationStep(None, errors, refined=name, form=form_of(model, name)))
             continue
         report_share(0.9, f"adding {best.effect.name}")
-        best, candidate, after = _added(roles, found, pool)
+        best, candidate, after = chosen_addition(roles, found, pool)
         candidate, after = with_maps_again(roles, candidate, after)
         # A map whose next order did not help is looked at again only where nothing else fits.
         if next_order(candidate.instance(best.effect.name)) is None:
@@ -248,6 +289,7 @@ def explain(
             candidate, after = further or (candidate, after)
         if not found.thresholds.worth_adding(removed_excess(errors, after), ideal.excess, 1):
             break
+        forks.append(fork_at(len(steps), len(diagnoses) - 1, model, best, found.ranking))
         errors = after
         model = recorded(candidate, best.effect.name, errors)
         took(model, ExplanationStep(best.effect.name, errors, best.indistinguishable_from))
@@ -265,6 +307,8 @@ def explain(
         for s in steps
         if s.added in rivals
     }
+    if _leaves_much(diagnoses[-1], ideal):
+        alike = dict(rivals)  # enough is left for another in place of one to be worth it
     while (better := preferred(roles, model, errors, alike, *limits, pool)) is not None:
         old, new, model, errors = better
         del alike[old]
@@ -287,85 +331,7 @@ def explain(
     if model.names != kept or steps[-1].form == IN_COMMON:
         found = diagnose(captures, model, known, pool, thresholds, None, ideal, thorough=False)
         diagnoses.append(found)
-    rest = None
-    if learn and diagnoses[-1].verdict != "complete" and not below_the_noise(errors):
-        rest = learn_rest(roles, model, diagnoses[-1], pool, part_of(report, 0.8, 1.0))
-        model = rest.model
-    report(1.0, "done")
-    return Explanation(tuple(steps), model, diagnoses[-1], tuple(diagnoses), rest)
-
-
-def _added(roles: CaptureRoles, found: Diagnosis, pool: Pool) -> tuple[RankedEffect, Model, PredictionErrors]:
-    """The effect to add, the model with it, everything refitted, and that model's held-out errors.
-
-    A candidate is ranked while present effects stay as they are, and these may have taken up a part of the right one.
-    So its closest rival is fitted together with them, too, before the orders of the better one are raised. A rival that
-    only the screen speaks for, and that leaves about as much, has its orders raised, too, and so has one that more
-    benches have than the best.
-    """
-    rival = _rival(found) if found.model.present else None
-    ones = [found.ranking[0]] if rival is None else [found.ranking[0], rival]
-    tasks = [
-        (roles.folder, roles.ids, one.base, one.model.instance(one.effect.name))
-        for one in ones
-        if one.together is None
-    ]
-    refitted = iter(pool.map_here_if_one(all_refitted, tasks))
-    fitted = [(one.together, one.held_out) if one.together else next(refitted) for one in ones]
-    undecided = False
-    if rival is not None:
-        (_, left), (_, after) = fitted
-        if ones[0].effect.rare and not rival.effect.rare:
-            undecided = True
-        elif not rival.worth_adding:
-            undecided = after.excess <= ABOUT * left.excess
-        elif _better(after, left, clearly=rival.effect.rare):
-            ones, fitted = ones[1:], fitted[1:]
-        if not undecided:
-            ones, fitted = ones[:1], fitted[:1]
-    raised = pool.map_here_if_one(all_raised, [(roles.folder, roles.ids, *one) for one in fitted])
-    which = 0
-    if undecided:
-        (_, left), (_, after) = raised
-        if ones[0].effect.rare:
-            which = 0 if _better(left, after, clearly=True) else 1
-        else:
-            # One that only the screen speaks for may have numbers that suit a little of anything.
-            which = 1 if _better(after, left, clearly=True) else 0
-    return ones[which], *raised[which]
-
-
-def _better(one: PredictionErrors, other: PredictionErrors, clearly: bool) -> bool:
-    """Whether held-out captures prefer one of two models; clearly: whether it leaves at most half, too."""
-    enough = not clearly or one.excess < CLEARLY * other.excess
-    return enough and removed_excess(other, one).interval()[0] > 0
-
-
-def _rival(found: Diagnosis) -> RankedEffect | None:
-    """The candidate that may be right instead of the best one.
-
-    It is the one that the screen, which lets present effects move, expects most of; or the next best, where it is near;
-    or one of which the screen expects about as much, even if it got nowhere while present effects stayed as they were.
-    The last is told from the best one only after orders are raised.
-    """
-    best, *others = worthwhile = [r for r in found.ranking if r.worth_adding]
-    first = found.screened[0] if found.screened else None
-    if first is None or first.effect == best.effect.name:
-        near = next((r for r in others if r.removed.value > NEAR * best.removed.value), None)
-    else:
-        near = next((r for r in others if r.effect.name == first.effect), None)
-    if near is not None or first is None or best.together is not None:
-        return near
-    names = [r.effect.name for r in worthwhile]
-    about = (s for s in found.screened if s.after < ABOUT * first.after and s.effect not in names)
-    return next((_unfitted(found, s) for s in about if not s.start.effect.rare), None)
-
-
-def _unfitted(found: Diagnosis, expected: ScreenResult) -> RankedEffect:
-    """A candidate as it starts, of which only the screen has said something."""
-    start = expected.start
-    unknown = RemovedExcess(0.0, math.inf)
-    return RankedEffect(start.effect, found.model.having(start), found.held_out, unknown, False)
+    return Explanation(tuple(steps), model, diagnoses[-1], tuple(diagnoses)), forks, ideal
 
 
 def _any_gone_on(
