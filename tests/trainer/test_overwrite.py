@@ -57,7 +57,7 @@ def interrupted_after(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
         monkeypatch.undo()
         monkeypatch.setattr("trainer.fitting.pool.cores", lambda: 1)
         with_few_effects(monkeypatch, *FEW)
-        real, calls, real_diagnose = ladder._added, [], ladder.diagnose
+        real, calls, real_diagnose = ladder.chosen_addition, [], ladder.diagnose
 
         def diagnose_ideal_once(captures: CaptureSet, model: Model, *given: Any, **named: Any) -> Diagnosis:
             if model.names:
@@ -74,7 +74,7 @@ def interrupted_after(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
                 raise KeyboardInterrupt
             return real(*given)
 
-        monkeypatch.setattr(ladder, "_added", add_or_stop)
+        monkeypatch.setattr(ladder, "chosen_addition", add_or_stop)
 
     return put
 
