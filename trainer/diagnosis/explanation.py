@@ -158,9 +158,8 @@ def explain(
     fork = doubtful(forks, found.model) if _leaves_much(diagnosis, ideal) else None
     if fork is not None:
         others = {name: effect for name, effect in known.items() if name != fork.added}
-        other, *_ = _one_way(
-            captures, fork.before, others, pool, thresholds, None, no_progress, is_second=True
-        )
+        again = part_of(report, 0.95, 1.0, f"without {fork.added}")
+        other, *_ = _one_way(captures, fork.before, others, pool, thresholds, None, again, is_second=True)
         ends = [one.steps[-1].held_out for one in (found, other)]
         if is_better(ends[0], found.model, ends[1], other.model, 1 - diagnosis.thresholds.level):
             steps = (*found.steps[: fork.step], *other.steps[1:])
