@@ -117,7 +117,7 @@ class FirstPhases:
                 else:
                     start.flat_phase(self.amplitude, phase)
             if network is not None:
-                found = network.phase(*map(self.backend.to_host, (self.amplitude, phase)))
+                found = network.phase(self.backend.to_host(self.amplitude), self.backend.to_host(phase))
                 phase[...] = xp.asarray(found)
             if drive.bounded:
                 for one in (phase, *alike):

@@ -137,3 +137,23 @@ def scene(shape: tuple[int, int], seed: int = 0) -> np.ndarray:
         i, j = rng.integers(2, shape[0] - 6), rng.integers(2, shape[1] - 6)
         picture[i : i + 4, j : j + 4] = rng.random()
     return np.clip(picture, 0.02, 1).astype(np.float32)
+
+
+def one_mode(path: LightPath) -> LightPath:
+    """The path with the first of its pupil's modes alone."""
+    return replace(path, transfers=path.transfers[:1], weights=path.weights[:1])
+
+
+# What a light path may have, alone and together.
+PATHS = {
+    "everything": random_path(),
+    "iris twice the band": random_path((20, 26), 1.95),
+    "iris half the band": random_path((21, 25), 0.5),
+    "no crosstalk": random_path(crosstalk=None),
+    "no crosstalk, wide": random_path((20, 26), 1.9, crosstalk=None),
+    "no leak, no filter": random_path(leak=None, irradiance_filter=None),
+    "phase alone": random_path(modulation=None),
+    "by the panel's phase": replace(random_path(), modulation_by_phase=True),
+    "two states, one mode": one_mode(random_path(crosstalk=None, irradiance_filter=None)),
+    "ideal": ideal_path((24, 30), 0.005),
+}

@@ -16,21 +16,11 @@ from runtime.lightpath.light_path import LightPath
 from runtime.solver import Solver
 from runtime.solver.array_backend import Backend, CupyBackend, backend
 from runtime.solver.in_place_path import Optics
-from tests.runtime.benches import converted, ideal_path, random_path, scene
+from tests.runtime.benches import PATHS, converted, ideal_path, scene
 from tests.runtime.second_array_library import in_cupys_place
 
-IDEAL = ideal_path((24, 30), 0.005)
+IDEAL = PATHS["ideal"]
 HALF = ideal_path((48, 64), 0.02, 0.5)
-PATHS = {
-    "everything": random_path(),
-    "a wide iris": random_path((20, 26), 1.95),
-    "half the band": random_path((21, 25), 0.5),
-    "no crosstalk": random_path(crosstalk=None),
-    "no crosstalk, wide": random_path((20, 26), 1.9, crosstalk=None),
-    "phase alone": random_path(modulation=None),
-    "by the panel's phase": replace(random_path(), modulation_by_phase=True),
-    "ideal": IDEAL,
-}
 # a random filter would make light negative
 LIT = {name: replace(path, irradiance_filter=None) for name, path in PATHS.items()}
 SOLVES: dict[str, tuple[Any, dict[str, Any]]] = {

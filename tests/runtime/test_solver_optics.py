@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -20,26 +18,7 @@ from runtime.lightpath.light_path import (
 from runtime.lightpath.light_path_adjoint import irradiance_and_pullback, pixel_irradiance_adjoint
 from runtime.solver.array_backend import Backend, backend
 from runtime.solver.in_place_path import Optics
-from tests.runtime.benches import converted, ideal_path, random_path, torch_path
-
-
-def one_mode(path: LightPath) -> LightPath:
-    """The path with the first of its pupil's modes alone."""
-    return replace(path, transfers=path.transfers[:1], weights=path.weights[:1])
-
-
-PATHS = {
-    "everything": random_path(),
-    "iris twice the band": random_path((20, 26), 1.95),
-    "iris half the band": random_path((21, 25), 0.5),
-    "no crosstalk": random_path(crosstalk=None),
-    "no crosstalk, wide": random_path((20, 26), 1.9, crosstalk=None),
-    "no leak, no filter": random_path(leak=None, irradiance_filter=None),
-    "phase alone": random_path(modulation=None),
-    "by the panel's phase": replace(random_path(), modulation_by_phase=True),
-    "two states, one mode": one_mode(random_path(crosstalk=None, irradiance_filter=None)),
-    "ideal": ideal_path((24, 30), 0.005),
-}
+from tests.runtime.benches import PATHS, converted, torch_path
 
 
 def drawn(path: LightPath) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -177,8 +177,8 @@ def explain(
 
 def _leaves_much(found: Diagnosis, ideal: PredictionErrors) -> bool:
     """Whether nothing is missing, and yet enough is left for an effect to be worth it."""
-    least = found.thresholds.may_be_worth_adding(found.held_out.excess, ideal.excess)
-    return found.verdict == "complete" and least
+    enough = found.thresholds.may_be_worth_adding(found.held_out.excess, ideal.excess)
+    return found.verdict == "complete" and enough
 
 
 def _one_way(
