@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.excess import PredictionErrors
+from runtime.excess import PredictionErrors, removed_excess
 from trainer.captures.bench_file import Bench, Camera, Channel, Iris, Panel
 from trainer.diagnosis.candidate_fits import CandidateFit
-from trainer.diagnosis.chosen_addition import _rival
-from trainer.diagnosis.ranking import rank
+from trainer.diagnosis.chosen_addition import _rival, chosen_addition
+from trainer.diagnosis.ranking import RankedEffect, rank
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import catalogue
 from trainer.model.model import Model, absent
@@ -84,6 +84,43 @@ def test_the_rival_is_what_the_screen_expects_most_of_or_what_is_near(
 ) -> None:
     one = _rival(found(ranking, screened, worthless, together))
     assert (one and one.effect.name) == rival
+
+
+@pytest.mark.parametrize(
+    ("leak", "response", "chosen"),
+    [
+        (0.20, 0.25, "phase_response"),  # of the first effect, too: the others are still to come
+        (0.05, 0.25, "polarisation_leak"),
+        (0.20, 0.60, "polarisation_leak"),  # far behind: not even looked at
+    ],
+)
+def test_an_effect_that_few_benches_have_is_added_first_only_where_it_does_much_better(
+    leak: float, response: float, chosen: str
+) -> None:
+    left = {RARE: leak, "phase_response": response}
+    before = errors(0.7)
+    ranking = [
+        RankedEffect(
+            KNOWN[name],
+            Model(BENCH).having(absent(KNOWN[name], BENCH)),
+            errors(excess),
+            removed_excess(before, errors(excess)),
+            True,
+        )
+        for name, excess in left.items()
+    ]
+    diagnosis: Any = SimpleNamespace(ranking=ranking, screened=[], model=Model(BENCH), held_out=before)
+
+    def fitted_again(_: Any, tasks: list[Any]) -> list[Any]:
+        """Nothing gets better when all is fitted together, and no order when it is raised."""
+        models = [t[2] if t[2].present else t[2].having(t[3]) for t in tasks]
+        return [(m, errors(left[m.names[0]])) for m in models]
+
+    roles: Any = SimpleNamespace(folder=None, ids=())
+    pool: Any = SimpleNamespace(map_here_if_one=fitted_again)
+    added, model, after = chosen_addition(roles, diagnosis, pool)
+    assert (added.effect.name, model.names) == (chosen, (chosen,))
+    assert after.excess == pytest.approx(left[chosen])
 
 
 @pytest.mark.parametrize(

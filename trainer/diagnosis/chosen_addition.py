@@ -26,10 +26,11 @@ def chosen_addition(
     A candidate is ranked while present effects stay as they are, and these may have taken up a part of the right one.
     So its closest rival is fitted together with them, too, before the orders of the better one are raised. A rival that
     only the screen speaks for, and that leaves about as much, has its orders raised, too, and so has one that more
-    benches have than the best.
+    benches have than the best: the best is added then only where it leaves at most half as much.
     """
-    rival = _rival(found) if found.model.present else None
-    ones = [found.ranking[0]] if rival is None else [found.ranking[0], rival]
+    best = found.ranking[0]
+    rival = _rival(found) if found.model.present or best.effect.rare else None
+    ones = [best] if rival is None else [best, rival]
     tasks = [
         (roles.folder, roles.ids, one.base, one.model.instance(one.effect.name))
         for one in ones
@@ -40,7 +41,7 @@ def chosen_addition(
     undecided = False
     if rival is not None:
         (_, left), (_, after) = fitted
-        if ones[0].effect.rare and not rival.effect.rare:
+        if best.effect.rare and not rival.effect.rare:
             undecided = True
         elif not rival.worth_adding:
             undecided = after.excess <= ABOUT * left.excess
@@ -52,7 +53,7 @@ def chosen_addition(
     which = 0
     if undecided:
         (_, left), (_, after) = raised
-        if ones[0].effect.rare:
+        if best.effect.rare:
             which = 0 if _better(left, after, clearly=True) else 1
         else:
             # One that only the screen speaks for may have numbers that suit a little of anything.
