@@ -27,6 +27,9 @@ from trainer.prediction.scene import bare_stages, scene_at
 
 Starts = list[dict[str, Any]]
 SEARCHED = 2  # captures of a colour and plane on which its distance is searched
+REACH = 2.0  # pitch^2 / wavelength: from so far a fit of the distance finds the right one
+# The squared error, as a share of the signal's variance, of a model that is wrong in its distance alone, by REACH.
+OUT_OF_REACH = 0.25
 _DISTANCES: dict[
     tuple[Any, ...], float | None
 ] = {}  # found before in this process: every diagnosis asks again
@@ -36,7 +39,7 @@ PATH_REACH_NM = 4000.0
 
 
 def distance_starts(evidence: Sequence[Evidence]) -> Starts:
-    """The distance at which the first captures fit their patterns best, searched globally."""
+    """The distance at which the first captures fit their patterns best, searched where a fit does not reach."""
     found = _found_distance(evidence[0])
     return [{"offset": 0.0}] + ([] if found is None else [{"offset": found - evidence[0].scene.plane_mm}])
 
@@ -51,12 +54,17 @@ def wavelength_starts(evidence: Sequence[Evidence]) -> Starts:
         ratios = [distance / stated for distance, stated in found if distance is not None]
         if ratios:
             offsets[row] = channel.wavelength_nm * (float(np.mean(ratios)) - 1)
-    return [{"offset": 0.0 * offsets}, {"offset": offsets}]
+    return [{"offset": 0.0 * offsets}] + ([{"offset": offsets}] if offsets.any() else [])
 
 
 def _found_distance(evidence: Evidence) -> float | None:
-    """The distance, mm, at which a scene's captures fit their patterns best; None where none has structure."""
+    """The distance, mm, at which a scene's captures fit their patterns best.
+
+    None where none has structure, and where the model predicts so much that a fit reaches the right one.
+    """
     scene, batch = evidence.scene, evidence.batch
+    if batch.errors(evidence.prediction).nrmse ** 2 < OUT_OF_REACH:
+        return None
     digest = hashlib.sha256()
     for array in (batch.gray, batch.signal, batch.mask):
         digest.update(array_of(array[:SEARCHED]).tobytes())
@@ -79,7 +87,7 @@ def _found_distance(evidence: Evidence) -> float | None:
         def predict(bench: Bench, gray: NDArray, channel: str, plane_mm: float) -> NDArray:
             return bare_irradiance(scene_at(bench, channel, plane_mm, scene.method, 1.0, torch.float32), gray)
 
-        found = best_distance(scene.bench, samples, predict)
+        found = best_distance(scene.bench, samples, predict, finest=REACH)
         _DISTANCES[key] = None if found is None else found.distance_mm
     return _DISTANCES[key]
 

@@ -61,12 +61,22 @@ def pattern_search(
 
 
 def start_cost(
-    model: Model, predictors: Sequence[Predictor], points: Sequence[Trace], start: EffectInstance
+    model: Model,
+    predictors: Sequence[Predictor],
+    points: Sequence[Trace],
+    start: EffectInstance,
+    nearby: bool = False,
 ) -> float:
-    """Squared error of a model with an effect at a start, gains fitted; the captures move about as without it."""
+    """Squared error of a model with an effect at a start, gains fitted; the captures move about as without it.
+
+    Parameters
+    ----------
+    nearby : bool
+        As for `Predictor.trace`: the start is taken for a small step from the model of `points`.
+    """
     trial = model.having(start)
     near = [p.motions(model, t) for p, t in zip(predictors, points, strict=True)]
-    moved = [p.trace(trial, start.effect.stage, t) for p, t in zip(predictors, points, strict=True)]
+    moved = [p.trace(trial, start.effect.stage, t, nearby) for p, t in zip(predictors, points, strict=True)]
     lights = lights_of(trial, predictors, moved, near)
     trial = with_gain(trial, predictors, lights)
     return sum(_cost(p, p.counts(trial, light)) for p, light in zip(predictors, lights, strict=True))
