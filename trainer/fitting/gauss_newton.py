@@ -34,6 +34,7 @@ from trainer.model.model import Model, Values
 HOLD = 0.01  # `hold` of fits far from the truth
 # A fit is given up where a step is expected to leave more than so many times enough, and this share of what there is.
 FAR, SLOW = 10.0, 0.5
+BLOCK = 1 << 18  # pixels
 
 
 @dataclass(frozen=True)
@@ -278,8 +279,13 @@ def _gradient(slopes: list[Tensor], residuals: list[Tensor]) -> np.ndarray:
 
 
 def _scatter(slopes: list[Tensor], residuals: list[Tensor]) -> np.ndarray:
-    weighted = [s * r for s, r in zip(slopes, residuals, strict=True)]
-    return sum(array_of((w @ w.T).double()) for w in weighted)  # type: ignore[return-value]
+    """Sum over pixels of the outer product of their terms of the gradient; without a second table in memory."""
+    blocks = (
+        s * r
+        for table, own in zip(slopes, residuals, strict=True)
+        for s, r in zip(table.split(BLOCK, dim=1), own.split(BLOCK), strict=True)
+    )
+    return sum(array_of((b @ b.T).double()) for b in blocks)  # type: ignore[return-value]
 
 
 def _solve(normal: np.ndarray, gradient: np.ndarray, damping: float) -> np.ndarray:
