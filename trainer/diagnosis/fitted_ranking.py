@@ -34,6 +34,7 @@ RIVALS = 0.5  # at first those are fitted that the screen expects to remove so m
 # Of the least that is worth adding: a candidate of which few captures show less than this share, where the model is
 # complete and all that is left is not much more than that least, is not fitted to all.
 SHOWS = 0.25
+TOGETHER = "fitting candidates and present effects together"
 
 
 def fitted_ranking(
@@ -90,7 +91,7 @@ def fitted_ranking(
     fits += raised(try_all(roles, model, rest, pool, report, 0.6, 0.7))
     ranking = ranked(fits)
     if model.present and not any(r.worth_adding for r in ranking):
-        report(0.7, "fitting candidates and present effects together")
+        report(0.7, TOGETHER)
         without, together = try_together_with_present(roles, model, fits, pool)
         jointly = rank(without, together, known, thresholds, ideal_excess, len(order))
         ranking = jointly + [r for r in ranking if r.effect.name not in {f.effect for f in together}]
@@ -127,6 +128,7 @@ def _first_fits(
     if model.present and expects_the_rest(order):
         # Present effects may have taken up a part of the one that explains the rest: the screen lets them move.
         first = [s for s in promising if s.after < NEAR * order[0].after + least]
+        report(0.3, TOGETHER)
         fits = fit_with_present(roles, model, first, least, pool)
     else:
         first = [s for s in promising if s.removed_excess > RIVALS * order[0].removed_excess]
