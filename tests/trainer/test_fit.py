@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from runtime.lightpath.legendre import legendre_count
 from runtime.program.plain_values import plain
@@ -15,6 +18,7 @@ from trainer.captures.batches import Batch, load
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.effects import catalogue
 from trainer.effects.testing import captures_with
+from trainer.fitting import jacobian
 from trainer.fitting.gauss_newton import fit
 from trainer.fitting.refit import least_for_order, raise_orders
 from trainer.model.model import EffectInstance, Model, absent, instance_with
@@ -33,16 +37,27 @@ def fitted(captures: CaptureSet, start: EffectInstance) -> EffectInstance:
     return fit(model, [start.effect.name], batches_of(captures)).model.present[0]
 
 
+ZERO_ORDER = {"leak_real": 0.06, "leak_imaginary": -0.03, "fill_factor": 0.95}
+
+
 @pytest.mark.parametrize(
-    ("name", "truth"),
+    ("name", "truth", "table_pixels"),
     [
-        ("distance", {"offset": 0.08}),
-        ("zero_order", {"leak_real": 0.06, "leak_imaginary": -0.03, "fill_factor": 0.95}),
-        ("misregistration", {"shift_y": 0.2, "shift_x": -0.1, "rotation": 0.8, "magnification": 0.05}),
-        ("ghost", {"amplitude": 0.05, "shift_y": -3.3, "shift_x": 6.4}),
+        ("distance", {"offset": 0.08}, jacobian.TABLE_PIXELS),
+        ("zero_order", ZERO_ORDER, jacobian.TABLE_PIXELS),
+        ("zero_order", ZERO_ORDER, 600),
+        (
+            "misregistration",
+            {"shift_y": 0.2, "shift_x": -0.1, "rotation": 0.8, "magnification": 0.05},
+            jacobian.TABLE_PIXELS,
+        ),
+        ("ghost", {"amplitude": 0.05, "shift_y": -3.3, "shift_x": 6.4}, jacobian.TABLE_PIXELS),
     ],
 )
-def test_true_values_lie_within_the_stated_errors(name: str, truth: dict[str, float], tmp_path: Path) -> None:
+def test_true_values_lie_within_the_stated_errors(
+    name: str, truth: dict[str, float], table_pixels: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(jacobian, "TABLE_PIXELS", table_pixels)
     effect = KNOWN[name]
     scores = []
     for seed in range(4):
@@ -57,6 +72,33 @@ def test_true_values_lie_within_the_stated_errors(name: str, truth: dict[str, fl
     # The mean square of n normal scores lies in this range but for one case in some thousands.
     assert max(map(abs, scores)) < 4
     assert 0.15 < np.mean(np.square(scores)) < 3.5
+
+
+def test_tables_of_large_pictures_have_every_column_and_the_sums_of_all_pixels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    effect = KNOWN["vignetting"]
+    captures = captures_with(
+        tmp_path, effect, {"log_gain": [0.2, -0.1, 0.1, 0.05, -0.1]}, patterns=3, order=2
+    )
+    batches = batches_of(captures)
+    height, width = batches[0].mask.shape[-2:]
+    start = Model(captures.bench).having(absent(effect, captures.bench))
+    whole = fit(start, ["vignetting"], batches)
+    monkeypatch.setattr(jacobian, "TABLE_PIXELS", height * width // 4 + 1)
+    every = next(n for n in range(4, 99) if math.gcd(n, width) == 1)
+    place = torch.arange(width).expand(height, width)
+    one = batches[0].only([0])
+    columns = jacobian.weighted(replace(one, mask=torch.ones_like(one.mask)), place[None] + 1.0)
+    assert len(columns) == math.ceil(height * width / every)
+    seen = torch.bincount((columns / math.sqrt(every)).round().long() - 1, minlength=width)
+    assert seen.min() >= height // every
+    few = fit(start, ["vignetting"], batches)
+    errors = [np.sqrt(np.diag(f.covariance)) for f in (whole, few)]
+    assert errors[1] == pytest.approx(math.sqrt(every) * errors[0], rel=0.2)
+    away = few.model.present[0].values["log_gain"] - whole.model.present[0].values["log_gain"]
+    assert np.abs(away / errors[1][:-1]).max() < 4
+    assert few.errors.excess == pytest.approx(whole.errors.excess, abs=2e-5)
 
 
 def test_an_order_is_raised_as_far_as_the_captures_ask_and_no_farther(tmp_path: Path) -> None:

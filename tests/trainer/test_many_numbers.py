@@ -12,7 +12,7 @@ from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import capture_roles
 from trainer.diagnosis.screen import screen_batches
 from trainer.effects import Panel, Parameter, Sensor, discs, effect, testing
-from trainer.fitting import gauss_newton, many_numbers
+from trainer.fitting import gauss_newton, jacobian, many_numbers
 from trainer.fitting.gains import with_gains
 from trainer.fitting.gauss_newton import fit
 from trainer.fitting.jacobian import keys_of, slopes_of, weighted_residuals
@@ -56,7 +56,11 @@ def prepared(captures: CaptureSet) -> tuple[Model, list]:
     return model, load(captures, roles.fitted)
 
 
-def test_both_products_are_those_of_the_table(captures: CaptureSet, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("table_pixels", [jacobian.TABLE_PIXELS, 1000])
+def test_both_products_are_those_of_the_table(
+    captures: CaptureSet, monkeypatch: pytest.MonkeyPatch, table_pixels: int
+) -> None:
+    monkeypatch.setattr(jacobian, "TABLE_PIXELS", table_pixels)
     bare, batches = prepared(captures)
     model = bare.having(absent(own_columns, captures.bench)).having(absent(own_fall, captures.bench))
     predictors = [Predictor(model, b) for b in batches]

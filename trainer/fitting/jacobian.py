@@ -1,15 +1,22 @@
-"""Derivatives of predictions with respect to the numbers of effects, as secants one small physical step wide."""
+"""Derivatives of predictions with respect to the numbers of effects, as secants one small physical step wide.
+
+Tables of derivatives, and the residuals that go with them, are of every pixel of small pictures and of evenly chosen
+ones of large pictures: two million pixels of each capture would fill the memory, and a seventh of them says enough.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from runtime.excess import PredictionErrors, joined
+from trainer.captures.batches import Batch
 from trainer.fitting.predictor import Predictor
 from trainer.fitting.side_by_side import side_by_side
 from trainer.model.model import Model
@@ -17,6 +24,35 @@ from trainer.prediction.predict import Trace
 
 NO_CHANGE = 1e-5  # of the prediction: what a number's scale must change for captures to determine it
 STEP = 0.1  # of a parameter's scale: large against single precision's rounding, small against curvature
+TABLE_PIXELS = 1 << 19  # most pixels of a capture in a table of derivatives
+
+
+def weighted(batch: Batch, counts: Tensor) -> Tensor:
+    """Counts [B, h, w] of a batch as rows of tables have them: [pixels].
+
+    Those that can be used, of the pixels that tables are of. Each stands for as many as were left out, so that sums of
+    squares are those of all pixels.
+    """
+    every = _every(batch)
+    chosen = (batch.mask * counts).reshape(-1)[::every]
+    return chosen if every == 1 else math.sqrt(every) * chosen
+
+
+def unweighted(batch: Batch, row: Tensor) -> Tensor:
+    """The adjoint of `weighted`: [B, h, w] from a row [pixels]."""
+    every = _every(batch)
+    spread = torch.zeros(batch.mask.numel(), dtype=row.dtype)
+    spread[::every] = math.sqrt(every) * row
+    return batch.mask * spread.reshape(batch.mask.shape)
+
+
+def _every(batch: Batch) -> int:
+    """One of so many pixels, row after row, is in a table: a number that lets all columns have their turn."""
+    height, width = batch.mask.shape[-2:]
+    every = math.ceil(height * width / TABLE_PIXELS)
+    while math.gcd(every, width) > 1:
+        every += 1
+    return every
 
 
 def keys_of(model: Model, free: Sequence[str]) -> tuple[tuple[str, str, int], ...]:
@@ -70,7 +106,11 @@ def column_step(model: Model, key: tuple[str, str, int]) -> float:
 
 
 def columns(
-    model: Model, keys: Sequence[tuple[str, str, int]], predictor: Predictor, point: Trace
+    model: Model,
+    keys: Sequence[tuple[str, str, int]],
+    predictor: Predictor,
+    point: Trace,
+    kept: Callable[[Tensor], Tensor] | None = None,
 ) -> tuple[Tensor, list[Tensor]]:
     """Prediction of a batch and its derivatives.
 
@@ -78,11 +118,13 @@ def columns(
     ----------
     point : Trace
         The batch's light under `model`.
+    kept : callable, optional
+        What is kept of each derivative [B, h, w].
 
     Returns
     -------
     tensor [B, h, w], counts
-    list of tensors [B, h, w]
+    list of tensors [B, h, w], or what is kept of them
         Change a unit of each parameter, then of the logarithm of the gain. Zero for another colour's number, and for
         one that changes nothing here, where the difference would be rounding alone.
     """
@@ -93,11 +135,12 @@ def columns(
 
     def slope(moved: Tensor, step: float, scale: float) -> Tensor:
         found = (moved - base) / step
-        return found if scale * float(torch.linalg.vector_norm(found)) > least else torch.zeros_like(found)
+        found = found if scale * float(torch.linalg.vector_norm(found)) > least else torch.zeros_like(found)
+        return kept(found) if kept else found
 
     def of_number(key: tuple[str, str, int]) -> Tensor:
         if colour_of(model, key) not in (None, predictor.batch.channel):
-            return torch.zeros_like(base)
+            return kept(torch.zeros_like(base)) if kept else torch.zeros_like(base)
         step, effect = column_step(model, key), model.instance(key[0]).effect
         moved = predictor.predict_nearby(stepped(model, key, step), effect.stage, point, near)
         return slope(moved, step, effect.parameter(key[1]).scale)
@@ -118,12 +161,11 @@ def slopes_of(
     """Weighted derivatives of each batch's prediction: [keys + channels, pixels]."""
     blocks = []
     for predictor, point in zip(predictors, points, strict=True):
-        weight = predictor.batch.mask
-        block = torch.zeros((len(keys) + len(channels), weight.numel()), dtype=weight.dtype)
-        _, slopes = columns(model, keys, predictor, point)
+        _, slopes = columns(model, keys, predictor, point, partial(weighted, predictor.batch))
+        block = torch.zeros((len(keys) + len(channels), slopes[0].numel()), dtype=slopes[0].dtype)
         which = [*range(len(keys)), len(keys) + channels.index(predictor.batch.channel)]
         for row, slope in zip(which, slopes, strict=True):
-            block[row] = (weight * slope).reshape(-1)
+            block[row] = slope
         blocks.append(block)
     return blocks
 
@@ -131,12 +173,12 @@ def slopes_of(
 def weighted_residuals(
     model: Model, predictors: Sequence[Predictor], points: Sequence[Trace]
 ) -> tuple[list[Tensor], PredictionErrors]:
-    """Weighted residuals of each batch [pixels], and the errors they make."""
+    """Weighted residuals of each batch [pixels], and the errors that all pixels make."""
     residuals, errors = [], []
     for predictor, point in zip(predictors, points, strict=True):
         batch = predictor.batch
         prediction = predictor.counts(model, predictor.light(model, point))
-        residuals.append((batch.mask * (batch.signal - prediction)).reshape(-1))
+        residuals.append(weighted(batch, batch.signal - prediction))
         errors.append(batch.errors(prediction))
     return residuals, joined(errors)
 

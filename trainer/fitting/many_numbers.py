@@ -18,7 +18,7 @@ from torch import Tensor
 
 from trainer.device import array_of
 from trainer.effects.definition import STAGES
-from trainer.fitting.jacobian import STEP
+from trainer.fitting.jacobian import STEP, unweighted, weighted
 from trainer.fitting.predictor import Predictor
 from trainer.model.model import EffectInstance, Model
 from trainer.model.model_stages import stages_of
@@ -99,21 +99,20 @@ class ManySlopes:
         """Change of the weighted predictions [pixels] of each batch in a direction."""
         size = float(np.abs(direction).max())
         if size == 0:
-            return [torch.zeros(b.numel(), dtype=b.dtype) for b in self._base]
+            return [torch.zeros_like(o[0]) for o in self.others]
         step = STEP / size
         there = self.moved(step * direction, held=False)
         rows = []
         with torch.no_grad():
             for q, point, base in zip(self.predictors, self.points, self._base, strict=True):
-                slope = (q.predict_nearby(there, self.first, point) - base) / step
-                rows.append((q.batch.mask * slope).reshape(-1))
+                rows.append(weighted(q.batch, (q.predict_nearby(there, self.first, point) - base) / step))
         return rows
 
     def across(self, rows: Sequence[Tensor]) -> Vector:
         """The transpose's product with one row [pixels] a batch."""
         total = np.zeros(self.scales.size)
         for q, point, row in zip(self.predictors, self.points, self.alone(rows), strict=True):
-            weights = row.reshape(q.batch.mask.shape) * q.batch.mask
+            weights = unweighted(q.batch, row)
             for k in range(weights.shape[0]):
                 total += self._backward(q, point, weights, k)
         return total * self.scales
@@ -163,7 +162,9 @@ class ManySlopes:
         for _ in range(SIGNS):
             signs = draw.choice([-1.0, 1.0], self.scales.size)
             curvature += signs * self.across(self.along(signs)) / SIGNS
-        pixels = sum(float((q.batch.mask > 0).sum()) for q in self.predictors)
+        pixels = sum(
+            float((weighted(q.batch, torch.ones_like(q.batch.mask)) > 0).sum()) for q in self.predictors
+        )
         square = sum(float((r.double() ** 2).sum()) for r in residuals) / max(pixels, 1.0)
         positive = np.maximum(curvature, 1e-3 * max(float(curvature.mean()), 1e-300))
         return self.scales * np.sqrt(square / positive)
