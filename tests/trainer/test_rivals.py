@@ -12,7 +12,7 @@ from runtime.excess import PredictionErrors, removed_excess
 from trainer.captures.bench_file import Bench, Camera, Channel, Iris, Panel
 from trainer.diagnosis.candidate_fits import CandidateFit
 from trainer.diagnosis.chosen_addition import _rival, chosen_addition
-from trainer.diagnosis.ranking import RankedEffect, rank
+from trainer.diagnosis.ranking import RankedEffect, fit_with_present, rank
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import catalogue
 from trainer.model.model import Model, absent
@@ -150,3 +150,32 @@ def test_a_plainer_one_that_is_not_worth_adding_does_not_come_first() -> None:
         ("polarisation_leak", True),
         ("phase_response", False),
     ]
+
+
+@pytest.mark.parametrize(
+    ("told", "expected"),
+    [
+        (("a",), ["try_together_on_few", "try_with_present"]),
+        (("a", "b"), ["try_with_present"]),  # one capture a colour: few are all that a fit has
+    ],
+)
+def test_no_candidate_is_fitted_twice_to_the_same_captures(
+    told: tuple[str, ...], expected: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+
+    def noted(task: Any, tasks: list[Any]) -> list[float]:
+        asked.append(task.__name__)
+        return [0.1 for _ in tasks]
+
+    def captures(*names: str) -> list[Any]:
+        return [SimpleNamespace(capture=name) for name in names]
+
+    monkeypatch.setattr("trainer.diagnosis.ranking.telling_captures", lambda *_: captures(*told))
+    roles: Any = SimpleNamespace(
+        captures=None, folder=None, fitted=captures("a", "b"), held_out=captures("c")
+    )
+    screened: Any = [SimpleNamespace(start=None), SimpleNamespace(start=None)]
+    pool: Any = SimpleNamespace(map=noted, map_here_if_one=noted)
+    assert len(fit_with_present(roles, Model(BENCH), screened, 0.0002, pool)) == 2
+    assert asked == expected

@@ -242,7 +242,7 @@ def fit_with_present(
 ) -> list[CandidateFit]:
     """Fit candidates at their lowest order, each together with the effects that are present.
 
-    Several are fitted to few captures first, and those that come near the best there to all.
+    Several are fitted to few captures first, where a fit has more, and those that come near the best there to all.
 
     Parameters
     ----------
@@ -250,8 +250,8 @@ def fit_with_present(
         Excess that makes no difference.
     """
     ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
-    if len(screened) > 1:
-        few = ids_of(telling_captures(roles.captures, roles.fitted, model))
+    few = ids_of(telling_captures(roles.captures, roles.fitted, model)) if len(screened) > 1 else ids
+    if len(few) < len(ids):
         left = pool.map(try_together_on_few, [(roles.folder, few, model, s.start) for s in screened])
         most = NEAR * min(left) + least
         screened = [s for s, there in zip(screened, left, strict=True) if there <= most]
