@@ -12,6 +12,7 @@ from runtime.excess import PredictionErrors, removed_excess
 from trainer.captures.bench_file import Bench, Camera, Channel, Iris, Panel
 from trainer.diagnosis.candidate_fits import CandidateFit
 from trainer.diagnosis.chosen_addition import _rival, chosen_addition
+from trainer.diagnosis.exchange import preferred
 from trainer.diagnosis.ranking import RankedEffect, fit_with_present, rank
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import catalogue
@@ -179,3 +180,23 @@ def test_no_candidate_is_fitted_twice_to_the_same_captures(
     pool: Any = SimpleNamespace(map=noted, map_here_if_one=noted)
     assert len(fit_with_present(roles, Model(BENCH), screened, 0.0002, pool)) == 2
     assert asked == expected
+
+
+@pytest.mark.parametrize(("left", "tried"), [(0.0001, 0), (0.0003, 1)])
+def test_a_less_plain_rival_is_tried_only_where_enough_is_left_for_it(
+    left: float, tried: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trials: list[Any] = []
+
+    def noted(_roles: Any, _model: Any, given: list[Any], *_: Any) -> list[Any]:
+        trials.extend(given)
+        return []
+
+    monkeypatch.setattr("trainer.diagnosis.exchange._promising", noted)
+    model = Model(BENCH).having(absent(KNOWN["phase_response"], BENCH))
+    nothing: Any = None
+    for name, expected in ((RARE, tried), ("stray_light", 1)):
+        trials.clear()
+        rivals = {"phase_response": {name: absent(KNOWN[name], BENCH)}}
+        assert preferred(nothing, model, errors(left), rivals, Thresholds(), 0.5, nothing) is None
+        assert len(trials) == expected

@@ -115,7 +115,8 @@ def preferred(
 ) -> tuple[str, str, Model, PredictionErrors] | None:
     """The model with one effect exchanged for a rival that captures prefer now that nothing else is missing.
 
-    A plainer rival is preferred unless it does worse, a less plain one only where it is worth it.
+    A plainer rival is preferred unless it does worse, a less plain one only where it is worth it. Where too little is
+    left for that, the less plain one is not tried.
 
     Parameters
     ----------
@@ -129,7 +130,8 @@ def preferred(
     (str, str, Model, PredictionErrors) or None
         As of `exchanged`.
     """
-    pairs = _pairs(model, rivals)
+    enough = thresholds.may_be_worth_adding(errors.excess, ideal_excess)
+    pairs = [p for p in _pairs(model, rivals) if enough or not model.instance(p[0]).is_plainer_than(p[2])]
     trials = [(model.without(old), fitted) for old, _, fitted in pairs]
     found = _promising(roles, model, trials, lambda left: left + thresholds.least(ideal_excess), pool)
     for which, together, after in found:
