@@ -68,10 +68,7 @@ class FirstPhases:
         self.frames, self.drives = objective.frames, drives[:: objective.frames]
         self.initialiser = None if initialiser is None else Initialiser(initialiser, self.shape)
         begins = self.initialiser is None or self.initialiser.corrects
-        self.starts = [
-            Start(objective, stack[0], c, drive.gapless and begins, len(stack))
-            for c, (stack, drive) in enumerate(zip(stacks, self.drives, strict=True))
-        ]
+        self.starts = [Start(objective, stack[0], c, begins, len(stack)) for c, stack in enumerate(stacks)]
         self.noise: np.ndarray | None = None
         if self.frames > 1:
             noise = np.random.default_rng(0).normal(scale=NOISE, size=self.shape)
@@ -111,11 +108,8 @@ class FirstPhases:
             alike: Sequence[Array] = ()
             network = self.initialiser
             if network is None or network.corrects:
-                if drive.gapless:
-                    alike = others[: BOARDS - 1] if soon and network is None else ()
-                    start.double_phase(self.amplitude, phase, alike, self.moved)
-                else:
-                    start.flat_phase(self.amplitude, phase)
+                alike = others[: BOARDS - 1] if soon and network is None else ()
+                start.double_phase(self.amplitude, phase, alike, self.moved)
             if network is not None:
                 found = network.phase(self.backend.to_host(self.amplitude), self.backend.to_host(phase))
                 phase[...] = xp.asarray(found)

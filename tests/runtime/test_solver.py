@@ -44,6 +44,19 @@ def test_double_phase_shows_the_picture_where_the_iris_stops_its_chequerboard() 
     assert quality_of(path, gray, target).psnr_db > quality_of(path, flat, target).psnr_db + 8
 
 
+@pytest.mark.parametrize(("turns", "less_db"), [(0.95, 0.5), (0.86, 0.5), (0.75, 1.5)])
+def test_a_panel_that_misses_a_part_of_the_turn_begins_with_double_phase_too(
+    turns: float, less_db: float
+) -> None:
+    """As in red, where the panel is made for green. From flat phase, five iterations end at 17 dB."""
+    whole = ideal_path(SHAPE, DISTANCE, half_width=0.5, dtype=np.float32)
+    short = replace(whole, response=(turns * 2 * np.pi * np.arange(256) / 255).astype(np.float32))
+    target = scene(SHAPE)
+    best, reached = (solve(path, target, 5) for path in (whole, short))
+    assert reached.quality.psnr_db > best.quality.psnr_db - less_db
+    assert reached.phase.max() <= short.response[-1] + 1e-5
+
+
 def test_more_iterations_never_give_a_worse_pattern(ideal: LightPath) -> None:
     target = scene(SHAPE, 2)
     qualities = [solve(ideal, target, n).quality.psnr_db for n in (0, 1, 2, 3, 5, 8, 13, 21, 40)]
