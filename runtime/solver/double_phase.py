@@ -1,4 +1,4 @@
-"""Double phase, a pattern that shows a picture without iterations: where a solve begins."""
+"""Double phase, a pattern that shows a picture without iterations, and flat phase: where a solve begins."""
 
 from __future__ import annotations
 
@@ -194,6 +194,20 @@ class Start:
         first = max(edge, rows.start)
         last = max(min(height - edge, rows.stop), first)
         return slice(first - rows.start, last - rows.start), slice(side, width - side)
+
+    def flat_phase(self, amplitude: Array, phase: Array) -> None:
+        """Fill `phase` with that of the amplitude with flat phase, back at the panel; its amplitude there is lost.
+
+        A better start than double phase where the panel does not reach a whole turn and the iris is open (WIDE).
+        """
+        self._wave(amplitude, self.light)
+        xp, wave = self.backend.xp, self.wave
+
+        def work(worker: int, rows: slice) -> None:
+            rooms = [room[: rows.stop - rows.start] for room in self.rooms[worker]]
+            angle_into(xp, wave[rows].imag, wave[rows].real, phase[rows], rooms)
+
+        self.backend.over_rows(len(phase), self.objective.strip, work)
 
     def _tilt(self, cycles: list[np.ndarray], half_open: bool) -> Tilt:
         """The tilt of light with these frequencies, cycles a pixel, at each row and each column of the image."""

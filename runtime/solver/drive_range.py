@@ -26,6 +26,8 @@ class DriveRange:
     ----------
     low, high : float or float array [H, W], rad
         The ends of the range.
+    gapless : bool
+        A whole turn is covered everywhere.
     bounded : bool
         Phases a turn apart do not act the same, so a step has to stay in range.
 
@@ -52,7 +54,8 @@ class DriveRange:
         step = (high - low) / (len(response) - 1)
         # Where a whole turn is covered, phases beyond the ends come back inside; one step is no gap.
         gap = 2 * math.pi - np.min(self.high - self.low)
-        self.bounded = path.crosstalk is not None or path.modulation is not None or bool(gap > 1.5 * step)
+        self.gapless = bool(gap <= 1.5 * step)
+        self.bounded = path.crosstalk is not None or path.modulation is not None or not self.gapless
         self.table = None
         if self.gain is None and not self.bounded:
             turn = np.arange(TURN_STEPS, dtype=response.dtype) * (2 * math.pi / TURN_STEPS)
