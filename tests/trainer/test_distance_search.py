@@ -91,3 +91,8 @@ def test_nothing_is_searched_for_a_model_that_explains_most(
         starts = distance_starts([Evidence(predictor.scene, batch, predictor.predict(model))])
         assert starts == [{"offset": 0.0}]
         assert len(searches) == (offset_mm != 0)
+    smoothed = batch.smoothed(4.0)  # of which a model out of focus predicts nearly all
+    predictor = Predictor(model, smoothed)
+    assert smoothed.errors(predictor.predict(model)).nrmse ** 2 < 0.05
+    distance_starts([Evidence(predictor.scene, smoothed, predictor.predict(model))])
+    assert len(searches) == 2

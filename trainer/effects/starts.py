@@ -28,7 +28,8 @@ from trainer.prediction.scene import bare_stages, scene_at
 Starts = list[dict[str, Any]]
 SEARCHED = 2  # captures of a colour and plane on which its distance is searched
 REACH = 2.0  # pitch^2 / wavelength: from so far a fit of the distance finds the right one
-# The squared error, as a share of the signal's variance, of a model that is wrong in its distance alone, by REACH.
+# The squared error, as a share of the signal's variance, of a model that is wrong in its distance alone, by REACH; of
+# pictures that are smoothed it is less by far.
 OUT_OF_REACH = 0.25
 _DISTANCES: dict[
     tuple[Any, ...], float | None
@@ -60,10 +61,11 @@ def wavelength_starts(evidence: Sequence[Evidence]) -> Starts:
 def _found_distance(evidence: Evidence) -> float | None:
     """The distance, mm, at which a scene's captures fit their patterns best.
 
-    None where none has structure, and where the model predicts so much that a fit reaches the right one.
+    None where none has structure, and where the model predicts so much of pictures as they are that a fit reaches the
+    right one.
     """
     scene, batch = evidence.scene, evidence.batch
-    if batch.errors(evidence.prediction).nrmse ** 2 < OUT_OF_REACH:
+    if batch.seen is None and batch.errors(evidence.prediction).nrmse ** 2 < OUT_OF_REACH:
         return None
     digest = hashlib.sha256()
     for array in (batch.gray, batch.signal, batch.mask):
