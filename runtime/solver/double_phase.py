@@ -64,13 +64,17 @@ class Start:
     path : LightPath
         Of the colour's first plane.
     colour : int
-    doubled : bool
-        Whether the start is double phase.
+    begins : bool
+        Whether a solve begins with this start, and not with a network's.
+    gapless : bool
+        Whether the panel reaches a whole turn.
     planes : int
         Of the colour: a tilted image moves from plane to plane, so it is tilted where there is one.
 
     Attributes
     ----------
+    doubled : bool
+        Whether the start is double phase.
     still, moving : Tilt
         The light in the image of a still picture and of one that moves; the same one where there is no difference.
     light : Tilt
@@ -80,7 +84,13 @@ class Start:
     """
 
     def __init__(
-        self, objective: Objective, path: LightPath, colour: int, doubled: bool, planes: int = 1
+        self,
+        objective: Objective,
+        path: LightPath,
+        colour: int,
+        begins: bool,
+        gapless: bool,
+        planes: int = 1,
     ) -> None:
         xp = objective.backend.xp
         self.backend, self.objective, self.colour = objective.backend, objective, colour
@@ -99,7 +109,10 @@ class Start:
             )
         leak = self.optics.panel.leak
         self.unmodulated = None if leak is None else leak * self.over_source
-        half_open = doubled and path.grid.band_share < WIDE
+        # An open iris passes the chequerboard: what a gap in the turn takes of it, the descent does not mend there.
+        stopped = path.grid.band_share < WIDE
+        self.doubled = begins and (gapless or stopped)
+        half_open = self.doubled and stopped
         tilts = [
             tilted(path, least) if half_open and planes == 1 else middle(path) for least in (RISE_LEAST, RISE)
         ]

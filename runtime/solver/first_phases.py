@@ -9,7 +9,7 @@ import numpy as np
 
 from runtime.lightpath.light_path import LightPath
 from runtime.solver.block_motion import Part, follow
-from runtime.solver.double_phase import BOARDS, WIDE, Start
+from runtime.solver.double_phase import BOARDS, Start
 from runtime.solver.drive_range import DriveRange
 from runtime.solver.initialiser import Initialiser
 from runtime.solver.objective import Objective
@@ -68,15 +68,9 @@ class FirstPhases:
         self.frames, self.drives = objective.frames, drives[:: objective.frames]
         self.initialiser = None if initialiser is None else Initialiser(initialiser, self.shape)
         begins = self.initialiser is None or self.initialiser.corrects
-        # An open iris passes the chequerboard of double phase: what a gap in the turn takes of it, the descent does not
-        # mend there. Where the iris stops it, it does.
-        self.doubled = [
-            drive.gapless or stack[0].grid.band_share < WIDE
-            for stack, drive in zip(stacks, self.drives, strict=True)
-        ]
         self.starts = [
-            Start(objective, stack[0], c, doubled and begins, len(stack))
-            for c, (stack, doubled) in enumerate(zip(stacks, self.doubled, strict=True))
+            Start(objective, stack[0], c, begins, drive.gapless, len(stack))
+            for c, (stack, drive) in enumerate(zip(stacks, self.drives, strict=True))
         ]
         self.noise: np.ndarray | None = None
         if self.frames > 1:
@@ -109,7 +103,7 @@ class FirstPhases:
 
     def _make(self, targets: Array, phases: Array, soon: bool) -> None:
         xp = self.backend.xp
-        for c, (drive, start, doubled) in enumerate(zip(self.drives, self.starts, self.doubled, strict=True)):
+        for c, (drive, start) in enumerate(zip(self.drives, self.starts, strict=True)):
             phase, *others = phases[c * self.frames : (c + 1) * self.frames]
             mean = float(targets[c, 0].mean(dtype=np.float64))
             xp.multiply(targets[c, 0], 1 / mean, out=self.amplitude)
@@ -117,7 +111,7 @@ class FirstPhases:
             alike: Sequence[Array] = ()
             network = self.initialiser
             if network is None or network.corrects:
-                if doubled:
+                if start.doubled:
                     alike = others[: BOARDS - 1] if soon and network is None else ()
                     start.double_phase(self.amplitude, phase, alike, self.moved)
                 else:

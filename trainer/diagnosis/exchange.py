@@ -131,7 +131,11 @@ def preferred(
         As of `exchanged`.
     """
     enough = thresholds.may_be_worth_adding(errors.excess, ideal_excess)
-    pairs = [p for p in _pairs(model, rivals) if enough or not model.instance(p[0]).is_plainer_than(p[2])]
+    pairs = [
+        (old, new, fitted)
+        for old, new, fitted in _pairs(model, rivals)
+        if enough or not model.instance(old).is_plainer_than(fitted)
+    ]
     trials = [(model.without(old), fitted) for old, _, fitted in pairs]
     found = _promising(roles, model, trials, lambda left: left + thresholds.least(ideal_excess), pool)
     for which, together, after in found:

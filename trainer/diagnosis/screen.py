@@ -192,9 +192,8 @@ def _start(effect: Effect, model: Model, predictors: list[Predictor], points: li
     # A start need only be near: one colour and plane are enough.
     few, there = predictors[:1], points[:1]
     at_pupil = effect.stage == "pupil"
-    if (
-        at_pupil
-    ):  # what the panel sends to other wavelengths is the same for all starts, and nearly so light from aside
+    if at_pupil:
+        # What the panel sends to other wavelengths is the same for all starts, and nearly so is light from aside.
         there = [p.trace(model.having(starts[0]), "pupil", t) for p, t in zip(few, there, strict=True)]
     costs = [start_cost(model, few, there, start, nearby=at_pupil) for start in starts]
     if max(costs) - min(costs) < 1e-9 * max(costs) and not any(has_many(start) for start in starts):

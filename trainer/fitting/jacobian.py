@@ -110,7 +110,7 @@ def columns(
     keys: Sequence[tuple[str, str, int]],
     predictor: Predictor,
     point: Trace,
-    kept: Callable[[Tensor], Tensor] | None = None,
+    kept: Callable[[Tensor], Tensor] = lambda slope: slope,
 ) -> tuple[Tensor, list[Tensor]]:
     """Prediction of a batch and its derivatives.
 
@@ -118,8 +118,8 @@ def columns(
     ----------
     point : Trace
         The batch's light under `model`.
-    kept : callable, optional
-        What is kept of each derivative [B, h, w].
+    kept : callable
+        What is kept of each derivative [B, h, w]; without it, all.
 
     Returns
     -------
@@ -135,12 +135,12 @@ def columns(
 
     def slope(moved: Tensor, step: float, scale: float) -> Tensor:
         found = (moved - base) / step
-        found = found if scale * float(torch.linalg.vector_norm(found)) > least else torch.zeros_like(found)
-        return kept(found) if kept else found
+        shows = scale * float(torch.linalg.vector_norm(found)) > least
+        return kept(found if shows else torch.zeros_like(found))
 
     def of_number(key: tuple[str, str, int]) -> Tensor:
         if colour_of(model, key) not in (None, predictor.batch.channel):
-            return kept(torch.zeros_like(base)) if kept else torch.zeros_like(base)
+            return kept(torch.zeros_like(base))
         step, effect = column_step(model, key), model.instance(key[0]).effect
         moved = predictor.predict_nearby(stepped(model, key, step), effect.stage, point, near)
         return slope(moved, step, effect.parameter(key[1]).scale)
