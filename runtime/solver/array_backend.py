@@ -126,6 +126,10 @@ class Backend:
         """Multiply a real image by a transfer function over its half spectrum, in place; `spectrum` is room."""
         fft.filter_into(image, transfer, spectrum, self.threads)
 
+    def take(self, table: Array, index: Array, out: Array) -> None:
+        """Fill `out` with the entries of a table at indices, all of which it has."""
+        np.take(table, index, out=out, mode="clip")  # another mode copies `out`
+
     def to_host(self, x: Array) -> np.ndarray:
         """As a NumPy array."""
         return np.asarray(x)
@@ -189,6 +193,9 @@ class CupyBackend(Backend):
         spectrum[...] = self._fft.rfft2(image)
         spectrum *= transfer
         image[...] = self._fft.irfft2(spectrum, s=image.shape)
+
+    def take(self, table: Array, index: Array, out: Array) -> None:
+        self.xp.take(table, index, out=out)
 
     def to_host(self, x: Array) -> np.ndarray:
         return np.asarray(self.xp.asnumpy(x))

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from runtime.solver.array_backend import Backend
 from runtime.solver.video_motion import motion_between
 
 Array = Any
@@ -37,7 +38,7 @@ class Part:
 
 
 def block_motions(
-    before: np.ndarray, after: np.ndarray, motion: tuple[int, int]
+    before: Array, after: Array, motion: tuple[int, int], on: Backend
 ) -> tuple[tuple[int, int], list[Part]]:
     """How the content of a picture has moved, block by block.
 
@@ -49,6 +50,8 @@ def block_motions(
     before, after : float array [H, W]
     motion : (int, int), pixels
         Of the whole picture, down and right, as from `motion_between`.
+    on : Backend
+        Where the pictures are.
 
     Returns
     -------
@@ -56,13 +59,13 @@ def block_motions(
         The motion of most of the picture, and the parts that move otherwise.
     """
     contrast = max(float(after[::STEP, ::STEP].var()), 1e-30)
-    candidates, errors = [motion], [_block_errors(before, after, motion) / contrast]
+    candidates, errors = [motion], [_block_errors(before, after, motion, on) / contrast]
     if not (_known(errors[0]) > WRONG).any():
         return motion, []
     for candidate in (0, 0), *_window_motions(before, after, errors[0] > WRONG):
         if candidate not in candidates and len(candidates) < MOTIONS + 2:
             candidates.append(candidate)
-            errors.append(_block_errors(before, after, candidate) / contrast)
+            errors.append(_block_errors(before, after, candidate, on) / contrast)
     # among blocks that do not fit at all, how little they fit says nothing about where most of the picture goes
     whole = int(np.argmin([np.minimum(e, WRONG).sum() for e in errors]))
     order = [whole, *(k for k in range(len(candidates)) if k != whole)]
@@ -95,27 +98,26 @@ def follow(phase: Array, found: Array, fresh: Array, part: Part, whole: tuple[in
     phase[rows, columns] += found[from_rows, from_columns]
 
 
-def _block_errors(before: np.ndarray, after: np.ndarray, motion: tuple[int, int]) -> np.ndarray:
+def _block_errors(before: Array, after: Array, motion: tuple[int, int], on: Backend) -> np.ndarray:
     """Mean squared difference of each block to the picture before, moved; infinite where nothing comes from there."""
-    spans, edges, counts = [], [], []
+    side = (
+        BLOCK // STEP
+    )  # samples of a block's side: every STEP-th pixel from the first that the motion leaves
+    here, there, counts, samples = [], [], [], []
     for step, size in zip(motion, after.shape, strict=True):
         first, last = (min(max(n, 0), size) for n in (step, size + step))
-        spans.append((slice(first, last, STEP), slice(first - step, last - step, STEP)))
-        inside = np.zeros(size, int)
-        inside[first:last:STEP] = 1
-        counts.append(np.add.reduceat(inside, np.arange(0, size, BLOCK)))
-        edges.append(np.cumsum(counts[-1]) - counts[-1])
-    (rows, from_rows), (columns, from_columns) = spans
-    difference = after[rows, columns] - before[from_rows, from_columns]
-    sums = np.full((len(counts[0]), len(counts[1])), np.inf)
-    seen = np.ix_(*(np.flatnonzero(n) for n in counts))
-    starts = [e[np.flatnonzero(n)] for e, n in zip(edges, counts, strict=True)]
-    if difference.size:
-        np.multiply(difference, difference, out=difference)
-        by_rows = np.add.reduceat(difference, starts[0], 0)
-        pixels = np.outer(*(n[n > 0] for n in counts))
-        sums[seen] = np.add.reduceat(by_rows, starts[1], 1) / pixels
-    return sums
+        here.append(slice(first, last, STEP))
+        there.append(slice(first - step, last - step, STEP))
+        blocks = -(-size // BLOCK)
+        samples.append(slice(first // STEP, first // STEP + len(range(first, last, STEP))))
+        counts.append(np.bincount(np.arange(samples[-1].start, samples[-1].stop) // side, minlength=blocks))
+    rows, columns = map(len, counts)
+    squares = on.xp.zeros((rows * side, columns * side), before.dtype)
+    on.xp.subtract(after[tuple(here)], before[tuple(there)], out=squares[tuple(samples)])
+    squares *= squares
+    sums = squares.reshape(rows, side, -1).sum(1).reshape(rows, columns, side).sum(-1)
+    pixels = np.outer(*counts)
+    return np.where(pixels > 0, on.to_host(sums) / np.maximum(pixels, 1), np.inf)
 
 
 def _known(errors: np.ndarray) -> np.ndarray:
@@ -123,7 +125,7 @@ def _known(errors: np.ndarray) -> np.ndarray:
     return np.where(np.isinf(errors), 0, errors)
 
 
-def _window_motions(before: np.ndarray, after: np.ndarray, wrong: np.ndarray) -> list[tuple[int, int]]:
+def _window_motions(before: Array, after: Array, wrong: np.ndarray) -> list[tuple[int, int]]:
     """Motions in the windows with most blocks that no candidate explains, the most frequent first."""
     pixels = int(np.clip(min(before.shape) // 8, *WINDOW))
     side = pixels // BLOCK
@@ -141,7 +143,7 @@ def _window_motions(before: np.ndarray, after: np.ndarray, wrong: np.ndarray) ->
     return sorted(votes, key=lambda m: -votes[m])
 
 
-def _nearest(before: np.ndarray, after: np.ndarray, motion: tuple[int, int]) -> tuple[int, int]:
+def _nearest(before: Array, after: Array, motion: tuple[int, int]) -> tuple[int, int]:
     """The motion of least difference among this one and its neighbours: a window's taper pulls the peak to 0."""
     best, least = motion, np.inf
     for down in (-1, 0, 1):
@@ -151,7 +153,7 @@ def _nearest(before: np.ndarray, after: np.ndarray, motion: tuple[int, int]) -> 
                 (slice(max(m, 0), n + min(m, 0)), slice(max(-m, 0), n - max(m, 0)))
                 for m, n in zip(tried, after.shape, strict=True)
             )
-            error = float(np.mean((after[rows, columns] - before[from_rows, from_columns]) ** 2))
+            error = float(((after[rows, columns] - before[from_rows, from_columns]) ** 2).mean())
             if error < least:
                 best, least = tried, error
     return best

@@ -121,7 +121,7 @@ class FirstPhases:
                 phase[...] = xp.asarray(found)
             if drive.bounded:
                 for one in (phase, *alike):
-                    one[...] = xp.asarray(drive.held(self.backend.to_host(one)))
+                    one[...] = drive.held(one)
             for n, other in enumerate(others[len(alike) :], 1 + len(alike)):
                 self._part(n, drive, phase, other)
 
@@ -132,7 +132,7 @@ class FirstPhases:
         other[...] = phase
         other += self.backend.xp.asarray(moved)
         if drive.bounded:
-            other[...] = self.backend.xp.asarray(drive.held(self.backend.to_host(other)))
+            other[...] = drive.held(other)
 
     def warm(
         self,

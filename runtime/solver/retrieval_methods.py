@@ -112,18 +112,13 @@ class MemorylessBfgs:
 
         self.backend.over_rows(len(phase), self.objective.strip, work)
         if self.bounded:
-            xp.clip(out, xp.asarray(drive.low), xp.asarray(drive.high), out=out)
+            xp.clip(out, drive.low, drive.high, out=out)
             xp.subtract(out, phase, out=move)
 
     def _hold(self, phase: Array) -> None:
         """Set the step of pixels that are pushed out of the panel's range to zero."""
-        xp = self.backend.xp
         for colour, drive in enumerate(self.drives):
-            free = xp.asarray(
-                ~drive.pushed_out(
-                    self.backend.to_host(phase[colour]), self.backend.to_host(self.gradient[colour])
-                )
-            )
+            free = ~drive.pushed_out(phase[colour], self.gradient[colour])
             self.gradient[colour] *= free
             if not self.first:
                 self.before[colour] *= free

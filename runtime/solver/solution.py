@@ -21,8 +21,6 @@ class Solution:
     ----------
     gray : uint8 array [C, N, H, W], [C, H, W], [N, H, W] or [H, W]
         Gray levels to send to the panel.
-    phase : float array, of the same shape, rad
-        What was asked of the panel, before rounding.
     psnr_db : tuple of float, dB
         Amplitude PSNR before rounding, at the start and after each iteration, on the solver's own grid. Where the
         panel's few levels are in the loop, of phases that are rounded ever more sharply.
@@ -38,17 +36,25 @@ class Solution:
     """
 
     gray: np.ndarray
-    phase: np.ndarray
     psnr_db: tuple[float, ...]
     expected_psnr_db: float
     milliseconds: float
     given: tuple[float, ...]
+    _phase: Callable[[], np.ndarray] = field(repr=False)
     _judge: Callable[[], tuple[Quality, ...]] = field(repr=False)
 
     @property
     def iterations(self) -> int:
         """Steps that were made."""
         return len(self.psnr_db) - 1
+
+    @cached_property
+    def phase(self) -> np.ndarray:
+        """What was asked of the panel, before rounding: float, of the shape of `gray`, rad.
+
+        From a GPU it is copied when first asked for, which is before the next solve.
+        """
+        return self._phase()
 
     @cached_property
     def qualities(self) -> tuple[Quality, ...]:

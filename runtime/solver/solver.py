@@ -119,12 +119,12 @@ class Solver:
         self.stacks = stacked(paths)
         self.shape = self.stacks[0][0].grid.shape
         self.frames = check_frames(frames, method)
-        self.drives = [DriveRange(stack[0], levels) for stack in self.stacks for _ in range(frames)]
         if approximator is not None:
             check_approximator(approximator.shape, self.stacks)
         self.approximator, self.through = approximator, through
         self.region = checked_region(region, self.shape)
         self.on = on or backend()
+        self.drives = [DriveRange(stack[0], levels, self.on) for stack in self.stacks for _ in range(frames)]
         fine = frames > 1 or needs_fine_grid(self.stacks) if grid is None else grid == "fine"
         in_the_loop = approximator if through == "gradient" else None
         self.objective = Objective(self.stacks, fine, penalty, self.region, in_the_loop, self.on, frames)
@@ -143,8 +143,8 @@ class Solver:
         whole = self.objective.shape
         self.phases = [xp.zeros(whole, real) for _ in range(3)]
         self.begun_from: Any = xp.zeros(whole, real) if stages else None
-        self.grays = [np.zeros(whole, np.uint8) for _ in range(2)]
-        self.before = np.zeros(self.shape, real)
+        self.grays = [xp.zeros(whole, np.uint8) for _ in range(2)]
+        self.before = xp.zeros(self.shape, real)
         self.solved = 0
         self.follows = False  # whether `best` is of the picture in `before`
         self.best = self.phases[0]
@@ -224,7 +224,7 @@ class Solver:
         parts: list[Part] = []
         if self.follows:
             whole = motion_between(self.before, picture) if motion is None else motion
-            motion, parts = block_motions(self.before, picture, whole)
+            motion, parts = block_motions(self.before, picture, whole, self.on)
         optics_targets = self._aim(targets)
         if self.follows and motion is not None and not is_cut(self.before, picture, motion):
             first = next(k for k, phase in enumerate(self.phases) if phase is not self.best)
@@ -261,8 +261,8 @@ class Solver:
 
     def _begun(
         self, target: np.ndarray, iterations: int | None, deadline_ms: float | None
-    ) -> tuple[np.ndarray, float]:
-        """The checked targets, and the time (s) that a deadline counts from."""
+    ) -> tuple[Any, float]:
+        """The checked targets, where the solver computes, and the time (s) that a deadline counts from."""
         targets = self._checked(target)
         check_iterations(iterations)
         check_deadline(deadline_ms)
@@ -272,7 +272,7 @@ class Solver:
 
     def _improve(
         self,
-        targets: np.ndarray,
+        targets: Any,
         begun: float,
         iterations: int | None,
         deadline_ms: float | None,
@@ -306,15 +306,22 @@ class Solver:
                 _, expected, self.given = at_first
         self.grays.reverse()
         for drive, phase, gray in zip(self.drives, self.best, self.grays[0], strict=True):
-            drive.gray(self.on.to_host(phase), gray)
+            drive.gray(phase, gray)
+        gray = self.on.to_host(self.grays[0])
         done = time.perf_counter()
         self.finish.took(1e3 * (done - clock))
-        gray, phase = self.grays[0], self.on.to_host(self.best)
-        leading = [n for n in (len(self.stacks), self.frames) if n > 1]
-        gray, phase = (a.reshape(*leading, *self.shape) for a in (gray, phase))
+        shape = *(n for n in (len(self.stacks), self.frames) if n > 1), *self.shape
+        best = self.best
         self.solved += 1
-        judge = partial(self._judged, self.grays[0], targets, self.solved)
-        return Solution(gray, phase, tuple(history), expected, 1e3 * (done - begun), self.given, judge)
+        return Solution(
+            gray.reshape(shape),
+            tuple(history),
+            expected,
+            1e3 * (done - begun),
+            self.given,
+            lambda: self.on.to_host(best).reshape(shape),
+            partial(self._judged, gray, targets, self.solved),
+        )
 
     def _rounded(self, phase: Any) -> tuple[float, float, tuple[float, ...]]:
         """The loss, the PSNR (dB) and what a target of 1 gets, of the panel's levels that are nearest to a phase."""
@@ -365,35 +372,34 @@ class Solver:
             before, clock = clock, time.perf_counter()
             self.step.took(1e3 * (clock - before))
 
-    def _aim(self, targets: np.ndarray) -> Any:
-        """Point the objective at targets; returns those that the optics should show, where the solver computes."""
-        xp = self.on.xp
-        if self.approximator is None:
-            shown_by_optics = aimed_at = xp.asarray(targets)
-        else:
-            shown_by_optics = xp.asarray(predistorted(self.approximator, targets))
-            aimed_at = shown_by_optics if self.through == "predistorted" else xp.asarray(targets)
-        self.objective.aim(aimed_at)
+    def _aim(self, targets: Any) -> Any:
+        """Point the objective at targets; returns those that the optics should show."""
+        shown_by_optics = targets
+        if self.approximator is not None:
+            wanted = predistorted(self.approximator, self.on.to_host(targets))
+            shown_by_optics = self.on.xp.asarray(wanted)
+        self.objective.aim(targets if self.through == "gradient" else shown_by_optics)
         return shown_by_optics
 
-    def _is_still(self, targets: np.ndarray) -> bool:
+    def _is_still(self, targets: Any) -> bool:
         """Whether targets [C, K, H, W] are of the picture solved before, judged by some of its pixels."""
         some = (slice(None, None, COMPARED), slice(None, None, COMPARED))
-        return bool(np.array_equal(_grayscale(targets[..., *some]), self.before[some]))
+        return bool(self.on.xp.array_equal(_grayscale(targets[..., *some]), self.before[some]))
 
-    def _judged(self, patterns: np.ndarray, targets: np.ndarray, number: int) -> tuple[Quality, ...]:
+    def _judged(self, patterns: np.ndarray, targets: Any, number: int) -> tuple[Quality, ...]:
         if self.solved > number + 1:
             raise InputError(
                 "the pattern has been written again: ask for its quality before the second next solve"
             )
         grays = patterns.reshape(len(self.stacks), self.frames, *self.shape)
-        return qualities_of(self.stacks, grays, targets, self.region, self.approximator)
+        return qualities_of(self.stacks, grays, self.on.to_host(targets), self.region, self.approximator)
 
-    def _checked(self, target: np.ndarray) -> np.ndarray:
-        return checked_target(target, len(self.stacks), len(self.stacks[0]), self.shape)
+    def _checked(self, target: np.ndarray) -> Any:
+        there = self.on.xp.asarray(target)
+        return checked_target(there, len(self.stacks), len(self.stacks[0]), self.shape)
 
 
-def _grayscale(targets: np.ndarray) -> np.ndarray:
+def _grayscale(targets: Any) -> Any:
     """The picture [H, W] whose motion is looked for: the mean of its colours, one of which may be dark."""
     return targets[0, 0] if len(targets) == 1 else targets[:, 0].mean(0)
 

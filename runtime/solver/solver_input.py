@@ -6,9 +6,12 @@ import math
 from typing import Any
 
 import numpy as np
+from array_api_compat import array_namespace
 
 from firmware_iface.errors import InputError
 from runtime.lightpath.light_path import LightPath
+
+Array = Any
 
 BRIGHTEST = (1e-20, 1e20)  # of a target's brightest pixel: single precision also holds its square
 MOST_FRAMES = 32  # patterns for each colour of a picture; each takes as much memory as a colour
@@ -45,7 +48,7 @@ def stacked(paths: Any) -> list[list[LightPath]]:
     return stacks
 
 
-def checked_target(target: np.ndarray, colours: int, planes: int, shape: tuple[int, int]) -> np.ndarray:
+def checked_target(target: Array, colours: int, planes: int, shape: tuple[int, int]) -> Array:
     """A target for each colour and plane, without copying what already has that shape.
 
     Parameters
@@ -67,7 +70,6 @@ def checked_target(target: np.ndarray, colours: int, planes: int, shape: tuple[i
         For another size, for negative or non-finite values, and where a target is all dark, or too bright or too dark
         for single precision.
     """
-    target = np.asarray(target)
     if target.shape[-2:] != shape or target.ndim < 2:
         raise InputError(
             f"the target is {' x '.join(map(str, target.shape))} (height x width) and the panel "
@@ -81,11 +83,10 @@ def checked_target(target: np.ndarray, colours: int, planes: int, shape: tuple[i
             f"the target is {' x '.join(map(str, target.shape))}; for {colours} colours and {planes} planes "
             f"give {colours} x {planes} x {shape[0]} x {shape[1]}, or one picture for all"
         )
-    low, high = float(target.min()), float(target.max())
+    brightest = [float(one.max()) for one in target.reshape(-1, *shape)]
+    low, high, darkest = float(target.min()), max(brightest), min(brightest)
     if not (math.isfinite(low) and math.isfinite(high)) or low < 0:
         raise InputError("the target has negative or non-finite values: irradiance is never below zero")
-    whole = np.broadcast_to(target, (colours, planes, *shape))
-    darkest = min(float(one.max()) for one in whole.reshape(-1, *shape))
     if darkest == 0:
         raise InputError("the target is all dark: any pattern shows some light, so give it a bright pixel")
     if darkest < BRIGHTEST[0] or high > BRIGHTEST[1]:
@@ -93,7 +94,7 @@ def checked_target(target: np.ndarray, colours: int, planes: int, shape: tuple[i
             f"the target's brightest pixel is {high:g} ({darkest:g} in its darkest colour or plane): "
             f"scale it to between {BRIGHTEST[0]:g} and {BRIGHTEST[1]:g}, such as to 1"
         )
-    return whole
+    return array_namespace(target).broadcast_to(target, (colours, planes, *shape))
 
 
 def checked_region(region: np.ndarray | None, shape: tuple[int, int]) -> np.ndarray | None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
+from array_api_compat import array_namespace
 
 from runtime.lightpath import fft
 
@@ -53,7 +55,7 @@ def renewed(motion: tuple[int, int], edges: tuple[int, int], shape: tuple[int, i
     return parts
 
 
-def motion_between(before: np.ndarray, after: np.ndarray) -> tuple[int, int]:
+def motion_between(before: Array, after: Array) -> tuple[int, int]:
     """How far content has moved as a whole from one picture to the next, by phase correlation of their middle.
 
     Parameters
@@ -71,22 +73,27 @@ def motion_between(before: np.ndarray, after: np.ndarray) -> tuple[int, int]:
     """
     first = [(n - min(n, PATCH)) // 2 for n in before.shape]
     patch = tuple(slice(f, f + min(n, PATCH)) for f, n in zip(first, before.shape, strict=True))
-    window = [np.hanning(p.stop - p.start)[..., None] for p in patch]
-    edge = window[0] * window[1].T
+    shape = tuple(p.stop - p.start for p in patch)
+    xp = array_namespace(after)
+    down, across = (xp.asarray(np.hanning(n)) for n in shape)
+    edge = down[:, None] * across
     a, b = (fft.rfft2((x[patch] - x[patch].mean()) * edge) for x in (before, after))
-    cross = b * np.conj(a)
-    peak = fft.irfft2(cross / np.maximum(np.abs(cross), 1e-12 * np.abs(cross).max() + 1e-300), edge.shape)
-    place = np.unravel_index(int(np.argmax(peak)), edge.shape)
-    moved = [int(p) - n if p > n // 2 else int(p) for p, n in zip(place, edge.shape, strict=True)]
-    if any(abs(m) > n // 4 for m, n in zip(moved, edge.shape, strict=True)):
+    cross = b * xp.conj(a)
+    size = xp.abs(cross)
+    peak = fft.irfft2(cross / xp.maximum(size, 1e-12 * size.max() + 1e-300), shape)
+    place = np.unravel_index(int(xp.argmax(peak)), shape)
+    moved = [int(p) - n if p > n // 2 else int(p) for p, n in zip(place, shape, strict=True)]
+    if any(abs(m) > n // 4 for m, n in zip(moved, shape, strict=True)):
         return 0, 0
     return moved[0], moved[1]
 
 
-def is_cut(before: np.ndarray, after: np.ndarray, motion: tuple[int, int]) -> bool:
+def is_cut(before: Array, after: Array, motion: tuple[int, int]) -> bool:
     """Whether a picture [H, W] is of another scene than the one before, moved."""
     step = max(1, min(before.shape) // 64)
-    moved = np.roll(before[::step, ::step], [round(m / step) for m in motion], (0, 1))
+    moved = array_namespace(before).roll(
+        before[::step, ::step], tuple(round(m / step) for m in motion), (0, 1)
+    )
     now = after[::step, ::step]
     contrast = max(float(now.std()), float(moved.std()), 1e-12)
-    return float(np.sqrt(np.mean((now - moved) ** 2))) > CUT * contrast
+    return math.sqrt(float(((now - moved) ** 2).mean())) > CUT * contrast

@@ -9,11 +9,13 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from runtime.solver import Solver, quality, shown
+from runtime.solver.array_backend import backend
 from runtime.solver.block_motion import BLOCK, Part, block_motions, follow
 from runtime.solver.video_motion import motion_between
 from tests.runtime.benches import ideal_path
 
 SHAPE = (160, 224)
+HOST = backend("numpy")
 Motion = tuple[int, int]
 
 
@@ -45,7 +47,7 @@ def motion_map(parts: list[Part], whole: Motion) -> np.ndarray:
 @pytest.mark.parametrize(("background", "thing"), [((0, 0), (2, 5)), ((1, -3), (2, 5)), ((-2, 1), (0, 0))])
 def test_each_block_is_found_to_move_as_it_does(background: Motion, thing: Motion) -> None:
     before, after = video(background, thing, 2)
-    whole, parts = block_motions(before, after, motion_between(before, after))
+    whole, parts = block_motions(before, after, motion_between(before, after), HOST)
     assert whole == background
     found = motion_map(parts, whole)
     square = (slice(48 + BLOCK, 48 + 64 - BLOCK), slice(40 + BLOCK, 40 + 64 - BLOCK))
@@ -57,15 +59,15 @@ def test_each_block_is_found_to_move_as_it_does(background: Motion, thing: Motio
 
 def test_a_picture_that_moves_as_a_whole_has_no_parts() -> None:
     before, after = (texture(0, (400, 500))[100 - k : 260 - k, 120 - 3 * k : 344 - 3 * k] for k in (0, 1))
-    assert block_motions(before, after, (1, 3)) == ((1, 3), [])
-    assert block_motions(before, before, (0, 0)) == ((0, 0), [])
+    assert block_motions(before, after, (1, 3), HOST) == ((1, 3), [])
+    assert block_motions(before, before, (0, 0), HOST) == ((0, 0), [])
 
 
 def test_what_was_not_there_is_new() -> None:
     before = texture(0, SHAPE)
     after = before.copy()
     after[64:96, 96:144] = texture(5, (32, 48))[::-1]
-    whole, parts = block_motions(before, after, (0, 0))
+    whole, parts = block_motions(before, after, (0, 0), HOST)
     new = np.isnan(motion_map(parts, whole)[..., 0])
     assert whole == (0, 0) and new[64:96, 96:144].mean() > 0.6 and new.sum() <= 32 * 48
 

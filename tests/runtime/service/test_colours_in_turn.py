@@ -118,10 +118,11 @@ def test_light_is_in_proportion_to_a_colours_brightness(headset: Headset) -> Non
 
 
 def test_a_refinement_says_that_it_is_of_one_colour(headset: Headset) -> None:
-    client = headset.client
+    client, white = headset.client, colours(headset.client, 1.0, 1.0, 1.0)
+    show(client, white)
     client.dark()
     until(lambda: refined(client), 20)
-    show(client, colours(client, 1.0, 1.0, 1.0))
+    show(client, white)
     until(lambda: list(client.outcomes()) is not None and client.refined is not None, 20)
     assert client.refined is not None and "several are shown in turn" in client.refined.text
 
