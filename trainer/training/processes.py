@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ def launched_fabric(folder: Path | None, device: str | None = None) -> Any:
     from lightning_fabric import Fabric
     from lightning_fabric.loggers import TensorBoardLogger
 
+    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # it advises less than single precision
     local, machines = processes()
     gpu = device == "cuda" or (device is None and torch.cuda.is_available())
     fabric = Fabric(
