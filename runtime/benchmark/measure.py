@@ -77,7 +77,8 @@ def measure(
     progress(0.1, "convergence")
     curves, final, pace = _convergence(path, pictures, part_of(progress, 0.1, 0.7))
     progress(0.7, "deadlines")
-    deadline = solver.begin.usual + 5.5 * solver.step.usual + solver.finish.usual
+    paces = solver.descent.paces
+    deadline = paces.start.usual + 5.5 * paces.iteration.usual + paces.rounding.usual
     took = [solver.solve(first, deadline_ms=deadline).milliseconds for _ in range(solves)]
     progress(0.8, "video")
     video = _video(path)
@@ -166,7 +167,8 @@ def _against_ffts(solver: Solver, target: np.ndarray) -> tuple[float, float, flo
     rows = np.zeros((grid.shape[0], grid.padded[1]), np.complex64)
     columns = np.zeros((grid.padded[0], 2 * grid.band[1] + 1), np.complex64)
     solver.solve(target, 1)
-    phase, following = solver.phases[0], solver.phases[1]
+    phase = solver.descent.best
+    following = solver.descent.next_start()
 
     def whole_transforms() -> None:
         for forward in (True, False, True, False):
@@ -203,13 +205,12 @@ def _convergence(
         for target in pictures.values():
             solution = solver.solve(target, iterations)
             curve.append(np.maximum.accumulate(solution.psnr_db))
-            times.append(
-                (solution.milliseconds - solver.begin.usual - solver.finish.usual) / max(iterations, 1)
-            )
+            around = solver.descent.paces.start.usual + solver.descent.paces.rounding.usual
+            times.append((solution.milliseconds - around) / max(iterations, 1))
             ends.append(solution.quality.psnr_db)
         curves[name] = [float(v) for v in np.mean(curve, 0)]
         final[name] = round(float(np.mean(ends)), 3)
-        pace[name] = (solver.begin.usual + solver.finish.usual, statistics.median(times))
+        pace[name] = (around, statistics.median(times))
     return curves, final, pace
 
 

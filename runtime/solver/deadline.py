@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from firmware_iface.errors import InputError
 
@@ -47,6 +47,15 @@ class Pace:
 
 
 @dataclass(frozen=True)
+class Paces:
+    """How long the parts of a solve take: from the target to the first light, an iteration, rounding to gray levels."""
+
+    start: Pace = field(default_factory=Pace)
+    iteration: Pace = field(default_factory=Pace)
+    rounding: Pace = field(default_factory=Pace)
+
+
+@dataclass(frozen=True)
 class Deadline:
     """When a solve has to be done, and the rule that stops it in time.
 
@@ -54,21 +63,18 @@ class Deadline:
     ----------
     milliseconds : float or None, ms
         From the target to the gray levels; None: no deadline.
-    iteration : Pace
-        Of one iteration.
-    rounding : Pace
-        Of the rounding to gray levels, which follows the last iteration.
+    paces : Paces
+        Of its parts.
     """
 
     milliseconds: float | None
-    iteration: Pace
-    rounding: Pace
+    paces: Paces
 
     def allows_another(self, spent: float) -> bool:
         """Whether another iteration and the rounding are expected to end in time, after `spent` ms."""
         if self.milliseconds is None:
             return True
-        return spent + self.iteration.expected + self.rounding.expected <= self.milliseconds
+        return spent + self.paces.iteration.expected + self.paces.rounding.expected <= self.milliseconds
 
 
 def check_deadline(milliseconds: float | None) -> None:

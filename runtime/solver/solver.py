@@ -12,9 +12,8 @@ time never gives a worse one, up to the rounding to gray levels.
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -25,7 +24,8 @@ from runtime.lightpath.light_path import LightPath
 from runtime.networks.onnx_approximator import Approximator, predistorted
 from runtime.solver.array_backend import Backend, backend
 from runtime.solver.block_motion import Part, block_motions
-from runtime.solver.deadline import Deadline, Pace, check_deadline
+from runtime.solver.deadline import Paces, check_deadline
+from runtime.solver.descent import Descent, IterationReport
 from runtime.solver.drive_range import DriveRange
 from runtime.solver.first_phases import FirstPhases
 from runtime.solver.objective import Objective, needs_fine_grid
@@ -44,7 +44,6 @@ from runtime.solver.solver_input import (
 )
 from runtime.solver.video_motion import is_cut, motion_between
 
-IterationReport = Callable[[int, float], None]
 GRIDS = ("panel", "fine")
 WAYS = ("gradient", "predistorted")
 ITERATIONS = 20
@@ -141,16 +140,11 @@ class Solver:
             )
         xp, real = self.on.xp, self.stacks[0][0].response.dtype
         whole = self.objective.shape
-        self.phases = [xp.zeros(whole, real) for _ in range(3)]
-        self.begun_from: Any = xp.zeros(whole, real) if stages else None
+        self.descent = Descent(self.objective, self.method)
         self.grays = [xp.zeros(whole, np.uint8) for _ in range(2)]
         self.before = xp.zeros(self.shape, real)
         self.solved = 0
-        self.follows = False  # whether `best` is of the picture in `before`
-        self.best = self.phases[0]
-        self.given: tuple[float, ...] = ()  # of `best`
-        self.cold = False  # whether phases[0] is a start from the targets alone
-        self.begin, self.step, self.finish = Pace(), Pace(), Pace()
+        self.follows = False  # whether the descent's best phase is of the picture in `before`
 
     def solve(
         self,
@@ -188,16 +182,14 @@ class Solver:
             out of range.
         """
         targets, begun = self._begun(target, iterations, deadline_ms)
-        phase = self.phases[0]
         optics_targets = self._aim(targets)
-        self.cold = start is None
         if start is None:
-            self.first.cold(optics_targets, phase)
+            self.first.cold(optics_targets, self.descent.start)
         else:
-            phase[...] = self.on.xp.asarray(np.reshape(start, phase.shape))
+            self.descent.start[...] = self.on.xp.asarray(np.reshape(start, self.objective.shape))
             self.first.tilt(moves=False)
             self.first.fits = self.first.fits and self._is_still(targets)
-        return self._improve(targets, begun, iterations, deadline_ms, progress)
+        return self._improve(targets, begun, iterations, deadline_ms, start is None, progress)
 
     def frame(
         self,
@@ -227,17 +219,14 @@ class Solver:
             motion, parts = block_motions(self.before, picture, whole, self.on)
         optics_targets = self._aim(targets)
         if self.follows and motion is not None and not is_cut(self.before, picture, motion):
-            first = next(k for k, phase in enumerate(self.phases) if phase is not self.best)
-            self.phases[0], self.phases[first] = self.phases[first], self.phases[0]
-            room = next(phase for phase in self.phases[1:] if phase is not self.best)
-            self.first.warm(
-                self.best, motion, parts, optics_targets, self.phases[0], room, self._is_still(targets)
-            )
-            self.cold = False
+            room, descent = self.descent.next_start(), self.descent
+            still = self._is_still(targets)
+            self.first.warm(descent.best, motion, parts, optics_targets, descent.start, room, still)
+            cold = False
         else:
-            self.first.cold(optics_targets, self.phases[0], soon=True)
-            self.cold = True
-        return self._improve(targets, begun, iterations, deadline_ms, None)
+            self.first.cold(optics_targets, self.descent.start, soon=True)
+            cold = True
+        return self._improve(targets, begun, iterations, deadline_ms, cold, None)
 
     def rehearse(self, target: np.ndarray | None = None) -> Solution:
         """Measure how long the start, an iteration and the rounding take here, on a white picture or another.
@@ -245,15 +234,14 @@ class Solver:
         What `frame` goes on from stays as it is.
         """
         targets = self._checked(np.ones(self.shape) if target is None else target)
-        before, best, follows = self.before.copy(), self.best.copy(), self.follows
+        before, best, follows = self.before.copy(), self.descent.best.copy(), self.follows
         least, moves = list(self.objective.least), self.first.moves
         for _ in range(2):  # the first touches memory for the first time and is not counted
-            self.begin, self.step, self.finish = Pace(), Pace(), Pace()
+            self.descent.paces = Paces()
             begun = time.perf_counter()
-            self.first.cold(self._aim(targets), self.phases[0])
-            self.cold = True
-            solution = self._improve(targets, begun, 3, None, None)
-        self.before, self.best[...], self.follows = before, best, follows
+            self.first.cold(self._aim(targets), self.descent.start)
+            solution = self._improve(targets, begun, 3, None, True, None)
+        self.before, self.descent.best[...], self.follows = before, best, follows
         self.objective.least = least
         self.first.tilt(moves)
         self.first.fits = False
@@ -266,7 +254,7 @@ class Solver:
         targets = self._checked(target)
         check_iterations(iterations)
         check_deadline(deadline_ms)
-        if deadline_ms is not None and not self.step.known:
+        if deadline_ms is not None and not self.descent.paces.iteration.known:
             self.rehearse(targets)
         return targets, time.perf_counter()
 
@@ -276,101 +264,36 @@ class Solver:
         begun: float,
         iterations: int | None,
         deadline_ms: float | None,
+        cold: bool,
         progress: IterationReport | None,
     ) -> Solution:
-        """Steps from phases[0] until the iterations or the time are used up; the solution from the best phase met."""
+        """Steps from the descent's start until the iterations or the time are used up; of the best phase met."""
         self.before[...] = _grayscale(targets)
         self.follows = True
         if iterations is None:
             iterations = ITERATIONS if deadline_ms is None else _ENDLESS
-        history: list[float] = []
-        rounding = self.objective.rounding
-        stages: tuple[float, ...] = (0.0,)
-        at_first = (math.inf, -math.inf, self.given)
-        if rounding is not None:
-            at_first = self._rounded(self.phases[0])
-            self.begun_from[...] = self.phases[0]
-            stages = rounding.stages if iterations else rounding.stages[-1:]
-        for stage, sharpness in enumerate(stages, 1):
-            if rounding is not None:
-                rounding.sharpness = sharpness
-            part = None if deadline_ms is None else deadline_ms * stage / len(stages)
-            self._descend(begun, iterations * stage // len(stages), part, history, progress)
+        descent = self.descent
+        history = descent.run(begun, iterations, deadline_ms, cold, progress)
         clock = time.perf_counter()
-        expected = max(history)
-        if rounding is not None:
-            loss, expected, self.given = self._rounded(self.best)
-            # a descent that is cut short, or goes on for long, can end below its start
-            if loss > at_first[0]:
-                self.best[...] = self.begun_from
-                _, expected, self.given = at_first
+        settled = descent.settle()
+        best = descent.best
         self.grays.reverse()
-        for drive, phase, gray in zip(self.drives, self.best, self.grays[0], strict=True):
+        for drive, phase, gray in zip(self.drives, best, self.grays[0], strict=True):
             drive.gray(phase, gray)
         gray = self.on.to_host(self.grays[0])
         done = time.perf_counter()
-        self.finish.took(1e3 * (done - clock))
+        descent.paces.rounding.took(1e3 * (done - clock))
         shape = *(n for n in (len(self.stacks), self.frames) if n > 1), *self.shape
-        best = self.best
         self.solved += 1
         return Solution(
             gray.reshape(shape),
             tuple(history),
-            expected,
+            max(history) if settled is None else settled,
             1e3 * (done - begun),
-            self.given,
+            descent.given,
             lambda: self.on.to_host(best).reshape(shape),
             partial(self._judged, gray, targets, self.solved),
         )
-
-    def _rounded(self, phase: Any) -> tuple[float, float, tuple[float, ...]]:
-        """The loss, the PSNR (dB) and what a target of 1 gets, of the panel's levels that are nearest to a phase."""
-        assert self.objective.rounding is not None
-        self.objective.rounding.sharpness = math.inf
-        return self.objective.look(phase), self.objective.psnr_db, self.objective.given
-
-    def _descend(
-        self,
-        begun: float,
-        iterations: int,
-        deadline_ms: float | None,
-        history: list[float],
-        progress: IterationReport | None,
-    ) -> None:
-        """Steps until `history` (PSNR, dB, at the start and after each) has that many, or the time is used up.
-
-        From phases[0], or from the best phase of the stage before.
-        """
-        deadline = Deadline(deadline_ms, self.step, self.finish)
-        now = self.best = self.best if history else self.phases[0]
-        if self.method is not None:
-            self.method.begin()
-        lowest = self.objective.look(now)
-        self.given = self.objective.given
-        clock = time.perf_counter()
-        if not history:
-            if self.cold:
-                self.objective.keep_light()
-            history.append(self.objective.psnr_db)
-            self.begin.took(1e3 * (clock - begun))
-        while True:
-            if progress:
-                progress(len(history) - 1, max(history))
-            if len(history) > iterations or self.method is None:
-                break
-            if not deadline.allows_another(1e3 * (clock - begun)):
-                if len(history) == 1:
-                    self.step.skipped()
-                break
-            following = next(p for p in self.phases if p is not now and p is not self.best)
-            self.method.step(now, following)
-            now = following
-            loss = self.objective.look(now)
-            history.append(self.objective.psnr_db)
-            if loss < lowest:
-                lowest, self.best, self.given = loss, now, self.objective.given
-            before, clock = clock, time.perf_counter()
-            self.step.took(1e3 * (clock - before))
 
     def _aim(self, targets: Any) -> Any:
         """Point the objective at targets; returns those that the optics should show."""

@@ -12,7 +12,7 @@ import pytest
 from firmware_iface.errors import InputError
 from runtime.lightpath.light_path import LightPath
 from runtime.solver import METHODS, Solver, beside_zero_order, quality, quality_of, solve
-from runtime.solver.deadline import Deadline, Pace
+from runtime.solver.deadline import Deadline, Pace, Paces
 from tests.runtime.benches import ideal_path, padded_irradiance, scene
 
 SHAPE, DISTANCE = (96, 128), 0.015
@@ -37,7 +37,8 @@ class Clock:
 def clocked(solver: Solver, monkeypatch: pytest.MonkeyPatch, step_ms: list[float]) -> Clock:
     """A solver whose steps take the given times, one after the other and again, and whose looks take 5 ms."""
     clock, made = Clock(), []
-    monkeypatch.setattr("runtime.solver.solver.time", clock)
+    for module in ("solver", "descent"):
+        monkeypatch.setattr(f"runtime.solver.{module}.time", clock)
     assert solver.method is not None
     look, step = solver.objective.look, solver.method.step
 
@@ -113,7 +114,7 @@ def test_a_slow_iteration_is_planned_for() -> None:
 def test_one_slow_iteration_does_not_keep_later_solves_from_iterating(half: LightPath) -> None:
     solver, target = Solver(half), scene(SHAPE)
     solver.rehearse(target)
-    solver.step.took(10_000.0)  # as where another program took the core away
+    solver.descent.paces.iteration.took(10_000.0)  # as where another program took the core away
     assert solver.solve(target, deadline_ms=500).iterations == 0, "it is planned for at first"
     assert solver.solve(target, deadline_ms=500).iterations > 0
 
@@ -132,10 +133,10 @@ def test_another_iteration_fits_only_before_the_deadline() -> None:
     iteration, rounding = Pace(), Pace()
     iteration.took(10.0)
     rounding.took(4.0)
-    deadline = Deadline(50.0, iteration, rounding)
+    deadline = Deadline(50.0, Paces(iteration=iteration, rounding=rounding))
     assert deadline.allows_another(50 - 1.05 * 14 - 0.01)
     assert not deadline.allows_another(50 - 1.05 * 14 + 0.01)
-    assert Deadline(None, iteration, rounding).allows_another(1e9)
+    assert Deadline(None, Paces()).allows_another(1e9)
 
 
 def test_iterations_and_deadline_whichever_is_first(half: LightPath) -> None:
