@@ -42,11 +42,12 @@ class ProgressLines:
             clock,
         )
         self._begin = self._last = clock()
-        self._what = ""
+        self._doing = self._what = ""  # what is done, and what the last line said of it
 
     def __call__(self, done: float, what: str = "") -> None:
         """Say how far the work is, if it is time to."""
-        now = self._clock()
+        now, what = self._clock(), what or self._doing
+        self._doing = what
         changed = (
             self._each_step and what != self._what and (not self._what or now - self._last >= EVERY_STEP_S)
         )

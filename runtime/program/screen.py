@@ -152,7 +152,7 @@ class Screen:
 
             def progress(done: float, what: str = "") -> None:
                 logged(done, what)
-                bars.update(task, completed=min(max(done, 0.0), 1.0), description=what or title)
+                bars.update(task, completed=min(max(done, 0.0), 1.0), description=what or None)
 
             yield progress
 

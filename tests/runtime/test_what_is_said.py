@@ -52,6 +52,22 @@ def test_lines_come_now_and_then_and_short_work_says_nothing() -> None:
     assert lines == ["25 % step 10 (10 s)", "50 % step 20 (20 s)", "75 % step 30 (30 s)"]
 
 
+def test_work_that_does_not_say_what_it_does_still_does_the_same() -> None:
+    now = 0.0
+    lines: list[str] = []
+    progress = ProgressLines("working", lines.append, every_s=10, each_step=True, clock=lambda: now)
+    for at, done, what in (
+        (10, 0.2, ""),
+        (12, 0.3, "step"),
+        (14, 0.4, ""),
+        (24, 0.5, ""),
+        (26, 0.6, "other"),
+    ):
+        now = at
+        progress(done, what)
+    assert lines == ["20 % working (10 s)", "30 % step (12 s)", "50 % step (24 s)", "60 % other (26 s)"]
+
+
 def test_verbose_says_every_step_and_quiet_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     assert program().main(["work"]) == 0
     assert capsys.readouterr().err == "a warning\n"

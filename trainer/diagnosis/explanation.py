@@ -171,7 +171,7 @@ def explain(
         roles = capture_roles(captures)
         rest = learn_rest(roles, found.model, found.diagnosis, pool, part_of(report, 0.8, 1.0))
         found = replace(found, model=rest.model, learned=rest)
-    report(1.0, "done")
+    report(1.0)
     return found
 
 
@@ -236,7 +236,10 @@ def _one_way(
         """
         while True:
             screened = screen_candidates(roles, model, known, pool, report)
-            better = None if expects_the_rest(screened) else exchanged(roles, model, errors, rivals, pool)
+            if expects_the_rest(screened):
+                return model, errors, screened
+            report(1.0, "looking whether another effect should stand in the place of one")
+            better = exchanged(roles, model, errors, rivals, pool)
             if better is None:
                 return model, errors, screened
             old, new, model, errors = better
@@ -293,6 +296,7 @@ def _one_way(
         model = recorded(candidate, best.effect.name, errors)
         took(model, ExplanationStep(best.effect.name, errors, best.indistinguishable_from))
         newest = best.effect.name
+        report_share(0.95, "looking which effects are needed no longer")
         model, errors = without_unnecessary(model, errors, [n for n in model.names if n != newest])
         rivals[newest] = {
             r.effect.name: r.model.instance(r.effect.name)
@@ -300,6 +304,8 @@ def _one_way(
             if r.worth_adding and r.effect.name != newest
         }
     kept = model.names
+    last = part_of(report, 1 - 0.6 ** (len(steps) - 1), 1.0)
+    last(0.8, "comparing effects with what could stand in their place")
     limits = (diagnoses[-1].thresholds, ideal.excess)
     alike = {
         s.added: {n: one for n, one in rivals[s.added].items() if n in s.indistinguishable_from}
@@ -320,6 +326,7 @@ def _one_way(
         took(model, ExplanationStep(new, errors, removed=old), ExplanationStep(None, errors, removed=other))
     # A last pass: of every effect but the newest it is known already that the rest cannot do without it.
     if len(model.names) > 1:
+        last(0.9, "looking which effects are needed no longer")
         model, errors = without_unnecessary(model, errors, [steps[-1].added] if steps[-1].added else [])
     while (
         common := one_in_common(roles, model, errors, diagnoses[-1].thresholds, ideal.excess, pool)
