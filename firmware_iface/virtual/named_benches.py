@@ -8,6 +8,7 @@ from firmware_iface.errors import InputError, nearest
 from firmware_iface.virtual.bench_description import (
     BenchDescription,
     ChannelDescription,
+    IrisDescription,
     SimulationDescription,
 )
 from firmware_iface.virtual.defects import CATALOGUE_KINDS, make_defect
@@ -32,6 +33,8 @@ def _benches() -> dict[str, BenchDescription]:
     in_colour = replace(demo, name="colour_demo", channels=_RGB)
     benches = [BenchDescription("ideal"), demo, replace(demo.resized(144, 192, 18.0), name="small_demo")]
     benches += [in_colour, replace(in_colour.resized(144, 192, 18.0), name="small_colour_demo")]
+    half_open = replace(in_colour, name="full_size", iris=IrisDescription(half_width=0.5))
+    benches += [half_open.resized(1080, 1920, 200.0)]
     benches += [BenchDescription(kind, defects=(make(kind),)) for kind in CATALOGUE_KINDS]
     benches += [
         BenchDescription("pair", defects=(make("phase_response"), make("pupil_aberration"))),

@@ -15,9 +15,8 @@ from runtime.solver import quality
 from trainer.captures.capture_set import read_captures
 from trainer.captures.open_bench import nominal_bench
 from trainer.commands.demo import first_free
-from trainer.cycle import demo_run
 from trainer.cycle.demo_pictures import seen_by_camera, target_of
-from trainer.cycle.demo_run import run_demo
+from trainer.cycle.demo_run import QUICK, Demonstrated, run_demo
 from trainer.report.display_section import DisplayedPicture, display_section, with_display
 
 
@@ -46,7 +45,7 @@ def test_the_display_is_at_the_end_of_the_reports_main_part() -> None:
 @pytest.mark.usefixtures("real_time")
 def test_the_quick_demo(tmp_path: Path) -> None:
     shares: list[float] = []
-    result = run_demo(tmp_path / "demo", quick=True, progress=lambda done, what: shares.append(done))
+    result = run_demo(tmp_path / "demo", QUICK, progress=lambda done, what: shares.append(done))
     assert set(result["found"]) == {"zero_order", "illumination", "phase_response"}
     assert result["verdict"] == "complete"
     display = {name: numbers["psnr_db"] for name, numbers in result["display"].items()}
@@ -108,11 +107,10 @@ def test_the_camera_sees_each_colour_alone_in_the_frame_that_it_is_shown_in(tmp_
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("real_time")
-def test_the_demo_in_colour(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_demo_in_colour(tmp_path: Path) -> None:
     spec = tmp_path / "bench.toml"
     spec.write_text(IN_COLOUR)
-    monkeypatch.setitem(demo_run.BENCHES, (True, True), str(spec))
-    result = run_demo(tmp_path / "demo", quick=True, colour=True)
+    result = run_demo(tmp_path / "demo", Demonstrated(str(spec), patterns=6))
     assert "phase_response" in result["found"] and result["verdict"] == "complete"
     assert set(result["channels"]) == {"red", "green", "blue"}
     for of in [*result["channels"].values(), result["display"]]:

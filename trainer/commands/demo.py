@@ -22,7 +22,13 @@ def options(parser: ArgumentParser) -> None:
         type=Path,
         help="where the demo's files go (default: hololoop-demo, or if that is taken hololoop-demo-2 and so on)",
     )
-    parser.add_argument("--quick", action="store_true", help="a smaller panel and fewer captures")
+    size = parser.add_mutually_exclusive_group()
+    size.add_argument("--quick", action="store_true", help="a smaller panel and fewer captures")
+    size.add_argument(
+        "--full-size",
+        action="store_true",
+        help="1080 x 1920 pixels, in three colours, for half an hour to an hour",
+    )
     parser.add_argument(
         "--colour", action="store_true", help="three colours, shown in turn, and the report in colour"
     )
@@ -37,17 +43,20 @@ def run(args: Namespace, screen: Screen) -> Result:
     Interrupted
         After Ctrl-C, with a sentence on what is in the folder.
     """
-    from trainer.cycle.demo_run import run_demo
+    from trainer.cycle import demo_run
 
+    what = demo_run.FULL_SIZE
+    if not args.full_size:
+        quick, usual = demo_run.QUICK, demo_run.USUAL
+        if args.colour:
+            quick, usual = demo_run.QUICK_COLOUR, demo_run.COLOUR
+        what = quick if args.quick else usual
     folder = args.out or first_free(Path("hololoop-demo"))
     if args.overwrite:
         emptied(folder)
     try:
         with screen.progress("demo") as progress:
-            found = run_demo(
-                folder, quick=args.quick, workers=args.workers, progress=progress, colour=args.colour
-            )
-            return dict(found)
+            return dict(demo_run.run_demo(folder, what, workers=args.workers, progress=progress))
     except KeyboardInterrupt:
         raise Interrupted(_interrupted(folder)) from None
 
@@ -94,6 +103,6 @@ COMMAND = Command(
     run=run,
     show=show,
     outputs=outputs,
-    examples=("demo --quick",),
+    examples=("demo --quick", "demo --full-size --out full-size/"),
     after="Do the same with your own captures: check captures/",
 )

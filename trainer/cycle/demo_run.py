@@ -10,6 +10,7 @@ of red, green and blue in turn, each lit by its own laser alone.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,23 +34,31 @@ from trainer.model.bundle_export import export_bundle
 from trainer.model.model import Model
 from trainer.report.display_section import DisplayedPicture, with_display
 
-BENCHES = {  # by whether it is quick, and in colour
-    (False, False): "virtual:demo",
-    (True, False): "virtual:small_demo",
-    (False, True): "virtual:colour_demo",
-    (True, True): "virtual:small_colour_demo",
-}
 PICTURES = ("astronaut", "coffee")  # not among those that are captured
 ITERATIONS, ORACLE_ITERATIONS = 100, 60
-QUICK_PATTERNS = {False: 9, True: 6}  # of each colour, by whether there are several
+
+
+@dataclass(frozen=True)
+class Demonstrated:
+    """The bench of a demo, the patterns of each colour that are captured on it, and the pictures that are shown."""
+
+    bench: str
+    patterns: int | None = None
+    pictures: tuple[str, ...] = PICTURES[:1]
+
+
+USUAL = Demonstrated("virtual:demo", pictures=PICTURES)
+QUICK = Demonstrated("virtual:small_demo", patterns=9)
+COLOUR = Demonstrated("virtual:colour_demo", pictures=PICTURES)
+QUICK_COLOUR = Demonstrated("virtual:small_colour_demo", patterns=6)
+FULL_SIZE = Demonstrated("virtual:full_size", patterns=4)
 
 
 def run_demo(
     folder: Path,
-    quick: bool = False,
+    what: Demonstrated = USUAL,
     workers: int | None = None,
     progress: Progress | None = None,
-    colour: bool = False,
 ) -> dict[str, Any]:
     """Run all steps and leave every file in `folder`.
 
@@ -57,14 +66,12 @@ def run_demo(
     ----------
     folder : path
         A new or empty one.
-    quick : bool
-        A smaller panel and fewer captures.
+    what : Demonstrated
+        One of USUAL, QUICK, COLOUR, QUICK_COLOUR and FULL_SIZE. Several colours are shown in turn.
     workers : int or None
         Processes; None: one for each core.
     progress : callable or None
         Called with the share done and what is being done.
-    colour : bool
-        A bench of three colours, which are shown in turn.
 
     Returns
     -------
@@ -87,12 +94,11 @@ def run_demo(
 
     say = progress or no_progress
     _make_empty(folder)
-    spec = BENCHES[quick, colour]
-    headset = open_headset(spec, seed=1)
+    headset = open_headset(what.bench, seed=1)
     bench = nominal_bench(headset)
     captures_folder, model_path, report_path = (folder / n for n in ("captures", "model.toml", "report.html"))
     acquire_captures(
-        headset, bench, captures_folder, patterns=QUICK_PATTERNS[colour] if quick else None,
+        headset, bench, captures_folder, patterns=what.patterns,
         progress=part_of(say, 0.0, 0.1, "capturing"),
     )  # fmt: skip
     captures = read_captures(captures_folder)
@@ -111,11 +117,10 @@ def run_demo(
     bundles = {"before": folder / "bundle-ideal", "after": folder / "bundle"}
     export_bundle(Model(captures.bench), captures, bundles["before"])
     export_bundle(found.model, captures, bundles["after"])
-    pictures = PICTURES[:1] if quick else PICTURES
     patterns = folder / "patterns"
-    solved = _patterns(headset, captures.bench, bundles, pictures, patterns, part_of(say, 0.62, 0.87))
+    solved = _patterns(headset, captures.bench, bundles, what.pictures, patterns, part_of(say, 0.62, 0.87))
     say(0.88, "showing")
-    with emulated(spec, seed=2, fields=len(bench.channels)) as devices:
+    with emulated(what.bench, seed=2, fields=len(bench.channels)) as devices:
         shown = [_show(devices, captures.bench, *each, patterns) for each in solved]
 
     say(0.94, "writing the report")
