@@ -16,7 +16,7 @@ from trainer.captures.capture_set import read_captures
 from trainer.captures.open_bench import nominal_bench
 from trainer.commands.demo import first_free
 from trainer.cycle.demo_pictures import seen_by_camera, target_of
-from trainer.cycle.demo_run import QUICK, Demonstrated, run_demo
+from trainer.cycle.demo_run import COLOUR, FULL_SIZE, QUICK, QUICK_COLOUR, USUAL, Demonstrated, run_demo
 from trainer.report.display_section import DisplayedPicture, display_section, with_display
 
 
@@ -130,8 +130,8 @@ def test_the_demo_in_colour(tmp_path: Path) -> None:
 
 
 def test_the_benches_of_the_demo_in_colour_are_those_of_one_colour_with_two_more() -> None:
-    for quick in (False, True):
-        one, three = (load_bench(demo_run.BENCHES[quick, colour]) for colour in (False, True))
+    for pair in ((USUAL, COLOUR), (QUICK, QUICK_COLOUR)):
+        one, three = (load_bench(what.bench) for what in pair)
         assert [c.name for c in three.channels] == ["red", "green", "blue"]
         assert (three.panel, three.propagation, three.defects) == (one.panel, one.propagation, one.defects)
         assert one.channels[0] == three.channel(one.channels[0].name)
@@ -143,3 +143,9 @@ def test_a_demo_after_a_demo_gets_a_folder_of_its_own(tmp_path: Path) -> None:
         folder = first_free(wanted)
         assert folder == tmp_path / name
         folder.mkdir()
+
+
+def test_the_bench_of_full_size_has_the_same_faults_and_a_headsets_pixels() -> None:
+    full, colour = load_bench(FULL_SIZE.bench), load_bench(COLOUR.bench)
+    assert (full.defects, full.channels) == (colour.defects, colour.channels)
+    assert (full.panel.height, full.panel.width) == (full.camera.height, full.camera.width) == (1080, 1920)
