@@ -37,8 +37,13 @@ def part_of(progress: Progress, begin: float, end: float, name: str = "") -> Pro
         What the part is; stands before what it says itself.
     """
 
+    begun = False
+
     def part(done: float, what: str = "") -> None:
-        said = f"{name}: {what}" if name and what else what or name
+        nonlocal begun
+        named = f"{name}: {what}" if name and what else what or name
+        said = "" if begun and not what else named
+        begun = True
         progress(begin + (end - begin) * done, said)
 
     return part

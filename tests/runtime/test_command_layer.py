@@ -333,7 +333,12 @@ def test_a_part_of_the_work_says_its_share_of_the_whole() -> None:
     part = part_of(lambda done, what="": said.append((done, what)), 0.6, 1.0, "the rest")
     part(0)
     part(0.5, "half of it")
-    assert said == [(pytest.approx(0.6), "the rest"), (pytest.approx(0.8), "the rest: half of it")]
+    part(1)
+    assert said == [
+        (pytest.approx(0.6), "the rest"),
+        (pytest.approx(0.8), "the rest: half of it"),
+        (pytest.approx(1.0), ""),
+    ]
 
 
 def test_progress_does_not_go_back_where_work_begins_again() -> None:
