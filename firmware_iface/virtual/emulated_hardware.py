@@ -27,6 +27,7 @@ from firmware_iface.virtual.usb.panel_board import EVERY_OUTPUT, BoardModel, Lit
 from firmware_iface.virtual.virtual_devices import LitField
 
 TICK_S = 0.001
+PIXELS_PER_S = 1e7  # that the camera takes and sends: more would leave the boards no time to answer
 REMEMBERED = 20000  # changes of light
 
 
@@ -181,11 +182,12 @@ class EmulatedHardware:
 
     def attach_oak(self, address: str) -> None:
         """Emulate an OAK camera in front of the bench, at a loopback address; its faults are the camera's."""
+        height, width = self.bench.camera.height, self.bench.camera.width
         self.oak = OakModel(
             expose_bench(self.exposed, self.bench.camera),
-            (self.bench.camera.height, self.bench.camera.width),
+            (height, width),
             address,
-            frames_per_s=120.0,
+            frames_per_s=min(120.0, PIXELS_PER_S / (height * width)),
             faults=self.faults["camera"],
         )
 

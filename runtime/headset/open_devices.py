@@ -17,6 +17,7 @@ from runtime.headset.followed_camera import FollowedCamera
 
 FULL = 1.0  # power where none is given: the most that the safety controller allows
 FRAMES_HZ = 60.0  # of an emulated panel
+PICTURES_HZ = 4.0  # of an emulated camera, which so may expose for 15 frames
 SIMULATED_S = 60.0  # a simulated picture, which no camera waits for, may take as long as its optics compute
 
 
@@ -165,7 +166,9 @@ def emulated(bench: str, seed: int = 0, fields: int = 1) -> Iterator[Devices]:
         # An address of this run alone: other runs may be active.
         address = f"127.{os.getpid() >> 16 & 255}.{os.getpid() >> 8 & 255}.{os.getpid() % 254 + 1}"
         camera = (
-            {"kind": "oak", "address": address} if find_spec("depthai") else {"kind": "virtual", "bus": bus}
+            {"kind": "oak", "address": address, "frames_per_s": PICTURES_HZ}
+            if find_spec("depthai")
+            else {"kind": "virtual", "bus": bus}
         )
         with running(socket, bench, seed, address):
             lasers = {"bus": bus, "power": dict.fromkeys(colours, FULL)}

@@ -199,7 +199,7 @@ def test_explain_goes_on_where_ctrl_c_stopped_it(
 def test_a_demo_that_is_interrupted_says_what_is_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def stop(folder: Path, **_: Any) -> None:
+    def stop(folder: Path, *_: Any, **__: Any) -> None:
         (folder / "captures").mkdir(parents=True)
         (folder / "model.toml").write_text("")
         raise KeyboardInterrupt

@@ -103,6 +103,6 @@ COMMAND = Command(
     run=run,
     show=show,
     outputs=outputs,
-    examples=("demo --quick", "demo --full-size --out full-size/"),
+    examples=("demo --quick",),
     after="Do the same with your own captures: check captures/",
 )

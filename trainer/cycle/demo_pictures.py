@@ -19,6 +19,7 @@ from trainer.training.photographs import photograph
 
 SHOTS = 4  # pictures of the camera that are averaged
 SATURATED = 0.001  # share of pixels
+AIM = 0.85  # share of the camera's range that these pixels are to reach
 
 
 @dataclass(frozen=True)
@@ -61,10 +62,11 @@ def seen_by_camera(
 
 
 def _in_one_colour(devices: Devices, bench: Bench, gray: np.ndarray, target: np.ndarray) -> CameraPicture:
-    """At an exposure that does not saturate."""
+    """At the longest exposure that does not saturate."""
     camera = devices.camera
     devices.panel.show(gray[0])
     devices.light(bench.channels[0].name)
+    camera.exposure_ms = min(camera.exposure_ms * _headroom(devices, bench), camera.longest_exposure_ms)
     while _saturated(devices):
         camera.exposure_ms = camera.exposure_ms * 0.7
     light = _mean_light(devices, bench) / camera.exposure_ms
@@ -77,13 +79,14 @@ def _in_turn(
 ) -> CameraPicture:
     """All colours in turn, and then each of them alone in the same frame, since the camera sees their sum.
 
-    The exposure is of one frame. Each colour has light for as long as its target needs: the darker that is, the more a
-    pattern gives it. Where the sum saturates, all have less time.
+    Exposures are of as many whole frames as do not saturate. Each colour has light for as long as its target needs: the
+    darker that is, the more a pattern gives it. Where one frame saturates with all colours, all have less time.
     """
     channels = [c.name for c in bench.channels]
     lasers = [devices.lasers.channels.index(channel) for channel in channels]
     camera, field_us = devices.camera, devices.panel.field_us
-    camera.exposure_ms = min(1e-3 * field_us * len(channels), camera.longest_exposure_ms)
+    frame_ms = min(1e-3 * field_us * len(channels), camera.longest_exposure_ms)
+    camera.exposure_ms = frame_ms
     times = given.min() / given
 
     def show(times: np.ndarray) -> None:
@@ -96,8 +99,11 @@ def _in_turn(
         show(times)
     light = []
     for alone in np.diag(times):
+        camera.exposure_ms = frame_ms
         show(alone)
-        light.append(_mean_light(devices, bench))
+        frames = max(1, int(min(_headroom(devices, bench), camera.longest_exposure_ms / frame_ms)))
+        camera.exposure_ms = frames * frame_ms
+        light.append(_mean_light(devices, bench) / frames)
     show(times)  # every gate is open when the lasers go off, so that their photodiodes see that they are dark
     devices.lasers.off()
     qualities = {c: quality(seen, t) for c, seen, t in zip(channels, light, target, strict=True)}
@@ -110,11 +116,25 @@ def _saturated(devices: Devices) -> bool:
     return bool((camera.capture() >= 2**camera.bit_depth - 1).mean() > SATURATED)
 
 
+def _headroom(devices: Devices, bench: Bench) -> float:
+    """How many times the exposure could be what it is, until all but the brightest pixels are near the top."""
+    camera, black = devices.camera, _black(devices, bench)
+    pixels = np.cumsum(np.bincount(camera.capture().ravel()))
+    bright = float(np.searchsorted(pixels, (1 - SATURATED) * pixels[-1])) - black
+    return AIM * (2**camera.bit_depth - 1 - black) / max(bright, 1.0)
+
+
 def _mean_light(devices: Devices, bench: Bench) -> np.ndarray:
     """Counts above black of the picture that is lit, mean of several shots, float [h, w]."""
-    camera = devices.camera
-    black = bench.camera.black_level * 2.0 ** (camera.bit_depth - bench.camera.bit_depth)
-    return np.mean([camera.capture().astype(np.float64) - black for _ in range(SHOTS)], axis=0)
+    total = devices.camera.capture().astype(np.float64)
+    for _ in range(SHOTS - 1):
+        total += devices.camera.capture()
+    return total / SHOTS - _black(devices, bench)
+
+
+def _black(devices: Devices, bench: Bench) -> float:
+    """The camera's counts without light."""
+    return float(bench.camera.black_level * 2.0 ** (devices.camera.bit_depth - bench.camera.bit_depth))
 
 
 def write_picture(path: Path, light: np.ndarray) -> None:

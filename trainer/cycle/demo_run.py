@@ -16,18 +16,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from firmware_iface.errors import InputError
+from firmware_iface.errors import DeviceError, InputError
 from firmware_iface.virtual import VirtualHeadset, open_headset
 from runtime.bundle.bundle_folder import read_bundle
 from runtime.bundle.light_path_arrays import load_light_path
 from runtime.bundle.whole_files import whole_file
-from runtime.headset.open_devices import Devices, emulated
+from runtime.headset.open_devices import emulated
 from runtime.program.progress import Progress, no_progress, part_of
 from runtime.solver import Quality, quality, solve
 from runtime.solver.pattern_files import write_pattern
 from trainer.captures.bench_file import Bench
 from trainer.captures.open_bench import nominal_bench
-from trainer.cycle.demo_pictures import seen_by_camera, target_of, write_picture
+from trainer.cycle.demo_pictures import CameraPicture, seen_by_camera, target_of, write_picture
 from trainer.effects.effect_catalogue import catalogue
 from trainer.formatting import listed
 from trainer.model.bundle_export import export_bundle
@@ -36,6 +36,7 @@ from trainer.report.display_section import DisplayedPicture, with_display
 
 PICTURES = ("astronaut", "coffee")  # not among those that are captured
 ITERATIONS, ORACLE_ITERATIONS = 100, 60
+TRIES = 5  # to show a pattern
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,8 @@ def run_demo(
     ------
     InputError
         Where the folder is not empty or cannot be made.
+    DeviceError
+        Where the machine is too busy for the emulated hardware, time after time.
     """
     from trainer.captures.acquire import acquire_captures
     from trainer.captures.capture_set import read_captures
@@ -120,8 +123,7 @@ def run_demo(
     patterns = folder / "patterns"
     solved = _patterns(headset, captures.bench, bundles, what.pictures, patterns, part_of(say, 0.62, 0.87))
     say(0.88, "showing")
-    with emulated(what.bench, seed=2, fields=len(bench.channels)) as devices:
-        shown = [_show(devices, captures.bench, *each, patterns) for each in solved]
+    shown = _shown(what.bench, captures.bench, solved, patterns)
 
     say(0.94, "writing the report")
     display = {name: _mean([p.qualities[name] for p in shown]) for name in ("before", "after", "oracle")}
@@ -226,22 +228,42 @@ def _solved(
     return solved
 
 
-def _show(
-    devices: Devices, bench: Bench, name: str, target: np.ndarray, solved: dict[str, Solved], folder: Path
-) -> DisplayedPicture:
-    """A picture with each of its patterns, as the camera measures it."""
-    camera = {
-        which: seen_by_camera(devices, bench, one.gray, one.given, target) for which, one in solved.items()
-    }
-    for which, one in camera.items():
-        write_picture(folder / f"{name}-{which}-seen.png", one.light)
-    return DisplayedPicture(
-        name,
-        target,
-        {which: one.light for which, one in camera.items()},
-        {which: one.quality for which, one in camera.items()},
-        {which: one.by_channel for which, one in camera.items() if one.by_channel},
-    )
+def _shown(
+    spec: str, bench: Bench, solved: Sequence[tuple[str, np.ndarray, dict[str, Solved]]], folder: Path
+) -> list[DisplayedPicture]:
+    """Each picture with each of its patterns, as the camera of the emulated hardware measures it.
+
+    The lasers go dark where their heartbeat is late. A machine that does other work, or a large panel's optics, can
+    bring that about; the hardware is then opened again, and what was seen by then stays.
+    """
+    seen: list[dict[str, CameraPicture]] = [{} for _ in solved]
+    failed = 0
+    while any(len(here) < len(patterns) for here, (_, _, patterns) in zip(seen, solved, strict=True)):
+        try:
+            with emulated(spec, seed=2, fields=len(bench.channels)) as devices:
+                for here, (_, target, patterns) in zip(seen, solved, strict=True):
+                    for which, one in patterns.items():
+                        if which not in here:
+                            here[which] = seen_by_camera(devices, bench, one.gray, one.given, target)
+                            failed = 0
+        except DeviceError:
+            failed += 1
+            if failed == TRIES:
+                raise
+    found = []
+    for here, (name, target, _) in zip(seen, solved, strict=True):
+        for which, picture in here.items():
+            write_picture(folder / f"{name}-{which}-seen.png", picture.light)
+        found.append(
+            DisplayedPicture(
+                name,
+                target,
+                {which: picture.light for which, picture in here.items()},
+                {which: picture.quality for which, picture in here.items()},
+                {which: picture.by_channel for which, picture in here.items() if picture.by_channel},
+            )
+        )
+    return found
 
 
 def _oracle(

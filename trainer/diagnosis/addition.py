@@ -90,7 +90,7 @@ def add(
     limits = Thresholds()
     added, after = gone_on(roles, added, effect.name, after, limits) or (added, after)
     added = recorded(added, effect.name, after)
-    report(1.0)
+    report(1.0, "")
     return Addition(effect.name, added, before, after, roles.is_held_out)
 
 

@@ -261,7 +261,7 @@ def diagnose(
     table += _exposures(roles, model, (*model.names, *drifts))
     same = equal_facts(ranking[0].model if verdict == "missing" else model, captures)
     suggestions = same.deciding_captures + suggest(roles, verdict, ranking)
-    report(1.0)
+    report(1.0, "")
     return Diagnosis(
         model,
         before,

@@ -171,7 +171,7 @@ def explain(
         roles = capture_roles(captures)
         rest = learn_rest(roles, found.model, found.diagnosis, pool, part_of(report, 0.8, 1.0))
         found = replace(found, model=rest.model, learned=rest)
-    report(1.0)
+    report(1.0, "")
     return found
 
 

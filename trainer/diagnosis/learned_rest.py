@@ -84,7 +84,7 @@ def learn_rest(
             model, errors = recorded(trial, f"learned_{stage}", after), after
             steps.append((stage, after))
             probes = ()
-    report(1.0)
+    report(1.0, "")
     at_floor = limits.complete(errors.excess, ideal)
     return LearnedRest(model, tuple(steps), at_floor, _sentence(roles, model, steps, errors, at_floor))
 
