@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import io
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +41,20 @@ def test_the_display_is_at_the_end_of_the_reports_main_part() -> None:
     assert html.count("data:image/png;base64,") == 2
     assert "dB, nrmse" in html
     assert with_display("no main", shown, "") == "no main" + display_section(shown, "")
+
+
+def test_a_large_picture_is_shown_by_means_of_blocks() -> None:
+    target = np.full((3, 600, 2000), 0.25)
+    target[:, ::2] = 0.75
+    light = {"after": target}
+    shown = [DisplayedPicture("stripes", target, light, {"after": quality(target, target)})]
+    html = display_section(shown, "")
+    assert (
+        html.count("each point is the mean of 3 × 3 pixels") == 4
+    )  # of two pictures, in words and in their captions
+    encoded = html.partition("data:image/png;base64,")[2].partition('"')[0]
+    with Image.open(io.BytesIO(base64.b64decode(encoded))) as picture:
+        assert picture.size == (666, 200)
 
 
 @pytest.mark.slow

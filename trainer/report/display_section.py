@@ -11,8 +11,10 @@ from PIL import Image
 
 from runtime.solver import Quality
 from runtime.solver.targets import encode_srgb
+from trainer.captures.block_means import blocks
 from trainer.report.png_uri import png_uri
 
+LARGEST = 960  # pixels: side above which a picture shows means of blocks, as pages hold it
 TITLES = {
     "before": "Pattern for the ideal model",
     "after": "Pattern for the explained model",
@@ -90,6 +92,10 @@ def _row(one: DisplayedPicture) -> str:
 
 def _figure(title: str, light: np.ndarray, target: np.ndarray, note: str) -> str:
     white = max(float(np.percentile(target, 99.8)), 1e-12)
+    factor = -(-max(light.shape[-2:]) // LARGEST)
+    if factor > 1:
+        light = np.stack([blocks(one, factor) for one in light.reshape(-1, *light.shape[-2:])])
+        note = "; ".join(filter(None, (note, f"each point is the mean of {factor} × {factor} pixels")))
     picture = srgb_picture(light / white)
     words = escape(f"{title}: {note}" if note else title)
     return (
