@@ -12,13 +12,22 @@ from PIL import Image
 
 from firmware_iface.errors import InputError
 from firmware_iface.virtual import load_bench, open_headset
-from runtime.headset.open_devices import emulated
 from runtime.solver import quality
 from trainer.captures.capture_set import read_captures
 from trainer.captures.open_bench import nominal_bench
 from trainer.commands.demo import first_free
-from trainer.cycle.demo_pictures import seen_by_camera, target_of
-from trainer.cycle.demo_run import COLOUR, FULL_SIZE, QUICK, QUICK_COLOUR, USUAL, Demonstrated, run_demo
+from trainer.cycle.demo_pictures import target_of
+from trainer.cycle.demo_run import (
+    COLOUR,
+    FULL_SIZE,
+    QUICK,
+    QUICK_COLOUR,
+    USUAL,
+    Demonstrated,
+    Solved,
+    on_hardware,
+    run_demo,
+)
 from trainer.report.display_section import DisplayedPicture, display_section, with_display
 
 
@@ -108,17 +117,16 @@ def test_the_camera_sees_each_colour_alone_in_the_frame_that_it_is_shown_in(tmp_
     channels = [c.name for c in bench.channels]
     target = target_of("astronaut", channels, bench.panel.shape)
     gray = np.random.default_rng(0).integers(0, 256, target.shape, dtype=np.uint8)
-    with emulated(spec, seed=2, fields=3) as devices:
-        given = np.array([1.0, 2.5, 1.6])
-        seen = seen_by_camera(devices, bench, gray, given, target)
+    given = np.array([1.0, 2.5, 1.6])
+    (seen,) = on_hardware(spec, bench, [("noise", target, {"after": Solved(gray, given)})], tmp_path)
     black = bench.camera.black_level
     expected = np.stack([truth.expected_counts(g, c) - black for g, c in zip(gray, channels, strict=True)])
     expected = expected / given[:, None, None]
-    scale = np.vdot(expected, seen.light) / np.vdot(expected, expected)
-    for light, wanted in zip(seen.light, scale * expected, strict=True):
+    scale = np.vdot(expected, seen.lights["after"]) / np.vdot(expected, expected)
+    for light, wanted in zip(seen.lights["after"], scale * expected, strict=True):
         assert light.mean() == pytest.approx(wanted.mean(), rel=0.02)
         assert np.corrcoef(light.ravel(), wanted.ravel())[0, 1] > 0.98
-    assert set(seen.by_channel) == set(channels)
+    assert set(seen.channels["after"]) == set(channels)
 
 
 @pytest.mark.slow

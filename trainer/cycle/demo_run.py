@@ -123,7 +123,7 @@ def run_demo(
     patterns = folder / "patterns"
     solved = _patterns(headset, captures.bench, bundles, what.pictures, patterns, part_of(say, 0.62, 0.87))
     say(0.88, "showing")
-    shown = _shown(what.bench, captures.bench, solved, patterns)
+    shown = on_hardware(what.bench, captures.bench, solved, patterns)
 
     say(0.94, "writing the report")
     display = {name: _mean([p.qualities[name] for p in shown]) for name in ("before", "after", "oracle")}
@@ -228,13 +228,27 @@ def _solved(
     return solved
 
 
-def _shown(
+def on_hardware(
     spec: str, bench: Bench, solved: Sequence[tuple[str, np.ndarray, dict[str, Solved]]], folder: Path
 ) -> list[DisplayedPicture]:
-    """Each picture with each of its patterns, as the camera of the emulated hardware measures it.
+    """Pictures with each of their patterns, as the camera of emulated hardware measures them.
 
     The lasers go dark where their heartbeat is late. A machine that does other work, or a large panel's optics, can
     bring that about; the hardware is then opened again, and what was seen by then stays.
+
+    Parameters
+    ----------
+    spec : str
+        The simulated bench, as `emulated` takes it.
+    solved : sequence of (str, array [C, H, W], dict of str to Solved)
+        Name, target and patterns of every picture.
+    folder : path
+        Where the camera's pictures are written: NAME-PATTERN-seen.png.
+
+    Raises
+    ------
+    DeviceError
+        Where the same pattern fails `TRIES` times.
     """
     seen: list[dict[str, CameraPicture]] = [{} for _ in solved]
     failed = 0
