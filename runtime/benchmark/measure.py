@@ -167,8 +167,7 @@ def _against_ffts(solver: Solver, target: np.ndarray) -> tuple[float, float, flo
     rows = np.zeros((grid.shape[0], grid.padded[1]), np.complex64)
     columns = np.zeros((grid.padded[0], 2 * grid.band[1] + 1), np.complex64)
     solver.solve(target, 1)
-    phase = solver.descent.best
-    following = solver.descent.next_start()
+    phase, following = solver.descent.best, solver.descent.next_start()
 
     def whole_transforms() -> None:
         for forward in (True, False, True, False):
@@ -201,11 +200,12 @@ def _convergence(
         progress(number / len(SOLVERS), name)
         solver = Solver(path, method=method, **options)
         solver.rehearse()
+        paces = solver.descent.paces
         curve, ends, times = [], [], []
         for target in pictures.values():
             solution = solver.solve(target, iterations)
             curve.append(np.maximum.accumulate(solution.psnr_db))
-            around = solver.descent.paces.start.usual + solver.descent.paces.rounding.usual
+            around = paces.start.usual + paces.rounding.usual
             times.append((solution.milliseconds - around) / max(iterations, 1))
             ends.append(solution.quality.psnr_db)
         curves[name] = [float(v) for v in np.mean(curve, 0)]

@@ -100,9 +100,8 @@ def follow(phase: Array, found: Array, fresh: Array, part: Part, whole: tuple[in
 
 def _block_errors(before: Array, after: Array, motion: tuple[int, int], on: Backend) -> np.ndarray:
     """Mean squared difference of each block to the picture before, moved; infinite where nothing comes from there."""
-    side = (
-        BLOCK // STEP
-    )  # samples of a block's side: every STEP-th pixel from the first that the motion leaves
+    # Samples of a block's side: every STEP-th pixel from the first that the motion leaves.
+    side = BLOCK // STEP
     here, there, counts, samples = [], [], [], []
     for step, size in zip(motion, after.shape, strict=True):
         first, last = (min(max(n, 0), size) for n in (step, size + step))

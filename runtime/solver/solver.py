@@ -219,8 +219,8 @@ class Solver:
             motion, parts = block_motions(self.before, picture, whole, self.on)
         optics_targets = self._aim(targets)
         if self.follows and motion is not None and not is_cut(self.before, picture, motion):
-            room, descent = self.descent.next_start(), self.descent
-            still = self._is_still(targets)
+            descent, still = self.descent, self._is_still(targets)
+            room = descent.next_start()
             self.first.warm(descent.best, motion, parts, optics_targets, descent.start, room, still)
             cold = False
         else:

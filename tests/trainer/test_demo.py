@@ -58,9 +58,8 @@ def test_a_large_picture_is_shown_by_means_of_blocks() -> None:
     light = {"after": target}
     shown = [DisplayedPicture("stripes", target, light, {"after": quality(target, target)})]
     html = display_section(shown, "")
-    assert (
-        html.count("each point is the mean of 3 × 3 pixels") == 4
-    )  # of two pictures, in words and in their captions
+    # of two pictures, in words and in their captions
+    assert html.count("each point is the mean of 3 × 3 pixels") == 4
     encoded = html.partition("data:image/png;base64,")[2].partition('"')[0]
     with Image.open(io.BytesIO(base64.b64decode(encoded))) as picture:
         assert picture.size == (666, 200)

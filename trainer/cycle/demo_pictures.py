@@ -119,6 +119,7 @@ def _saturated(devices: Devices) -> bool:
 def _headroom(devices: Devices, bench: Bench) -> float:
     """How many times the exposure could be what it is, until all but the brightest pixels are near the top."""
     camera, black = devices.camera, _black(devices, bench)
+    # NumPy's quantile of a large picture would keep the lasers' heartbeat waiting.
     pixels = np.cumsum(np.bincount(camera.capture().ravel()))
     bright = float(np.searchsorted(pixels, (1 - SATURATED) * pixels[-1])) - black
     return AIM * (2**camera.bit_depth - 1 - black) / max(bright, 1.0)

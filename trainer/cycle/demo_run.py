@@ -250,34 +250,34 @@ def on_hardware(
     DeviceError
         Where the same pattern fails `TRIES` times.
     """
-    seen: list[dict[str, CameraPicture]] = [{} for _ in solved]
+    waiting = [(name, target, which, one) for name, target, these in solved for which, one in these.items()]
+    seen: dict[str, dict[str, CameraPicture]] = {name: {} for name, *_ in solved}
     failed = 0
-    while any(len(here) < len(patterns) for here, (_, _, patterns) in zip(seen, solved, strict=True)):
+    while waiting:
         try:
             with emulated(spec, seed=2, fields=len(bench.channels)) as devices:
-                for here, (_, target, patterns) in zip(seen, solved, strict=True):
-                    for which, one in patterns.items():
-                        if which not in here:
-                            here[which] = seen_by_camera(devices, bench, one.gray, one.given, target)
-                            failed = 0
+                while waiting:
+                    name, target, which, one = waiting[0]
+                    seen[name][which] = seen_by_camera(devices, bench, one.gray, one.given, target)
+                    del waiting[0]
+                    failed = 0
         except DeviceError:
             failed += 1
             if failed == TRIES:
                 raise
-    found = []
-    for here, (name, target, _) in zip(seen, solved, strict=True):
-        for which, picture in here.items():
+    for name, pictures in seen.items():
+        for which, picture in pictures.items():
             write_picture(folder / f"{name}-{which}-seen.png", picture.light)
-        found.append(
-            DisplayedPicture(
-                name,
-                target,
-                {which: picture.light for which, picture in here.items()},
-                {which: picture.quality for which, picture in here.items()},
-                {which: picture.by_channel for which, picture in here.items() if picture.by_channel},
-            )
+    return [
+        DisplayedPicture(
+            name,
+            target,
+            {which: picture.light for which, picture in seen[name].items()},
+            {which: picture.quality for which, picture in seen[name].items()},
+            {which: picture.by_channel for which, picture in seen[name].items() if picture.by_channel},
         )
-    return found
+        for name, target, _ in solved
+    ]
 
 
 def _oracle(
