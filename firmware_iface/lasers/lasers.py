@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from smbus2 import SMBus
 
 BEAT_S, SOONEST_BEAT_S = 0.025, 0.006
+UNKNOWN = "the safety controller gives no reason; try again"
 RAMP_S, RAMP_STEPS = 0.100, 20  # a rise of 5 ms a step is twice as slow as the safety controller's limiter
 
 
@@ -158,9 +159,9 @@ class Lasers:
             self.board.controller.command(Command.CLEAR)
             held = self.board.controller.state() is State.FAULT
             needed = Input.INTERLOCK | Input.DARK | Input.COOL | Input.QUIET
-            missing = self.board.controller.missing_text(needed) if held else ""
+            missing = "; ".join(self.board.controller.missing(needed)) if held else ""
         if held:
-            raise DeviceError(f"the fault cannot be cleared: {missing}.")
+            raise DeviceError(f"the fault cannot be cleared: {missing or UNKNOWN}.")
 
     def arm(self) -> None:
         """Second step: arm the board, dark.
@@ -181,11 +182,14 @@ class Lasers:
                 self.board.controller.command(Command.ARM_SECOND)
                 state = self.board.controller.state()
             latched = ", ".join(self.board.controller.fault_names())
-            missing = self.board.controller.missing_text(Input(0x7F))
+            # a fault ends the heartbeat, so that a missing one says nothing about the fault's cause
+            needed = Input(0x7F) & ~Input.HEARTBEAT if state is State.FAULT else Input(0x7F)
+            missing = "; ".join(self.board.controller.missing(needed))
         if state is State.FAULT:
-            raise DeviceError(f"a fault is latched ({latched}); find its cause, then clear() and arm().")
+            first = f"find its cause; {missing};" if missing else "find its cause,"
+            raise DeviceError(f"a fault is latched ({latched}); {first} then clear() and arm().")
         if state is State.OFF:
-            raise DeviceError(f"the lasers cannot be armed: {missing}.")
+            raise DeviceError(f"the lasers cannot be armed: {missing or UNKNOWN}.")
 
     def heartbeat(self, unlit: Collection[str] = ()) -> None:
         """Show that the caller is alive, at least every 50 ms; checks one photodiode each time.

@@ -95,7 +95,12 @@ def test_what_is_missing_is_said(bench: Bench) -> None:
         lasers.arm()
     bench.board.celsius = 30
     lasers.arm()
-    bench.board.interlock = False
+    lasers.trip()
+    bench.board.interlock = False  # another matter than the fault, and both are said
+    with pytest.raises(
+        DeviceError, match=r"latched \(.*host\); find its cause; close the interlock; then clear"
+    ):
+        lasers.arm()
     with pytest.raises(DeviceError, match="cannot be cleared: close the interlock"):
         lasers.clear()
 
