@@ -10,9 +10,12 @@ from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.held_out import capture_roles
 from trainer.diagnosis.candidate_fits import CandidateFit, try_again
+from trainer.diagnosis.explanation import explain
 from trainer.effects.effect_catalogue import catalogue
 from trainer.fitting.gains import with_gains
 from trainer.fitting.gauss_newton import fit
+from trainer.fitting.pool import open_pool
+from trainer.model.history import ANEW
 from trainer.model.model import Model, instance_with
 
 GAIN = 1.1
@@ -48,3 +51,17 @@ def test_what_comes_back_is_left_alone(captures: CaptureSet) -> None:
     right, again = from_gain(captures, 1.05)
     assert float(right.instance("phase_response").values["gain"][0]) == pytest.approx(GAIN, abs=0.01)
     assert again is None
+
+
+def test_an_explanation_leaves_a_wrong_place_where_no_other_effect_is_expected_to_help(
+    captures: CaptureSet,
+) -> None:
+    stuck, _ = from_gain(captures, 2.1)
+    known = {name: catalogue()[name] for name in ("phase_response", "distance", "misregistration")}
+    with open_pool(1) as pool:
+        found = explain(captures, stuck, known, pool)
+    step = found.steps[1]
+    assert (step.refined, step.form) == ("phase_response", ANEW)
+    assert found.model.history[-1]["form"] == ANEW["form"]
+    assert found.model.names == ("phase_response",) and found.diagnosis.verdict == "complete"
+    assert float(found.model.instance("phase_response").values["gain"][0]) == pytest.approx(GAIN, abs=0.01)

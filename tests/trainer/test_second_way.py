@@ -13,7 +13,7 @@ from tests.trainer.hidden import bench_text
 from trainer.captures.acquire import acquire_from
 from trainer.captures.capture_set import read_captures
 from trainer.diagnosis.explanation import explain
-from trainer.diagnosis.second_way import Fork, doubtful, fork_at, is_better
+from trainer.diagnosis.second_way import Fork, doubtful, fork_at, is_better, is_hopeless
 from trainer.effects.effect_catalogue import catalogue
 from trainer.effects.testing import small_bench
 from trainer.fitting.pool import open_pool
@@ -74,10 +74,17 @@ def test_the_first_effect_whose_rival_is_not_there_is_in_doubt() -> None:
 
 def test_another_model_has_to_be_better_and_no_longer() -> None:
     one, two = model_of("zero_order"), model_of("zero_order", "ghost")
-    assert is_better(errors(0.0004), two, errors(0.0003), one, 0.95)
-    assert not is_better(errors(0.0004), one, errors(0.0003), two, 0.95)
-    assert not is_better(errors(0.0003), one, errors(0.0003), one, 0.95)
-    assert not is_better(errors(0.0004, spread=0.01), one, errors(0.0003), one, 0.95)
+    assert is_better(two, errors(0.0004), one, errors(0.0003), 0.95)
+    assert not is_better(one, errors(0.0004), two, errors(0.0003), 0.95)
+    assert not is_better(one, errors(0.0003), one, errors(0.0003), 0.95)
+    assert not is_better(one, errors(0.0004, spread=0.01), one, errors(0.0003), 0.95)
+
+
+def test_a_way_that_needs_as_many_effects_and_leaves_more_is_hopeless() -> None:
+    one, two = model_of("zero_order"), model_of("zero_order", "ghost")
+    assert is_hopeless(two, errors(0.0005), two, errors(0.0004))
+    assert not is_hopeless(one, errors(0.0005), two, errors(0.0004)), "one more may do better"
+    assert not is_hopeless(two, errors(0.0003), two, errors(0.0004))
 
 
 def test_two_effects_that_stand_for_others_give_way(tmp_path: Path) -> None:

@@ -12,14 +12,15 @@ from runtime.program.progress import Progress, forward_only, no_progress, part_o
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import CaptureRoles, capture_roles
 from trainer.diagnosis.addition import gone_on, with_maps_again
+from trainer.diagnosis.another_start import from_another_start, nothing_expects_much
 from trainer.diagnosis.chosen_addition import chosen_addition
 from trainer.diagnosis.colours_in_common import one_in_common
 from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors, screen_candidates
-from trainer.diagnosis.exchange import exchanged, one_for_two, preferred
+from trainer.diagnosis.exchange import CLEARLY, exchanged, one_for_two, preferred
 from trainer.diagnosis.fitted_ranking import expects_the_rest
 from trainer.diagnosis.learned_rest import LearnedRest, learn_rest
 from trainer.diagnosis.screen import ScreenResult
-from trainer.diagnosis.second_way import Fork, doubtful, fork_at, is_better
+from trainer.diagnosis.second_way import Fork, doubtful, fork_at, is_better, is_hopeless
 from trainer.diagnosis.together import explain_together, is_far
 from trainer.diagnosis.unnecessary import without_one
 from trainer.diagnosis.verdict import Thresholds, below_the_noise
@@ -29,7 +30,7 @@ from trainer.fitting.further_numbers import next_order
 from trainer.fitting.gains import with_gains
 from trainer.fitting.pool import Pool
 from trainer.fitting.predictor import evaluate_captures
-from trainer.model.history import IN_COMMON, form_of, recorded
+from trainer.model.history import ANEW, IN_COMMON, form_of, recorded
 from trainer.model.model import EffectInstance, Model
 
 MOST_EFFECTS = 8  # an explanation longer than this explains nothing
@@ -50,9 +51,10 @@ class ExplanationStep:
     removed : str or None
         The effect that was taken out; with `added`, exchanged for that one.
     refined : str or None
-        The effect of an earlier step whose map or curve went on in free form, or whose colours were put together again.
+        The effect of an earlier step whose map or curve went on in free form, whose colours were put together again, or
+        that was fitted anew.
     form : mapping
-        The key `form`, where it is a curve, or the colours' values are in common again.
+        The key `form`, where it is a curve, the colours' values are in common again, or the start is another one.
     """
 
     added: str | None
@@ -66,8 +68,8 @@ class ExplanationStep:
         """A row of the key `steps` of `explain --json`.
 
         Keys `added`, `nrmse`, `excess` and `indistinguishable_from`; `removed` only where an effect was taken out,
-        `refined` only where the map or curve of an earlier one went on in free form, or its colours were put together,
-        and `form` where it is no map.
+        `refined` only where the map or curve of an earlier one went on in free form, its colours were put together, or
+        it was fitted anew, and `form` where it is no map.
         """
         record: dict[str, Any] = {
             "added": self.added,
@@ -159,9 +161,10 @@ def explain(
     if fork is not None:
         others = {name: effect for name, effect in known.items() if name != fork.added}
         again = part_of(report, 0.95, 1.0, f"without {fork.added}")
-        other, *_ = _one_way(captures, fork.before, others, pool, thresholds, None, again, is_second=True)
-        ends = [one.steps[-1].held_out for one in (found, other)]
-        if is_better(ends[0], found.model, ends[1], other.model, 1 - diagnosis.thresholds.level):
+        end = (found.model, found.steps[-1].held_out)
+        other, *_ = _one_way(captures, fork.before, others, pool, thresholds, None, again, to_beat=end)
+        level = diagnosis.thresholds.level
+        if is_better(*end, other.model, other.steps[-1].held_out, 1 - level):
             steps = (*found.steps[: fork.step], *other.steps[1:])
             diagnoses = (*found.diagnoses[: fork.diagnosis], *other.diagnoses)
             found = Explanation(steps, other.model, other.diagnosis, diagnoses)
@@ -189,9 +192,15 @@ def _one_way(
     thresholds: Thresholds | None,
     save: Callable[[Model], None] | None,
     report: Progress,
-    is_second: bool = False,
+    to_beat: tuple[Model, PredictionErrors] | None = None,
 ) -> tuple[Explanation, list[Fork], PredictionErrors]:
-    """An explanation by the best candidate at each step, where others came near, and the ideal model's errors."""
+    """An explanation by the best candidate at each step, where others came near, and the ideal model's errors.
+
+    Parameters
+    ----------
+    to_beat : (Model, PredictionErrors), optional
+        Where another way ended. This one goes on from a model with its history, and ends early where it is hopeless.
+    """
     thresholds = thresholds or Thresholds()
     roles = capture_roles(captures)
     model = with_gains(captures, model, roles.fitted)
@@ -202,6 +211,8 @@ def _one_way(
     rivals: dict[str, dict[str, EffectInstance]] = {}
     diagnoses: list[Diagnosis] = []
     forks: list[Fork] = []
+    # The last model that was asked which of its maps or curves goes on, and the answer.
+    asked: tuple[Model, tuple[str, Model, PredictionErrors] | None] | None = None
 
     def took(model: Model, *new: ExplanationStep) -> None:
         """Note the steps that led to a model, and save it."""
@@ -209,17 +220,20 @@ def _one_way(
         if save:
             save(model)
 
-    if not is_second:  # which has its history
+    if to_beat is None:
         model = recorded(model, None, errors)
     took(model, ExplanationStep(None, errors))
+
+    def limits() -> Thresholds:
+        """As the last diagnosis has them, with the floor of the noise."""
+        return diagnoses[-1].thresholds if diagnoses else thresholds
 
     def without_unnecessary(
         model: Model, errors: PredictionErrors, names: Sequence[str]
     ) -> tuple[Model, PredictionErrors]:
         """The model without those of the named effects that it does as well without, each a step."""
-        limits = diagnoses[-1].thresholds
         while True:
-            smaller = without_one(roles, model, errors, names, limits, ideal.excess, pool)
+            smaller = without_one(roles, model, errors, names, limits(), ideal.excess, pool)
             if smaller is None:
                 return model, errors
             dropped, model, errors = smaller
@@ -227,25 +241,55 @@ def _one_way(
             model = recorded(model, None, errors, dropped)
             took(model, ExplanationStep(None, errors, removed=dropped))
 
-    def with_exchanges(
+    def in_free_form(
         model: Model, errors: PredictionErrors, report: Progress
-    ) -> tuple[Model, PredictionErrors, list[ScreenResult]]:
-        """The model with effects exchanged for their rivals, each a step, and the screen of what it lacks.
+    ) -> tuple[str, Model, PredictionErrors] | None:
+        """The effect whose map or curve goes on in free form, and the model with it; it is asked once of a model."""
+        nonlocal asked
+        if asked is None or asked[0] is not model:
+            report(1.0, "looking whether maps and curves go on")
+            asked = model, _any_gone_on(roles, model, errors, limits())
+        return asked[1]
+
+    def took_on(name: str, model: Model, errors: PredictionErrors) -> tuple[Model, PredictionErrors]:
+        """Note that a map or curve went on."""
+        model = recorded(model, None, errors, refined=name)
+        took(model, ExplanationStep(None, errors, refined=name, form=form_of(model, name)))
+        return model, errors
+
+    def looked_at_again(
+        model: Model, errors: PredictionErrors, report: Progress
+    ) -> tuple[Model, PredictionErrors, list[ScreenResult] | None]:
+        """The model with effects exchanged for rivals, fitted anew or gone on, and the screen of what it lacks then.
 
         While one more effect is expected to explain the rest, there is no reason to doubt those that are present.
         """
-        while True:
+        while not limits().complete(errors.excess, ideal.excess):
             screened = screen_candidates(roles, model, known, pool, report)
             if expects_the_rest(screened):
                 return model, errors, screened
             report(1.0, "looking whether another effect should stand in the place of one")
             better = exchanged(roles, model, errors, rivals, pool)
-            if better is None:
+            if better is not None:
+                old, new, model, errors = better
+                del rivals[old]
+                model = recorded(model, new, errors, old)
+                took(model, ExplanationStep(new, errors, removed=old))
+                continue
+            if not nothing_expects_much(screened):
                 return model, errors, screened
-            old, new, model, errors = better
-            del rivals[old]
-            model = recorded(model, new, errors, old)
-            took(model, ExplanationStep(new, errors, removed=old))
+            report(1.0, "looking whether an effect ends better from another start")
+            anew = from_another_start(roles, model, errors, pool)
+            if anew is not None and anew[2].excess < CLEARLY * errors.excess:
+                name, model, errors = anew
+                model = recorded(model, None, errors, refined=name, form=ANEW)
+                took(model, ExplanationStep(None, errors, refined=name, form=ANEW))
+                continue
+            further = in_free_form(model, errors, report)
+            if further is None or further[2].excess > CLEARLY * errors.excess:
+                return model, errors, screened
+            model, errors = took_on(*further)
+        return model, errors, None
 
     screened = together = None
     if is_far(roles, model, errors):
@@ -265,30 +309,26 @@ def _one_way(
         done = len(steps) - 1
         report_share = part_of(report, 1 - 0.6**done, 1 - 0.6**done * 0.6)
         diagnosing = part_of(report_share, 0, 0.9)
-        if rivals and not diagnoses[-1].thresholds.complete(errors.excess, ideal.excess):
-            model, errors, screened = with_exchanges(model, errors, diagnosing)
+        if model.present:
+            model, errors, screened = looked_at_again(model, errors, diagnosing)
         found = diagnose(captures, model, known, pool, thresholds, diagnosing, ideal, False, screened)
         screened = None
         diagnoses.append(found)
         best = found.best
         if best is None or len(model.names) >= MOST_EFFECTS:
-            went_on = None
-            if found.verdict == "outside_catalogue" and not below_the_noise(errors):
-                report_share(0.9, "looking whether maps and curves go on")
-                went_on = _any_gone_on(roles, model, errors, found.thresholds)
-            if went_on is None:
+            outside = found.verdict == "outside_catalogue" and not below_the_noise(errors)
+            further = in_free_form(model, errors, part_of(report_share, 0.8, 0.9)) if outside else None
+            if further is None:
                 break
-            name, model, errors = went_on
-            model = recorded(model, None, errors, refined=name)
-            took(model, ExplanationStep(None, errors, refined=name, form=form_of(model, name)))
+            model, errors = took_on(*further)
             continue
         report_share(0.9, f"adding {best.effect.name}")
         best, candidate, after = chosen_addition(roles, found, pool)
         candidate, after = with_maps_again(roles, candidate, after)
         # A map whose next order did not help is looked at again only where nothing else fits.
         if next_order(candidate.instance(best.effect.name)) is None:
-            further = gone_on(roles, candidate, best.effect.name, after, found.thresholds)
-            candidate, after = further or (candidate, after)
+            mapped = gone_on(roles, candidate, best.effect.name, after, found.thresholds)
+            candidate, after = mapped or (candidate, after)
         if not found.thresholds.worth_adding(removed_excess(errors, after), ideal.excess, 1):
             break
         forks.append(fork_at(len(steps), len(diagnoses) - 1, model, best, found.ranking))
@@ -298,6 +338,8 @@ def _one_way(
         newest = best.effect.name
         report_share(0.95, "looking which effects are needed no longer")
         model, errors = without_unnecessary(model, errors, [n for n in model.names if n != newest])
+        if to_beat is not None and is_hopeless(model, errors, *to_beat):
+            return Explanation(tuple(steps), model, found, tuple(diagnoses)), forks, ideal
         rivals[newest] = {
             r.effect.name: r.model.instance(r.effect.name)
             for r in found.ranking
@@ -306,7 +348,6 @@ def _one_way(
     kept = model.names
     last = part_of(report, 1 - 0.6 ** (len(steps) - 1), 1.0)
     last(0.8, "comparing effects with what could stand in their place")
-    limits = (diagnoses[-1].thresholds, ideal.excess)
     alike = {
         s.added: {n: one for n, one in rivals[s.added].items() if n in s.indistinguishable_from}
         for s in steps
@@ -314,12 +355,12 @@ def _one_way(
     }
     if _leaves_much(diagnoses[-1], ideal):
         alike = dict(rivals)  # enough is left for another in place of one to be worth it
-    while (better := preferred(roles, model, errors, alike, *limits, pool)) is not None:
+    while (better := preferred(roles, model, errors, alike, limits(), ideal.excess, pool)) is not None:
         old, new, model, errors = better
         del alike[old]
         model = recorded(model, new, errors, old)
         took(model, ExplanationStep(new, errors, removed=old))
-    simpler = one_for_two(roles, model, errors, rivals, *limits, pool)
+    simpler = one_for_two(roles, model, errors, rivals, limits(), ideal.excess, pool)
     if simpler is not None:
         new, old, other, model, errors = simpler
         model = recorded(recorded(model, new, errors, old), None, errors, other)
@@ -328,9 +369,7 @@ def _one_way(
     if len(model.names) > 1:
         last(0.9, "looking which effects are needed no longer")
         model, errors = without_unnecessary(model, errors, [steps[-1].added] if steps[-1].added else [])
-    while (
-        common := one_in_common(roles, model, errors, diagnoses[-1].thresholds, ideal.excess, pool)
-    ) is not None:
+    while (common := one_in_common(roles, model, errors, limits(), ideal.excess, pool)) is not None:
         name, model, errors = common
         model = recorded(model, None, errors, refined=name, form=IN_COMMON)
         took(model, ExplanationStep(None, errors, refined=name, form=IN_COMMON))

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from runtime.excess import PredictionErrors
 from runtime.program.progress import Progress
 from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.candidate_fits import CandidateFit
+from trainer.diagnosis.exchange import CLEARLY
 from trainer.diagnosis.ranking import (
     NEAR,
     RankedEffect,
@@ -34,6 +35,9 @@ RIVALS = 0.5  # at first those are fitted that the screen expects to remove so m
 # Of the least that is worth adding: a candidate of which few captures show less than this share, where the model is
 # complete and all that is left is not much more than that least, is not fitted to all.
 SHOWS = 0.25
+# Candidates fitted with present effects free where none explains anything alone: those that the screen expects most of,
+# and, unless one of them clearly explains what is left, those that came closest alone.
+FITTED_TOGETHER = 3
 TOGETHER = "fitting candidates and present effects together"
 
 
@@ -87,14 +91,26 @@ def fitted_ranking(
     ranking = ranked(fits)
     if complete or any(r.worth_adding for r in ranking):
         return ranking, fits
+
+    def jointly(with_candidate: Mapping[str, Model]) -> list[RankedEffect]:
+        report(0.7, TOGETHER)
+        without, together = try_together_with_present(roles, model, with_candidate, pool)
+        return rank(without, together, known, thresholds, ideal_excess, len(order))
+
+    def before_others(found: Sequence[RankedEffect]) -> list[RankedEffect]:
+        names = {r.effect.name for r in found}
+        return [*found, *(r for r in ranking if r.effect.name not in names)]
+
+    if model.present:  # the screen lets them move, and sees what they hide
+        found = jointly({s.effect: model.having(s.start) for s in order[:FITTED_TOGETHER]})
+        if found[0].worth_adding and found[0].held_out.excess < CLEARLY * before.excess:
+            return before_others(found), fits
     rest = [s for s in order if s.effect not in {f.effect for f in fits}]
     fits += raised(try_all(roles, model, rest, pool, report, 0.6, 0.7))
     ranking = ranked(fits)
     if model.present and not any(r.worth_adding for r in ranking):
-        report(0.7, TOGETHER)
-        without, together = try_together_with_present(roles, model, fits, pool)
-        jointly = rank(without, together, known, thresholds, ideal_excess, len(order))
-        ranking = jointly + [r for r in ranking if r.effect.name not in {f.effect for f in together}]
+        closest = sorted(fits, key=lambda f: f.held_out.excess)[:FITTED_TOGETHER]
+        ranking = before_others(jointly({f.effect: f.model for f in closest}))
     return ranking, fits
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,7 +39,6 @@ PIXEL_SHARE = 0.01
 NEAR, RAISED, LITTLE = 2.0, 0.3, 0.9
 # Of what the better of two candidates removes: by so much less removes one that is like it, and a plainer one.
 ALIKE, PLAINER = 0.5, 0.1
-FITTED_TOGETHER = 3  # candidates fitted with the present effects free, when none explains anything alone
 
 
 @dataclass(frozen=True)
@@ -261,11 +260,16 @@ def fit_with_present(
 
 
 def try_together_with_present(
-    roles: CaptureRoles, model: Model, fits: Sequence[CandidateFit], pool: Pool
+    roles: CaptureRoles, model: Model, with_candidate: Mapping[str, Model], pool: Pool
 ) -> tuple[PredictionErrors, list[CandidateFit]]:
-    """Fit the candidates that came closest once more, each together with the effects that are present.
+    """Fit candidates, each together with the effects that are present, and raise orders.
 
     An effect that was added alone may have taken up a part of one that is still missing, and then hides it.
+
+    Parameters
+    ----------
+    with_candidate : mapping of str to Model
+        By candidate: `model` with it.
 
     Returns
     -------
@@ -274,9 +278,8 @@ def try_together_with_present(
     list of CandidateFit
     """
     ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
-    closest = sorted(fits, key=lambda f: f.held_out.excess)[:FITTED_TOGETHER]
     tasks = [(roles.folder, ids, held, model, "")]
-    tasks += [(roles.folder, ids, held, f.model, f.effect) for f in closest]
+    tasks += [(roles.folder, ids, held, one, name) for name, one in with_candidate.items()]
     without, *together = pool.map(try_together, tasks)
     return without.held_out, together
 

@@ -56,8 +56,15 @@ def doubtful(forks: Sequence[Fork], model: Model) -> Fork | None:
     return next((f for f in forks if f.added in names and not set(f.rivals) <= set(names)), None)
 
 
+def is_hopeless(
+    model: Model, errors: PredictionErrors, to_beat: Model, errors_to_beat: PredictionErrors
+) -> bool:
+    """Whether a model has as many effects already as the one that it should be better than, and leaves more."""
+    return len(model.names) >= len(to_beat.names) and errors.excess > errors_to_beat.excess
+
+
 def is_better(
-    errors: PredictionErrors, model: Model, other_errors: PredictionErrors, other: Model, confidence: float
+    model: Model, errors: PredictionErrors, other: Model, other_errors: PredictionErrors, confidence: float
 ) -> bool:
     """Whether held-out captures prefer another model, which needs no more effects."""
     gained = removed_excess(errors, other_errors)

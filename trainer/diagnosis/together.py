@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from runtime.excess import PredictionErrors, removed_excess
+from runtime.excess import PredictionErrors
 from runtime.program.progress import Progress, no_progress, part_of
 from trainer.captures.batches import load
-from trainer.captures.capture_table import ids_of
 from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.addition import gone_on
-from trainer.diagnosis.candidate_fits import try_again
+from trainer.diagnosis.another_start import from_another_start
 from trainer.diagnosis.screen import ScreenResult
 from trainer.diagnosis.unnecessary import without_one
 from trainer.diagnosis.verdict import Thresholds
@@ -96,7 +95,10 @@ def explain_together(
             joint, after = _with_maps(roles, still, left, thresholds)
     if not thresholds.complete(after.excess, errors.excess):
         report(0.75, "looking whether an effect ends better from another start")
-        joint, after = _from_another_start(roles, joint, after, thresholds, pool)
+        better = from_another_start(roles, joint, after, pool)
+        if better is not None:
+            _, joint, after = better
+            joint, after = _with_maps(roles, joint, after, thresholds)
     report(0.8, "leaving out effects that are not needed")
     names = joint.names
     while smaller := without_one(roles, joint, after, names, thresholds, errors.excess, pool, thorough=False):
@@ -115,23 +117,6 @@ def _with_maps(
         tried = [*tried, rest[0]] if further is None else []
         model, errors = further or (model, errors)
     return model, errors
-
-
-def _from_another_start(
-    roles: CaptureRoles, model: Model, errors: PredictionErrors, thresholds: Thresholds, pool: Pool
-) -> tuple[Model, PredictionErrors]:
-    """The model with that effect fitted anew which then leaves least, all others after it; as it is where none helps.
-
-    What an effect took up while the others were far from right may keep all of them from where they belong: the leak
-    of a panel that is bent, say, what the panel's wavefront still lacked.
-    """
-    ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
-    names = [p.effect.name for p in model.present if p.nodes is None]
-    found = pool.map(try_again, [(roles.folder, ids, held, model, name) for name in names])
-    best = min((f for f in found if f is not None), key=lambda f: f.held_out.excess, default=None)
-    if best is None or removed_excess(errors, best.held_out).interval()[0] <= 0:
-        return model, errors
-    return _with_maps(roles, best.model, best.held_out, thresholds)
 
 
 def _maps_to_go_on(model: Model) -> list[str]:

@@ -30,7 +30,8 @@ def recorded(
     dropped : str, optional
         The effect that was taken out.
     refined : str, optional
-        The effect whose map or curve went on in free form, or whose colours were put together again.
+        The effect whose map or curve went on in free form, whose colours were put together again, or that was fitted
+        anew.
     form : mapping, optional
         The key `form` of such a record, where it is not that of `form_of`.
     """
@@ -48,6 +49,7 @@ def recorded(
 
 
 IN_COMMON = {"form": "values in common"}  # of an effect whose colours were put together again
+ANEW = {"form": "another start"}  # of an effect that was fitted anew, and all others after it
 
 
 def form_of(model: Model, refined: str) -> dict[str, str]:
