@@ -14,7 +14,7 @@ from trainer.captures.acquire import acquire_from
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.cli import main
 from trainer.cycle import demo_run
-from trainer.diagnosis import explanation as ladder
+from trainer.diagnosis import way as ladder
 from trainer.diagnosis.diagnosis import Diagnosis
 from trainer.effects.effect_catalogue import catalogue
 from trainer.model.model import Model
