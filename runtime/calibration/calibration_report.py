@@ -21,7 +21,7 @@ from runtime.calibration.response import Sweep
 from runtime.calibration.self_calibration import Calibration
 from runtime.calibration.shown_patterns import proof_picture
 from runtime.calibration.summary import numbers, sentence_of
-from runtime.solver.targets import encode_srgb
+from runtime.solver.picture_files import encode_srgb, white_of
 
 WIDTH = 320  # of a picture, screen pixels
 BLUE, WHITE, RED = (33, 102, 172), (247, 247, 247), (178, 24, 43)
@@ -165,8 +165,7 @@ def _row(figures: Sequence[str]) -> str:
 
 def _gray(light: np.ndarray, caption: str) -> str:
     """Irradiance as an sRGB picture, its 99.8th percentile white."""
-    share = np.clip(light / max(float(np.percentile(light, 99.8)), 1e-12), 0, 1)
-    return _figure(np.rint(255 * encode_srgb(share)).astype(np.uint8), caption)
+    return _figure(np.rint(255 * encode_srgb(light / white_of(light))).astype(np.uint8), caption)
 
 
 def _signed(values: np.ndarray, unit: str, caption: str, most: float | None = None) -> str:

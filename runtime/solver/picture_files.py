@@ -101,6 +101,11 @@ def encode_srgb(linear: np.ndarray) -> np.ndarray:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.power(linear, 1 / 2.4) - 0.055)
 
 
+def white_of(light: np.ndarray) -> float:
+    """What is white where irradiance is shown in any unit: its 99.8th percentile."""
+    return max(float(np.percentile(light, 99.8)), 1e-12)
+
+
 def decode_srgb(encoded: np.ndarray) -> np.ndarray:
     """sRGB in 0..1 to linear irradiance in 0..1: the inverse of `encode_srgb`."""
     return np.where(encoded <= 0.04045, encoded / 12.92, np.power((encoded + 0.055) / 1.055, 2.4))

@@ -12,6 +12,7 @@ from firmware_iface.panel.fields import colours_in_turn
 from runtime.bundle.whole_files import whole_file
 from runtime.headset.open_devices import Devices
 from runtime.solver import Quality, quality
+from runtime.solver.picture_files import white_of
 from runtime.solver.targets import CHANNELS, fit_area
 from trainer.captures.bench_file import Bench
 from trainer.report.display_section import srgb_picture
@@ -140,6 +141,5 @@ def _black(devices: Devices, bench: Bench) -> float:
 
 def write_picture(path: Path, light: np.ndarray) -> None:
     """Irradiance [C, h, w] as an sRGB picture, its 99.8th percentile white."""
-    share = np.clip(light / max(float(np.percentile(light, 99.8)), 1e-12), 0, 1)
     with whole_file(path) as file:
-        srgb_picture(share).save(file, format="PNG")
+        srgb_picture(light / white_of(light)).save(file, format="PNG")

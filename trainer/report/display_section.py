@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from runtime.solver import Quality
-from runtime.solver.targets import encode_srgb
+from runtime.solver.picture_files import encode_srgb, white_of
 from trainer.captures.block_means import blocks
 from trainer.report.png_uri import png_uri
 
@@ -91,7 +91,7 @@ def _row(one: DisplayedPicture) -> str:
 
 
 def _figure(title: str, light: np.ndarray, target: np.ndarray, note: str) -> str:
-    white = max(float(np.percentile(target, 99.8)), 1e-12)
+    white = white_of(target)
     factor = -(-max(light.shape[-2:]) // LARGEST)
     if factor > 1:
         light = np.stack([blocks(one, factor) for one in light.reshape(-1, *light.shape[-2:])])

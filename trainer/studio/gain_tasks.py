@@ -15,7 +15,8 @@ from firmware_iface.virtual import VirtualHeadset
 from runtime.bundle.whole_files import whole_file
 from runtime.lightpath.light_path import LightPath
 from runtime.solver import quality, shown, solve
-from runtime.solver.targets import encode_srgb, fit_area
+from runtime.solver.picture_files import encode_srgb, white_of
+from runtime.solver.targets import fit_area
 from trainer.captures.bench_file import Bench
 from trainer.captures.capture_set import opened
 from trainer.captures.open_bench import open_bench
@@ -199,5 +200,4 @@ def _capture(headset: Any, bench: Bench, channel: str, gray: np.ndarray) -> np.n
 
 
 def _encoded(light: np.ndarray) -> np.ndarray:
-    share = np.clip(light / max(float(np.percentile(light, 99.8)), 1e-12), 0, 1)
-    return np.asarray(encode_srgb(share), dtype=np.float32)
+    return np.asarray(encode_srgb(light / white_of(light)), dtype=np.float32)
