@@ -82,6 +82,23 @@ def test_the_headset_computes_what_the_trainer_does(half_width: float, tmp_path:
         assert np.abs(ours - theirs).max() < 2e-5 * theirs.max()
 
 
+def test_neighbours_that_no_camera_would_see_are_left_out(tmp_path: Path) -> None:
+    """A field that hardly reaches beyond its pixel costs the headset fewer sums, and the picture is the same."""
+    taps = {}
+    for width in (0.1, 0.6):
+        start = absent(catalogue()["crosstalk"], bench())
+        present = start.with_values({**start.values, "width_y": np.array(width), "width_x": np.array(width)})
+        model = Model(bench(), (present,))
+        export_bundle(model, None, tmp_path / f"{width}")
+        bundle = read_bundle(tmp_path / f"{width}")
+        rows, _ = load_light_path(bundle, "green", PLANE).crosstalk
+        taps[width] = rows.shape[1]
+        np.testing.assert_allclose(rows.sum(axis=1), 1, atol=1e-6)
+        ours, theirs = headset_irradiance(bundle, "green", PLANE), trained_irradiance(model, "green", PLANE)
+        assert np.abs(ours - theirs).max() < 1e-4 * theirs.max()
+    assert taps[0.1] < taps[0.6]
+
+
 def test_camera_effects_stay_out(tmp_path: Path) -> None:
     full = Model(bench(), every_effect())
     summary = export_bundle(full, None, tmp_path / "full")

@@ -31,6 +31,8 @@ from trainer.model.model_stages import scene_for, stages_of
 from trainer.model.parameters import json_values
 from trainer.prediction.predict import light_path
 
+NEGLIGIBLE = 1e-5  # share that a neighbour has in a sub-pixel's phase, which a camera would not see
+
 
 def export_bundle(
     model: Model,
@@ -189,7 +191,17 @@ def baked_path(model: Model, channel: str, plane_mm: float, moment: Moment | Non
     with torch.no_grad():
         scene = scene_for(model, channel, plane_mm, torch.float64)
         path = light_path(scene, stages_of(scene, model, moment=moment))
+        if path.crosstalk is not None:
+            rows, columns = path.crosstalk
+            path = replace(path, crosstalk=(_without_far(rows), _without_far(columns)))
     return LightPath(**{f.name: _single(getattr(path, f.name)) for f in fields(path)})
+
+
+def _without_far(taps: Tensor) -> Tensor:
+    """Shares of neighbours without the outermost that are negligible, which a headset need not add up."""
+    while taps.shape[1] > 1 and float(taps[:, [0, -1]].max()) < NEGLIGIBLE:
+        taps = taps[:, 1:-1]
+    return taps / taps.sum(dim=1, keepdim=True)
 
 
 def _slow_share(model: Model, channel: str, plane_mm: float, moment: Moment | None) -> float:
