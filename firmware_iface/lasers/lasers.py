@@ -159,7 +159,7 @@ class Lasers:
             self.board.controller.command(Command.CLEAR)
             held = self.board.controller.state() is State.FAULT
             needed = Input.INTERLOCK | Input.DARK | Input.COOL | Input.QUIET
-            missing = "; ".join(self.board.controller.missing(needed)) if held else ""
+            missing = self.board.controller.missing_text(needed) if held else ""
         if held:
             raise DeviceError(f"the fault cannot be cleared: {missing or UNKNOWN}.")
 
@@ -184,7 +184,7 @@ class Lasers:
             latched = ", ".join(self.board.controller.fault_names())
             # a fault ends the heartbeat, so that a missing one says nothing about the fault's cause
             needed = Input(0x7F) & ~Input.HEARTBEAT if state is State.FAULT else Input(0x7F)
-            missing = "; ".join(self.board.controller.missing(needed))
+            missing = self.board.controller.missing_text(needed)
         if state is State.FAULT:
             first = f"find its cause; {missing};" if missing else "find its cause,"
             raise DeviceError(f"a fault is latched ({latched}); {first} then clear() and arm().")

@@ -118,10 +118,10 @@ class SafetyController:
         """The names of its latched faults."""
         return [f.name.lower() for f in self.faults() if f.name]
 
-    def missing(self, needed: Input) -> list[str]:
-        """What to do about each of the needed conditions that does not hold now."""
+    def missing_text(self, needed: Input) -> str:
+        """What to do about those of the needed conditions that do not hold now; empty where all hold."""
         inputs = self.inputs()
-        return [TO_DO[i] for i in needed if not inputs & i]
+        return "; ".join(TO_DO[i] for i in needed if not inputs & i)
 
     def command(self, command: Command) -> None:
         """Send a command; the controller ignores what its conditions forbid."""

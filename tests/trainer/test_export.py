@@ -86,9 +86,7 @@ def test_neighbours_that_no_camera_would_see_are_left_out(tmp_path: Path) -> Non
     """A field that hardly reaches beyond its pixel costs the headset fewer sums, and the picture is the same."""
     taps = {}
     for width in (0.1, 0.6):
-        start = absent(catalogue()["crosstalk"], bench())
-        present = start.with_values({**start.values, "width_y": np.array(width), "width_x": np.array(width)})
-        model = Model(bench(), (present,))
+        model = Model(bench(), (present("crosstalk", width_y=width, width_x=width),))
         export_bundle(model, None, tmp_path / f"{width}")
         bundle = read_bundle(tmp_path / f"{width}")
         rows, _ = load_light_path(bundle, "green", PLANE).crosstalk

@@ -15,9 +15,7 @@ from trainer.effects.term_names import curve_terms, driver_terms, surface_terms
 from trainer.prediction.stages import Drive
 
 SUB_PIXELS = 4  # of a pixel along each axis; 3 leave an excess of 9e-4, 5 gain nothing visible to a camera
-REACH = (
-    4  # neighbours on either side that act on a pixel; 2 leave 6e-4 of a field that decays over 0.6 pixels
-)
+REACH = 4  # neighbours on either side that act on a pixel; 2 leave 6e-4 where the field decays over 0.6
 
 
 def _bent(drive: Drive, deviation: Tensor) -> Drive:
