@@ -10,7 +10,9 @@ from tests.trainer.hidden import bench_file
 from trainer.captures.acquire import acquire_from
 from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet, read_captures
+from trainer.captures.capture_table import ids_of
 from trainer.captures.held_out import capture_roles
+from trainer.diagnosis.addition import all_refitted
 from trainer.diagnosis.exchange import exchanged, one_for_two, preferred
 from trainer.diagnosis.screen import screen_batches
 from trainer.diagnosis.verdict import Thresholds
@@ -20,7 +22,7 @@ from trainer.fitting.gauss_newton import fit
 from trainer.fitting.pool import open_pool
 from trainer.fitting.predictor import evaluate_captures
 from trainer.fitting.refit import fit_from
-from trainer.model.model import Model, absent
+from trainer.model.model import Model, absent, instance_with
 
 
 @pytest.fixture(scope="module")
@@ -120,3 +122,21 @@ def test_captures_that_tell_in_the_end_decide_between_effects_that_were_alike(
             found = preferred(roles, models[present], errors, alike, Thresholds(), 1.0, pool)
             exchanges[present] = None if found is None else found[:2]
     assert exchanges == {hidden: None, rival: (rival, hidden)}
+
+
+def test_a_refit_begins_where_least_is_left(tmp_path: Path) -> None:
+    """Speckle of a plane that is far off says nothing of where the right one is."""
+    hidden = 'kind = "distance"\noffset_mm = 0.5'
+    acquire_from(str(bench_file(tmp_path, hidden)), tmp_path / "captures", patterns=4)
+    captures = read_captures(tmp_path / "captures")
+    roles = capture_roles(captures)
+    ideal = with_gains(captures, Model(captures.bench), roles.fitted)
+    near, far = (
+        ideal.having(instance_with(catalogue()["distance"], captures.bench, {"offset": offset}))
+        for offset in (0.45, -8.0)
+    )
+    ids = ids_of(captures.captures)
+    right, wrong = (all_refitted(roles.folder, ids, one)[1].excess for one in (near, far))
+    assert right < 1e-3 < 0.1 * wrong
+    for starts in ((near, far), (far, near)):
+        assert all_refitted(roles.folder, ids, *starts)[1].excess == right

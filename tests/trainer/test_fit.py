@@ -18,8 +18,8 @@ from trainer.captures.batches import Batch, load
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.effects import catalogue
 from trainer.effects.testing import captures_with
-from trainer.fitting import jacobian
-from trainer.fitting.gauss_newton import fit
+from trainer.fitting import gauss_newton, jacobian
+from trainer.fitting.gauss_newton import fit, is_too_slow
 from trainer.fitting.refit import least_for_order, raise_orders
 from trainer.model.model import EffectInstance, Model, absent, instance_with
 from trainer.model.parameters import describe, json_values
@@ -197,3 +197,24 @@ def test_a_fit_that_will_not_come_near_is_given_up_and_no_other(tmp_path: Path) 
             assert not hasty.settled
             assert hasty.errors.excess > 0.9 * patient.errors.excess
             assert plain(hasty.model.present[0].values) == plain(start.values)
+
+
+def test_a_fit_that_is_too_slow_for_what_is_enough_is_given_up_on_the_way(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert is_too_slow(0.01, 4, 0.5, 0.41) and not is_too_slow(0.01, 4, 0.5, 0.43)
+    assert is_too_slow(-0.01, 4, 0.5, 0.49)  # it went the wrong way
+    assert not is_too_slow(0.0, 0, 0.5, math.inf)
+    captures = captures_with(tmp_path, KNOWN["ghost"], {"amplitude": 0.3, "shift_x": 6.4}, 3)
+    model = Model(captures.bench).having(absent(KNOWN["panel_wavefront"], captures.bench, 4))
+    batches, steps = batches_of(captures), []
+    slopes_of = gauss_newton.slopes_of
+    monkeypatch.setattr(gauss_newton, "slopes_of", lambda *given: (steps.append(given), slopes_of(*given))[1])
+    patient = fit(model, model.names, batches)
+    longest = len(steps)
+    assert patient.errors.excess > 0.01
+    easy = fit(model, model.names, batches, enough=1.01 * patient.errors.excess)
+    assert easy.errors.excess == patient.errors.excess
+    steps.clear()
+    given_up = fit(model, model.names, batches, enough=0.9 * patient.errors.excess)
+    assert not given_up.settled and len(steps) < longest

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
+
+import pytest
 
 from tests.trainer.hidden import bench_file
 from trainer.captures.acquire import acquire_from
 from trainer.captures.capture_set import read_captures
 from trainer.captures.held_out import capture_roles
 from trainer.diagnosis.addition import add_from
-from trainer.diagnosis.candidate_fits import try_effect
+from trainer.diagnosis.candidate_fits import try_effect, try_on_few
 from trainer.diagnosis.diagnosis import diagnose
 from trainer.effects.effect_catalogue import catalogue
 from trainer.fitting.gains import with_gains
@@ -41,3 +44,24 @@ def test_the_one_that_explains_the_rest_with_present_effects_free_ranks_first(tm
         found = diagnose(captures, model, known, pool, thorough=False)
     assert found.best is not None and found.best.effect.name == "zero_order"
     assert found.best.held_out.excess < 0.02 * found.held_out.excess
+
+
+def test_what_is_read_off_captures_is_asked_before_what_takes_a_search(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The screen expects nothing of a power that varies from capture to capture: it looks at one capture."""
+    acquire_from(str(bench_file(tmp_path, 'kind = "laser_drift"')), tmp_path / "captures", patterns=6)
+    captures = read_captures(tmp_path / "captures")
+    names = ("iris", "laser_drift", "sensor_response", "temporal_coherence", "vibration")
+    searched: list[str] = []
+
+    def noted(*task: Any) -> Any:
+        searched.append(task[5].effect.name)
+        return try_on_few(*task)
+
+    monkeypatch.setattr("trainer.diagnosis.ranking.try_on_few", noted)
+    with open_pool(1) as pool:
+        known = {name: catalogue()[name] for name in names}
+        found = diagnose(captures, Model(captures.bench), known, pool, thorough=False)
+    assert found.best is not None and found.best.effect.name == "laser_drift"
+    assert not {"iris", "vibration"} & set(searched)

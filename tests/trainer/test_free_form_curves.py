@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,12 +13,16 @@ import torch
 from firmware_iface.virtual import BenchDescription, VirtualHeadset, make_defect
 from firmware_iface.virtual.simulated_drive import Drive
 from trainer.captures.acquire import acquire_captures
+from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.open_bench import nominal_bench
 from trainer.diagnosis.addition import Addition, add
 from trainer.effects import testing
 from trainer.effects.effect_catalogue import catalogue
 from trainer.effects.free_form import along, on_other_curve_nodes
+from trainer.fitting import free_form_effects
+from trainer.fitting.free_form_effects import with_free_form
+from trainer.fitting.gains import with_gains
 from trainer.formatting import change_of
 from trainer.model.bundle_export import acting_on_display, baked_path
 from trainer.model.history import recorded
@@ -119,3 +124,18 @@ def test_the_history_says_that_a_curve_went_on(tmp_path: Path) -> None:
     model = Model(bench, (replace(absent(effect, bench), nodes=np.zeros((1, 27))),))
     record = recorded(model, None, errors, refined="sensor_response").history[-1]
     assert change_of(record) == "curve of sensor_response"
+
+
+def test_a_curve_that_removes_next_to_nothing_is_given_up_before_the_rest_is_fitted_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A shifted picture: the curve of the camera's response has no part in it."""
+    refits: list[Any] = []
+    monkeypatch.setattr(free_form_effects, "fit", lambda *given, **_: refits.append(given))
+    captures = testing.captures_with(tmp_path, catalogue()["misregistration"], {"shift_x": 0.6}, 6)
+    effect = catalogue()["sensor_response"]
+    model = Model(captures.bench).having(absent(effect, captures.bench, max(effect.orders)))
+    model = with_gains(captures, model, captures.captures)
+    batches = [load(captures, captures.captures[:4]), load(captures, captures.captures[4:])]
+    assert with_free_form(model, effect.name, *batches, 0.0) is None
+    assert not refits

@@ -165,9 +165,9 @@ def test_no_candidate_is_fitted_twice_to_the_same_captures(
 ) -> None:
     asked: list[str] = []
 
-    def noted(task: Any, tasks: list[Any]) -> list[float]:
+    def noted(task: Any, tasks: list[Any]) -> list[Any]:
         asked.append(task.__name__)
-        return [0.1 for _ in tasks]
+        return [(Model(BENCH), 0.1) for _ in tasks]
 
     def captures(*names: str) -> list[Any]:
         return [SimpleNamespace(capture=name) for name in names]

@@ -19,7 +19,7 @@ from trainer.effects.definition import Effect
 from trainer.fitting.free_form_effects import refined, with_free_form
 from trainer.fitting.gains import with_gains
 from trainer.fitting.gauss_newton import FitResult, fit, with_measured_values
-from trainer.fitting.predictor import evaluate_captures
+from trainer.fitting.predictor import evaluate_captures, excess_on
 from trainer.fitting.refit import fit_from, least_for_order, raise_orders
 from trainer.model.history import recorded
 from trainer.model.model import EffectInstance, Model
@@ -103,16 +103,20 @@ def add_from(roles: CaptureRoles, model: Model, start: EffectInstance) -> Model:
     return with_orders_raised(roles, fitted)
 
 
-def all_refitted(
-    folder: Path, ids: tuple[str, ...], base: Model, given: EffectInstance
-) -> tuple[FitResult, PredictionErrors]:
-    """A model with an effect as it is given, all fitted together, and its held-out errors.
+def all_refitted(folder: Path, ids: tuple[str, ...], *starts: Model) -> tuple[FitResult, PredictionErrors]:
+    """A model with all of its effects fitted together, and its held-out errors.
 
     A task for any process.
+
+    Parameters
+    ----------
+    starts : Model
+        Where the fit may begin: it does from the one that leaves least.
     """
     roles = _roles_of(folder, ids)
-    model = base.having(given)
-    found = fit(model, model.names, load(roles.captures, roles.fitted))
+    batches = load(roles.captures, roles.fitted)
+    model = min(starts, key=lambda one: excess_on(one, batches)) if len(starts) > 1 else starts[0]
+    found = fit(model, model.names, batches)
     return found, evaluate_captures(roles.captures, roles.held_out, found.model)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from runtime.excess import PredictionErrors
 from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet, chosen, opened
-from trainer.fitting.gauss_newton import FitResult, fit
+from trainer.fitting.gauss_newton import ROUGH, FitResult, fit
 from trainer.fitting.predictor import evaluate_captures, excess_on
 from trainer.fitting.refit import fit_from, least_for_order, raise_orders, settled
 from trainer.model.model import EffectInstance, Model, absent
@@ -78,6 +78,7 @@ def try_on_few(
     model: Model,
     start: EffectInstance,
     enough: float,
+    most: float = math.inf,
 ) -> tuple[Model, float, CandidateFit | None]:
     """Fit one effect, with present ones as they are, to a few captures; where it explains these, to all.
 
@@ -89,6 +90,8 @@ def try_on_few(
         Captures to fit then, and captures to judge by.
     enough : float
         Excess of the few captures from which on the fit goes on to all.
+    most : float
+        Excess of the few captures that is of interest: a fit that will hardly come there is given up.
 
     Returns
     -------
@@ -97,7 +100,7 @@ def try_on_few(
         cannot explain of all. Then the fit to all captures, where it leaves no more than `enough` of the few.
     """
     captures = opened(folder)
-    fitted = fit_from(model, start, load(captures, chosen(captures, few)), iterations=8)
+    fitted = fit_from(model, start, load(captures, chosen(captures, few)), iterations=8, enough=most)
     further = None
     if fitted.errors.excess <= enough:
         further = try_further(folder, ids, held_ids, fitted.model, start.effect.name, False)
@@ -106,8 +109,8 @@ def try_on_few(
 
 def try_together_on_few(
     folder: Path, ids: tuple[str, ...], model: Model, start: EffectInstance, enough: float = math.inf
-) -> float:
-    """The excess on a few captures of one effect and the present ones, all fitted to these alone.
+) -> tuple[Model, float]:
+    """A model with one effect more, all fitted to a few captures alone, and its excess on these.
 
     Parameters
     ----------
@@ -117,7 +120,8 @@ def try_together_on_few(
     captures = opened(folder)
     batches = load(captures, chosen(captures, ids))
     started = fit_from(model, start, batches, iterations=8).model
-    return fit(started, started.names, batches, iterations=8, enough=enough).errors.excess
+    fitted = fit(started, started.names, batches, 8, ROUGH, enough=enough)
+    return fitted.model, fitted.errors.excess
 
 
 def try_further(
@@ -126,7 +130,7 @@ def try_further(
     """Go on with the fit of effect `name` from where it is in a model, as `try_effect` does from a start."""
     captures = opened(folder)
     batches = load(captures, chosen(captures, ids))
-    fitted = fit(model, [name], batches, iterations=8)
+    fitted = fit(model, [name], batches, 8, ROUGH)
     if raising:
         fitted = raise_orders(fitted, [name], batches, least_for_order)
     return _judged(name, fitted.model, captures, held_ids)
@@ -146,7 +150,7 @@ def try_again(
     batches = load(captures, chosen(captures, ids))
     present = model.instance(name)
     fresh = absent(present.effect, model.bench, present.order)
-    alone = fit(model.having(fresh), [name], batches, iterations=8)
+    alone = fit(model.having(fresh), [name], batches, 8, ROUGH)
     was = excess_on(model, batches)
     if was / BACK < alone.errors.excess < was * BACK or alone.errors.excess > NOWHERE * was:
         return None
@@ -163,12 +167,25 @@ def try_together(
 
 
 def try_with_present(
-    folder: Path, ids: tuple[str, ...], held_ids: tuple[str, ...], model: Model, start: EffectInstance
+    folder: Path,
+    ids: tuple[str, ...],
+    held_ids: tuple[str, ...],
+    model: Model,
+    start: EffectInstance,
+    on_few: Model | None = None,
 ) -> CandidateFit:
-    """Fit one effect to a model, then all of its effects together at the orders that they have, and judge it."""
+    """Fit one effect to a model, then all of its effects together at the orders that they have, and judge it.
+
+    Parameters
+    ----------
+    on_few : Model, optional
+        The same, all fitted to a few of the captures: where to begin, if that leaves less than the effect alone.
+    """
     captures = opened(folder)
     batches = load(captures, chosen(captures, ids))
-    started = fit_from(model, start, batches, iterations=8).model
+    alone = fit_from(model, start, batches, iterations=8)
+    is_nearer = on_few is not None and excess_on(on_few, batches) < alone.errors.excess
+    started = on_few if on_few and is_nearer else alone.model
     together = fit(started, started.names, batches)
     return replace(_judged(start.effect.name, together.model, captures, held_ids), together=together)
 

@@ -31,11 +31,7 @@ def chosen_addition(
     best = found.ranking[0]
     rival = _rival(found) if found.model.present or best.effect.rare else None
     ones = [best] if rival is None else [best, rival]
-    tasks = [
-        (roles.folder, roles.ids, one.base, one.model.instance(one.effect.name))
-        for one in ones
-        if one.together is None
-    ]
+    tasks = [(roles.folder, roles.ids, one.model) for one in ones if one.together is None]
     refitted = iter(pool.map_here_if_one(all_refitted, tasks))
     fitted = [(one.together, one.held_out) if one.together else next(refitted) for one in ones]
     undecided = False

@@ -39,7 +39,7 @@ def one_in_common(
         for p in model.present
         if p.effect.in_common is not None and p.effect.colours == "either"
     ]
-    tasks = [(roles.folder, roles.ids, model, put_together(model.instance(name))) for name in names]
+    tasks = [(roles.folder, roles.ids, model.having(put_together(model.instance(name)))) for name in names]
     for name, (refitted, after) in zip(names, pool.map_here_if_one(all_refitted, tasks), strict=True):
         if not thresholds.worth_adding(removed_excess(after, errors), ideal_excess, 1):
             return name, refitted.model, after

@@ -191,8 +191,9 @@ def _promising(
     on_few = pool.map_here_if_one(
         try_together_on_few, [(roles.folder, ids, *trial, enough) for trial in trials]
     )
-    promising = [k for k, excess in enumerate(on_few) if excess < enough]
-    tasks = [(roles.folder, roles.ids, *trials[k]) for k in promising]
+    promising = [k for k, (_, excess) in enumerate(on_few) if excess < enough]
+    # A rival's fit is of when it was added; what few captures made of all effects is often nearer.
+    tasks = [(roles.folder, roles.ids, trials[k][0].having(trials[k][1]), on_few[k][0]) for k in promising]
     fits = pool.map_here_if_one(all_refitted, tasks)
     found = [(k, together, after) for k, (together, after) in zip(promising, fits, strict=True)]
     return sorted(found, key=lambda one: one[2].excess)

@@ -69,11 +69,6 @@ class RankedEffect:
     indistinguishable_from: tuple[str, ...] = ()
     together: FitResult | None = None
 
-    @property
-    def base(self) -> Model:
-        """The model without the candidate; other effects as they were fitted with it."""
-        return self.model.without(self.effect.name)
-
     def as_json(self) -> dict[str, Any]:
         """A row of the key `ranking` of `diagnose --json`.
 
@@ -168,7 +163,19 @@ def try_near(
         evaluate_captures(roles.captures, telling, one).excess for one in (model, *(f.model for f in others))
     )
     surely_near = min(least, before / 2)  # whatever others leave
-    tasks = [(roles.folder, few, ids, held, model, s.start, surely_near) for s in screened]
+
+    def most_near(left: float, screened: ScreenResult, raising: bool) -> float:
+        """Excess on few captures up to which a candidate is near the best, which leaves `left` there."""
+        if before - left < (1 - LITTLE) * abs(before):
+            return math.inf
+        return _near(left, before, least, raising and len(screened.start.effect.orders) > 1)
+
+    # The best of all leaves no more than the best of the others.
+    most = [min(most_near(min(compared, default=math.inf), s, True), before - shown) for s in screened]
+    tasks = [
+        (roles.folder, few, ids, held, model, s.start, surely_near, of_use)
+        for s, of_use in zip(screened, most, strict=True)
+    ]
     share = (end - start) / max(1, len(tasks))
     fits = pool.map(try_on_few, tasks, lambda n: report(start + n * share, "fitting candidates"))
     left = min(compared + [excess for _, excess, _ in fits])
@@ -177,11 +184,7 @@ def try_near(
         return [
             s.effect
             for (_, excess, _), s in zip(fits, screened, strict=True)
-            if before - excess > shown
-            and (
-                before - left < (1 - LITTLE) * abs(before)
-                or excess <= _near(left, before, least, raising and len(s.start.effect.orders) > 1)
-            )
+            if before - excess > shown and excess <= most_near(left, s, raising)
         ]
 
     def to_all(names: Collection[str]) -> list[CandidateFit]:
@@ -251,11 +254,13 @@ def fit_with_present(
     ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
     few = ids_of(telling_captures(roles.captures, roles.fitted, model)) if len(screened) > 1 else ids
     if len(few) < len(ids):
-        left = pool.map(try_together_on_few, [(roles.folder, few, model, s.start) for s in screened])
-        most = NEAR * min(left) + least
-        screened = [s for s, there in zip(screened, left, strict=True) if there <= most]
+        on_few = pool.map(try_together_on_few, [(roles.folder, few, model, s.start) for s in screened])
+        most = NEAR * min(excess for _, excess in on_few) + least
+        begun = [(s, there) for s, (there, excess) in zip(screened, on_few, strict=True) if excess <= most]
+    else:
+        begun = [(s, None) for s in screened]  # type: ignore[misc]
     return pool.map_here_if_one(
-        try_with_present, [(roles.folder, ids, held, model, s.start) for s in screened]
+        try_with_present, [(roles.folder, ids, held, model, s.start, there) for s, there in begun]
     )
 
 

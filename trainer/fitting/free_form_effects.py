@@ -6,6 +6,7 @@ other numbers. Captures that the gradient does not use say when to stop and how 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -29,6 +30,9 @@ ITERATIONS, ROUNDS = 6, 5  # between two checks of the captures that say when to
 CURVE_ITERATIONS, CURVE_ROUNDS = 10, 12  # a curve's nodes differ much in how many pixels they touch
 FIRST_GAIN = 0.25  # share of the error that the coarsest map must remove for the polynomials to have ended
 FINER_GAIN = 0.05  # share that more nodes must remove to be kept
+DESCENT = (
+    0.5  # of what all numbers must remove together: what the nodes must remove, with the others as they are
+)
 REFIT_ITERATIONS = 3
 # Nodes and all other numbers go on in turns while each leaves less than this share. A rough beam on 96 x 128 pixels
 # ends at 0.0006 after one turn, and at 0.0001 after four.
@@ -68,8 +72,9 @@ def with_free_form(
     best, least = model, excess_on(model, stopping)
     shapes = _node_shapes(model, name, fitted[0])
     for level, shape in enumerate(shapes):
-        trial, excess = _turn(best, name, shape, fitted, stopping)
-        if least - excess < (FIRST_GAIN if level == 0 else FINER_GAIN) * abs(least):
+        needed = (FIRST_GAIN if level == 0 else FINER_GAIN) * abs(least)
+        trial, excess = _turn(best, name, shape, fitted, stopping, needed)
+        if least - excess < needed:
             break
         best, least = trial, excess
         if least < enough:
@@ -92,9 +97,17 @@ def _turn(
     shape: tuple[int, int] | None,
     fitted: Sequence[Batch],
     stopping: Sequence[Batch],
+    needed: float = 0.0,
 ) -> tuple[Model, float]:
-    """The model with one effect's nodes fitted, then all other numbers, and its excess on `stopping`."""
-    trial = _descended(model, name, shape, fitted, stopping)
+    """The model with one effect's nodes fitted, then all other numbers, and its excess on `stopping`.
+
+    Where the nodes alone remove less than DESCENT of the excess that is needed, other numbers stay as they are.
+    """
+    trial = _descended(model, name, shape, fitted, stopping, DESCENT * needed)
+    if needed:
+        excess = excess_on(trial, stopping)
+        if excess_on(model, stopping) - excess < DESCENT * needed:
+            return trial, excess
     trial = fit(trial, trial.names, fitted, iterations=REFIT_ITERATIONS).model
     return trial, excess_on(trial, stopping)
 
@@ -113,6 +126,7 @@ def _descended(
     shape: tuple[int, int] | None,
     fitted: Sequence[Batch],
     stopping: Sequence[Batch],
+    needed: float | None = None,
 ) -> Model:
     """The model with one effect's nodes fitted, on as many nodes as are given or on those that it has."""
     present = model.instance(name)
@@ -126,7 +140,9 @@ def _descended(
     scale = signal_variance(fitted)
     curve = present.effect.free_form is not None and present.effect.free_form.curve
     iterations, rounds = (CURVE_ITERATIONS, CURVE_ROUNDS) if curve else (ITERATIONS, ROUNDS)
-    found = descend(_stage_of(model, present), parts[0], parts[1], scale, iterations, rounds)
+    error = -math.inf if needed is None else needed * signal_variance(stopping)
+    stage = _stage_of(model, present)
+    found = descend(stage, parts[0], parts[1], scale, iterations, rounds, needed=error)
     return model.having(replace(present, nodes=present.nodes + array_of(found["nodes"].double())))
 
 

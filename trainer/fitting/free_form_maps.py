@@ -7,6 +7,7 @@ captures share.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from runtime.program.progress import Progress
 from trainer.captures.batches import Batch
+from trainer.fitting.gauss_newton import is_too_slow
 from trainer.fitting.predictor import Predictor
 from trainer.fitting.side_by_side import side_by_side
 from trainer.model.model import Model
@@ -72,6 +74,7 @@ def descend(
     iterations: int,
     rounds: int,
     progress: Progress | None = None,
+    needed: float = -math.inf,
 ) -> Tensors:
     """The maps of the descent that predict the stopping captures best.
 
@@ -89,6 +92,9 @@ def descend(
         Between two checks of the stopping captures.
     rounds : int
         Most checks.
+    needed : float
+        Squared error of the stopping captures that a descent must remove to be of use: it is given up where it will
+        hardly do so.
 
     Returns
     -------
@@ -136,13 +142,16 @@ def descend(
         return sum(float(b.squared_error(free, found, k)) for b in stopping for k in range(len(b.batch.ids)))
 
     best, least = {n: t.detach().clone() for n, t in raw.items()}, stopping_error()
-    waited = 0
+    most, waited = least - needed, 0
     for number in range(rounds):
         optimiser.step(loss_and_gradient)
         error = stopping_error()
+        removed = least - error
         if error < least:
             best, least, waited = {n: t.detach().clone() for n, t in raw.items()}, error, 0
         elif (waited := waited + 1) == PATIENCE:
+            break
+        if is_too_slow(removed, rounds - number - 1, error, most):
             break
         if progress:
             progress((number + 1) / rounds)

@@ -32,8 +32,10 @@ from trainer.fitting.predictor import Predictor, lights_of
 from trainer.model.model import Model, Values
 
 HOLD = 0.01  # `hold` of fits far from the truth
-# A fit is given up where a step is expected to leave more than so many times enough, and this share of what there is.
-FAR, SLOW = 10.0, 0.5
+ROUGH = 5e-3  # `tolerance` of fits that only compare, or that others follow
+# A fit is given up where a step is expected to leave more than so many times enough, and this share of what there is;
+# and where it would not come there if each step that it still has removed so many times what the last one did.
+FAR, SLOW, FASTER = 10.0, 0.5, 2.0
 BLOCK = 1 << 18  # pixels
 
 
@@ -92,12 +94,12 @@ def fit(
     fixed : collection of (str, str)
         Effects and those of their parameters that keep their values.
     enough : float
-        Excess at which the fit is of use: it is given up where it will hardly come near. As `hold`, for tables only.
+        Excess at which the fit is of use: it is given up where it will hardly come there.
     """
     with torch.no_grad():
         many = tuple(n for n in free if has_many(model.instance(n)))
         if many:
-            return _fit_many(model, tuple(free), many, batches, iterations, tolerance, progress)
+            return _fit_many(model, tuple(free), many, batches, iterations, tolerance, progress, enough)
         return _fit(model, tuple(free), batches, iterations, tolerance, progress, hold, fixed, enough)
 
 
@@ -158,6 +160,9 @@ def _fit(
         removed_excess = before - errors.excess
         if fresh and removed_excess < max(tolerance * abs(errors.excess), 2e-6):
             break
+        if fresh and is_too_slow(removed_excess, iterations - iteration - 1, errors.excess, enough):
+            settled = False
+            break
         # Secants are costly: they are used again while a step still removes more than half of what is left.
         fresh = not removed_excess > 0.5 * before
         if fresh and iteration + 1 < iterations:
@@ -180,6 +185,7 @@ def _fit_many(
     iterations: int,
     tolerance: float,
     progress: Progress | None,
+    enough: float,
 ) -> FitResult:
     """The same fit where the effects `many` have too many numbers for a table of derivatives."""
     predictors = [Predictor(model, b) for b in batches]
@@ -213,7 +219,11 @@ def _fit_many(
         if not accepted:
             break
         model, points, residuals, errors = trial, trial_points, trial_residuals, trial_errors
-        if before - errors.excess < max(tolerance * abs(errors.excess), 2e-6):
+        removed_excess = before - errors.excess
+        if removed_excess < max(tolerance * abs(errors.excess), 2e-6):
+            break
+        if is_too_slow(removed_excess, iterations - iteration - 1, errors.excess, enough):
+            settled = False
             break
     else:
         settled = False
@@ -232,6 +242,11 @@ def _fit_many(
     spread = np.concatenate([_spread(keys, covariance, normal), spread_of_many])
     model = with_measured_values(_with_errors(model, every, spread), free, batches)
     return FitResult(model, errors, whole, every, settled)
+
+
+def is_too_slow(removed: float, steps: int, error: float, enough: float) -> bool:
+    """Whether a fit whose last step removed so much will hardly bring the error to `enough` in so many more."""
+    return error - FASTER * steps * max(removed, 0.0) > enough
 
 
 @torch.no_grad()

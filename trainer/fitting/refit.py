@@ -9,7 +9,7 @@ import torch
 
 from trainer.captures.batches import Batch
 from trainer.fitting.further_numbers import with_numbers_that_pay
-from trainer.fitting.gauss_newton import FitResult, fit
+from trainer.fitting.gauss_newton import ROUGH, FitResult, fit
 from trainer.fitting.predictor import Predictor, telling
 from trainer.fitting.start_points import pattern_search
 from trainer.model.model import EffectInstance, Model
@@ -28,9 +28,19 @@ def settled(model: Model, batches: Sequence[Batch]) -> FitResult:
 
 
 def fit_from(
-    model: Model, start: EffectInstance, batches: Sequence[Batch], iterations: int = 12
+    model: Model,
+    start: EffectInstance,
+    batches: Sequence[Batch],
+    iterations: int = 12,
+    enough: float = math.inf,
 ) -> FitResult:
-    """Fit one effect from a start; where derivatives do not reach far, after a pattern search and in turns."""
+    """Fit one effect from a start; where derivatives do not reach far, after a pattern search and in turns.
+
+    Parameters
+    ----------
+    enough : float
+        Excess at which the fit is of use: it is given up where it will hardly come there.
+    """
     if start.effect.rugged:
         with torch.no_grad():
             few = [
@@ -40,12 +50,12 @@ def fit_from(
             predictors = [Predictor(model.having(start), b) for b in few]
             points = [p.trace(model) for p in predictors]
             start = pattern_search(model, predictors, points, start)
-    fitted = fit(model.having(start), [start.effect.name], batches, iterations)
+    fitted = fit(model.having(start), [start.effect.name], batches, iterations, ROUGH, enough=enough)
     turns = RUGGED_TURNS if start.effect.rugged else 1
     before = math.inf
-    while not fitted.settled and turns > 1 and fitted.errors.excess < RUGGED_LEFT * before:
+    while not fitted.settled and turns > 1 and fitted.errors.excess < min(RUGGED_LEFT * before, enough):
         before, turns = fitted.errors.excess, turns - 1
-        fitted = fit(fitted.model, [start.effect.name], batches, iterations)
+        fitted = fit(fitted.model, [start.effect.name], batches, iterations, ROUGH)
     return fitted
 
 
@@ -84,7 +94,8 @@ def raise_orders(
         trial = with_numbers_that_pay(fitted.model, names, rising, batches, LEAST_EXPECTED * needed)
         if trial is None:
             return fitted
-        better = fit(trial, names, batches, iterations=8, hold=hold, fixed=fixed)
-        if fitted.errors.excess - better.errors.excess < needed:
+        enough = fitted.errors.excess - needed
+        better = fit(trial, names, batches, 8, ROUGH, hold=hold, fixed=fixed, enough=enough)
+        if better.errors.excess > enough:
             return fitted
         fitted = better
