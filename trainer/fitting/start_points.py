@@ -55,7 +55,7 @@ def pattern_search(
                     step = sign * factor * best.effect.parameter(key[1]).scale
                     trial = stepped(model.having(best), key, step).instance(best.effect.name)
                     cost = cost_of(trial)
-                    if cost < 0.9999 * least:
+                    if cost < 0.999 * least:
                         best, least, improved = trial, cost, True
     return best
 
