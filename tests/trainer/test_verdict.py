@@ -217,6 +217,7 @@ def test_json_has_every_threshold() -> None:
         "complete_share": 0.0,
         "complete_excess": 5e-4,
         "floor": 0.0,
+        "pixel_noise": 0.0,
     }
 
 
@@ -226,3 +227,10 @@ def test_no_threshold_is_below_the_floor_that_the_captures_show() -> None:
     assert t.worth_adding(RemovedExcess(1.1e-3, 1e-6), 0.5, 18)
     assert t.complete(9e-4, 0.5) and not t.complete(1.1e-3, 0.5)
     assert not t.may_be_worth_adding(9e-4, 0.5)
+
+
+def test_the_noise_of_pixels_own_values_is_nothing_to_explain() -> None:
+    t = Thresholds(pixel_noise=1e-3)
+    assert t.complete(1.4e-3, 0.5) and not t.complete(1.6e-3, 0.5)
+    assert t.may_be_worth_adding(1.3e-3, 0.5) and not t.may_be_worth_adding(1.1e-3, 0.5)
+    assert t.worth_adding(RemovedExcess(2.1e-4, 1e-6), 0.5, 18)  # it hides no other effect

@@ -11,14 +11,15 @@ from runtime.program.progress import Progress, no_progress
 from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet, chosen, opened
 from trainer.captures.capture_table import Capture
-from trainer.captures.held_out import FIT_CAPTURES, CaptureRoles, capture_roles, scenes, split, with_stopping
+from trainer.captures.held_out import FIT_CAPTURES, CaptureRoles, capture_roles, scenes, with_stopping
 from trainer.diagnosis.screen import ScreenResult, screen_batches
 from trainer.diagnosis.telling import screened_captures
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.definition import Effect
 from trainer.fitting.free_form_effects import refined, with_free_form
 from trainer.fitting.gains import with_gains
-from trainer.fitting.gauss_newton import FitResult, fit, with_measured_values
+from trainer.fitting.gauss_newton import FitResult, fit
+from trainer.fitting.pixel_values import with_pixel_values
 from trainer.fitting.predictor import evaluate_captures, excess_on
 from trainer.fitting.refit import fit_from, least_for_order, raise_orders
 from trainer.model.history import recorded
@@ -149,10 +150,7 @@ def with_orders_raised(roles: CaptureRoles, fitted: FitResult) -> Model:
     """A fitted model with its effects' orders raised as far as that helps, and numbers by pixel from all captures."""
     batches = load(roles.captures, roles.fitted)
     model = raise_orders(fitted, fitted.model.names, batches, least_for_order).model
-    by_pixel = [p.effect.name for p in model.present if any(q.per_pixel for q in p.effect.parameters)]
-    if by_pixel:  # a number for each pixel asks for all pictures that there are
-        model = with_measured_values(model, by_pixel, load(roles.captures, split(roles.captures).fitted))
-    return model
+    return with_pixel_values(roles.captures, model)
 
 
 def gone_on(

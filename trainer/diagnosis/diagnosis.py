@@ -28,6 +28,7 @@ from trainer.diagnosis.verdict import Thresholds, below_the_noise, noise_floor, 
 from trainer.effects.definition import STAGES, Effect
 from trainer.effects.effect_catalogue import Catalogue
 from trainer.fitting.gains import with_gains
+from trainer.fitting.pixel_values import pixel_noise
 from trainer.fitting.pool import Pool
 from trainer.fitting.predictor import evaluate_captures
 from trainer.formatting import number
@@ -108,6 +109,9 @@ class Diagnosis:
             if self.best is not None:
                 share = 100 * self.best.removed.value / max(self.held_out.excess, 1e-12)
                 also = f" {self.best.effect.name} would explain {min(share, 100):.0f} % of that."
+            noise = self.thresholds.pixel_noise
+            if noise:
+                also += f" The noise in each pixel's own values is {number(noise, 2)} of it."
             return (
                 f"Nothing is missing: what remains above the camera's noise is {left} of the signal's variance."
                 + also
@@ -212,7 +216,9 @@ def diagnose(
     model = with_gains(captures, model, roles.fitted)
     before = evaluate_captures(captures, roles.held_out, model)
     ideal_excess = (ideal or (before if not model.present else ideal_errors(roles, model))).excess
-    thresholds = replace(thresholds, floor=noise_floor(captures, before))
+    thresholds = replace(
+        thresholds, floor=noise_floor(captures, before), pixel_noise=pixel_noise(captures, model)
+    )
     complete = thresholds.complete(before.excess, ideal_excess)
     little = complete and not thresholds.may_be_worth_adding(before.excess, ideal_excess)
 

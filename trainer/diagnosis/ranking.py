@@ -26,6 +26,7 @@ from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.definition import Effect
 from trainer.effects.effect_catalogue import Catalogue
 from trainer.fitting.gauss_newton import FitResult
+from trainer.fitting.pixel_values import is_by_pixel
 from trainer.fitting.pool import Pool
 from trainer.fitting.predictor import evaluate_captures
 from trainer.model.model import Model
@@ -311,8 +312,7 @@ def rank(
 
     def is_worth_adding(one: CandidateFit) -> bool:
         removed = removed_excess(before, one.held_out)
-        per_pixel = any(p.per_pixel for p in known[one.effect].parameters)
-        enough = not per_pixel or removed.value > PIXEL_SHARE * before.excess
+        enough = not is_by_pixel(known[one.effect]) or removed.value > PIXEL_SHARE * before.excess
         return enough and thresholds.worth_adding(removed, ideal_excess, candidates)
 
     ordered = sorted(fits, key=lambda f: f.held_out.excess)

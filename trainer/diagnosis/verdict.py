@@ -82,6 +82,8 @@ class Thresholds:
         A model is complete below the larger of these, absolute and as a share of the ideal model's excess.
     floor : float
         Excess that the captures themselves cannot tell from nothing; no threshold is below it.
+    pixel_noise : float
+        Excess that the noise in the model's values by pixel leaves; it does not count as something to explain.
     """
 
     level: float = 0.05
@@ -90,9 +92,10 @@ class Thresholds:
     complete_share: float = 0.0
     complete_excess: float = 5e-4
     floor: float = 0.0
+    pixel_noise: float = 0.0
 
     def as_json(self) -> dict[str, float]:
-        """Keys `level`, `share`, `excess`, `complete_share`, `complete_excess` and `floor`."""
+        """Keys `level`, `share`, `excess`, `complete_share`, `complete_excess`, `floor`, `pixel_noise`."""
         return asdict(self)
 
     def least(self, ideal_excess: float) -> float:
@@ -114,11 +117,12 @@ class Thresholds:
 
     def complete(self, excess: float, ideal_excess: float) -> bool:
         """Whether what remains is too little to explain."""
-        return is_complete(excess, ideal_excess, self.complete_share, max(self.complete_excess, self.floor))
+        least = max(self.complete_excess, self.floor)
+        return is_complete(excess - self.pixel_noise, ideal_excess, self.complete_share, least)
 
     def may_be_worth_adding(self, excess: float, ideal_excess: float) -> bool:
         """Whether enough remains for any effect to be worth adding."""
-        return excess > self.least(ideal_excess)
+        return excess - self.pixel_noise > self.least(ideal_excess)
 
     def inseparable(self, difference: RemovedExcess, unexplained: float, most: float) -> bool:
         """Whether the data cannot tell two explanations apart.

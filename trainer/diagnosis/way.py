@@ -27,6 +27,7 @@ from trainer.effects.effect_catalogue import Catalogue
 from trainer.fitting.free_form_effects import can_go_on
 from trainer.fitting.further_numbers import next_order
 from trainer.fitting.gains import with_gains
+from trainer.fitting.pixel_values import pixel_noise
 from trainer.fitting.pool import Pool
 from trainer.fitting.predictor import evaluate_captures
 from trainer.model.history import ANEW, IN_COMMON, form_of, recorded
@@ -139,6 +140,7 @@ class Way:
         self._rivals: dict[str, dict[str, EffectInstance]] = {}
         # The last model that was asked which of its maps or curves goes on, and the answer.
         self._asked: tuple[Model, tuple[str, Model, PredictionErrors] | None] | None = None
+        self._noise: tuple[Model, float] | None = None  # of a model's values by pixel
         if end_to_beat is None:
             self.model = recorded(self.model, None, self.errors)
         self._took(ExplanationStep(None, self.errors))
@@ -180,8 +182,11 @@ class Way:
 
     @property
     def _limits(self) -> Thresholds:
-        """As the last diagnosis has them, with the floor of the noise."""
-        return self.diagnoses[-1].thresholds if self.diagnoses else self._thresholds
+        """As the last diagnosis has them, with the floor of the noise, and that of the model's values by pixel."""
+        last = self.diagnoses[-1].thresholds if self.diagnoses else self._thresholds
+        if self._noise is None or self._noise[0] is not self.model:
+            self._noise = self.model, pixel_noise(self._captures, self.model)
+        return replace(last, pixel_noise=self._noise[1])
 
     def _screened(self, progress: Progress) -> list[ScreenResult]:
         return screen_candidates(self._roles, self.model, self._known, self._pool, progress)

@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 from runtime.excess import PredictionErrors
 from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet
-from trainer.captures.held_out import FIT_CAPTURES, capture_roles, split, with_stopping
+from trainer.captures.held_out import FIT_CAPTURES, capture_roles, with_stopping
 from trainer.diagnosis.diagnosis import ideal_errors
 from trainer.diagnosis.verdict import Thresholds, below_the_noise, noise_floor
 from trainer.fitting.free_form_effects import refined
 from trainer.fitting.gains import with_gains
-from trainer.fitting.gauss_newton import fit, with_measured_values
+from trainer.fitting.gauss_newton import fit
+from trainer.fitting.pixel_values import pixel_noise, with_pixel_values
 from trainer.fitting.predictor import evaluate_captures
 from trainer.fitting.refit import fit_from
 from trainer.model.model import Model
@@ -59,11 +60,13 @@ def recalibrate(captures: CaptureSet, model: Model, thresholds: Thresholds | Non
     if any(p.nodes is not None for p in fitted.present):
         first, last = with_stopping(roles.probed, FIT_CAPTURES)
         fitted = refined(fitted, load(captures, first), load(captures, last))
-    by_pixel = [p.effect.name for p in fitted.present if any(q.per_pixel for q in p.effect.parameters)]
-    if by_pixel:
-        fitted = with_measured_values(fitted, by_pixel, load(captures, split(captures).fitted))
+    fitted = with_pixel_values(captures, fitted)
     after = evaluate_captures(captures, roles.held_out, fitted)
-    limits = replace(thresholds or Thresholds(), floor=noise_floor(captures, after))
+    limits = replace(
+        thresholds or Thresholds(),
+        floor=noise_floor(captures, after),
+        pixel_noise=pixel_noise(captures, fitted),
+    )
     ideal = ideal_errors(roles, fitted).excess
     complete = limits.complete(after.excess, ideal) and not below_the_noise(after)
     return Recalibration(fitted, before, after, complete)

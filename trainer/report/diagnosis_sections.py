@@ -229,6 +229,11 @@ def thresholds(found: Any) -> list[tuple[str, str]]:
     if ideal is not None:
         worth += f"; here more than {number(max(share * ideal, least))}"
         done += f"; here below {number(max(complete * ideal, bound))}"
+    known = {
+        "floor": "repeated pictures leave in doubt, and nothing below it counts",
+        "pixel_noise": "the noise in each pixel's own values makes, and nothing can explain",
+    }
+    rows += [(f"excess that {what}", number(limits[key])) for key, what in known.items() if limits.get(key)]
     return [
         *rows,
         ("an effect is worth adding when it removes", worth),

@@ -128,6 +128,7 @@ def propose(
     if not has_no_name(found):
         report(1.0, "done")
         return Proposals(found)
+    thresholds = found.thresholds  # with what the captures themselves cannot tell
     work = RoundWork(capture_roles(captures), known, pool, drafts, thresholds, found.ideal_excess)
     current, errors = found.model, found.held_out
     report(0.4, "probing the stages")
