@@ -254,12 +254,11 @@ def fit_with_present(
     """
     ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
     few = ids_of(telling_captures(roles.captures, roles.fitted, model)) if len(screened) > 1 else ids
+    begun: list[tuple[ScreenResult, Model | None]] = [(s, None) for s in screened]
     if len(few) < len(ids):
         on_few = pool.map(try_together_on_few, [(roles.folder, few, model, s.start) for s in screened])
         most = NEAR * min(excess for _, excess in on_few) + least
         begun = [(s, there) for s, (there, excess) in zip(screened, on_few, strict=True) if excess <= most]
-    else:
-        begun = [(s, None) for s in screened]  # type: ignore[misc]
     return pool.map_here_if_one(
         try_with_present, [(roles.folder, ids, held, model, s.start, there) for s, there in begun]
     )
