@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from threading import Event, Lock, Thread
 
 EVERY_S = 10.0  # seconds between two lines
 EVERY_STEP_S = 1.0  # seconds between two lines of `--verbose` and `--log`, where steps are fast
@@ -42,17 +44,41 @@ class ProgressLines:
             clock,
         )
         self._begin = self._last = clock()
+        self._done = 0.0
         self._doing = self._what = ""  # what is done, and what the last line said of it
+        self._lock = Lock()
 
     def __call__(self, done: float, what: str = "") -> None:
         """Say how far the work is, if it is time to."""
-        now, what = self._clock(), what or self._doing
-        self._doing = what
+        with self._lock:
+            self._done, self._doing = done, what or self._doing
+            self._say_if_time()
+
+    @contextmanager
+    def going_on(self) -> Iterator[None]:
+        """Say a line when it is time to also while the work itself says nothing, for as long as this lasts."""
+        ended = Event()
+
+        def watch() -> None:
+            while not ended.wait(self._every_s / 10):
+                with self._lock:
+                    self._say_if_time()
+
+        thread = Thread(target=watch, name="progress lines", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
+
+    def _say_if_time(self) -> None:
+        now, what = self._clock(), self._doing
         changed = (
             self._each_step and what != self._what and (not self._what or now - self._last >= EVERY_STEP_S)
         )
         if now - self._last < self._every_s and not changed:
             return
         self._last, self._what = now, what
-        share = min(max(done, 0.0), 1.0)
+        share = min(max(self._done, 0.0), 1.0)
         self._say(f"{100 * share:.0f} % {what or self._title} ({now - self._begin:.0f} s)")

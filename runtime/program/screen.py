@@ -134,7 +134,8 @@ class Screen:
                 said(done, what)
                 logged(done, what)
 
-            yield lines
+            with said.going_on():
+                yield lines
             return
         from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
         from rich.progress import Progress as Bars

@@ -9,6 +9,7 @@ import sys
 from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import pytest
@@ -66,6 +67,25 @@ def test_work_that_does_not_say_what_it_does_still_does_the_same() -> None:
         now = at
         progress(done, what)
     assert lines == ["20 % working (10 s)", "30 % step (12 s)", "50 % step (24 s)", "60 % other (26 s)"]
+
+
+def test_a_line_comes_also_while_the_work_itself_says_nothing() -> None:
+    """A screen of all effects at full size says nothing for minutes."""
+    lines: list[str] = []
+    said = Event()
+
+    def say(line: str) -> None:
+        lines.append(line)
+        if len(lines) == 2:
+            said.set()
+
+    progress = ProgressLines("working", say, every_s=0.05)
+    progress(0.3, "screening")
+    with progress.going_on():
+        assert said.wait(60)
+    assert all(line.startswith("30 % screening (") for line in lines)
+    ended = len(lines)
+    assert not Event().wait(0.2) and len(lines) == ended
 
 
 def test_verbose_says_every_step_and_quiet_nothing(capsys: pytest.CaptureFixture[str]) -> None:
