@@ -17,6 +17,7 @@ from trainer.model.model import EffectInstance, Model, absent
 # An effect that starts anew is back where it was where it leaves the excess that there was, up to the first of these
 # factors, and nowhere near where it leaves more than the second times as much.
 BACK, NOWHERE = 1.1, 10.0
+THERE = 0.1  # of what there is: what a fit to few captures leaves of all where a fit to all may begin at once
 
 
 @dataclass(frozen=True)
@@ -179,13 +180,17 @@ def try_with_present(
     Parameters
     ----------
     on_few : Model, optional
-        The same, all fitted to a few of the captures: where to begin, if that leaves less than the effect alone.
+        The same, all fitted to a few of the captures: where to begin, if that leaves less than the effect alone, which
+        is not fitted where it leaves less than a tenth of what there is.
     """
     captures = opened(folder)
     batches = load(captures, chosen(captures, ids))
-    alone = fit_from(model, start, batches, iterations=8)
-    is_nearer = on_few is not None and excess_on(on_few, batches) < alone.errors.excess
-    started = on_few if on_few and is_nearer else alone.model
+    left = math.inf if on_few is None else excess_on(on_few, batches)
+    started = on_few
+    if on_few is None or left > THERE * excess_on(model, batches):
+        alone = fit_from(model, start, batches, iterations=8)
+        started = on_few if left < alone.errors.excess else alone.model
+    assert started is not None
     together = fit(started, started.names, batches)
     return replace(_judged(start.effect.name, together.model, captures, held_ids), together=together)
 
