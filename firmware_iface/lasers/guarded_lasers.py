@@ -29,6 +29,7 @@ from firmware_iface.errors import DeviceError, DeviceGoneError, InputError
 from firmware_iface.lasers.channels import LaserChannel
 from firmware_iface.lasers.eye_safety import GatedLight
 from firmware_iface.lasers.lasers import RAMP_S, RAMP_STEPS
+from firmware_iface.repeated import repeated
 
 TICK_S = 0.020
 STEP_S = RAMP_S / RAMP_STEPS
@@ -127,22 +128,16 @@ class GuardedLasers:
         It shows that the interpreter runs, not that the program makes progress: a service calls `heartbeat` from its
         loop.
         """
-        ended = threading.Event()
 
-        def beat() -> None:
-            while not ended.wait(TICK_S):
-                try:
-                    self.heartbeat()
-                except DeviceError:
-                    return  # dark; the next use of the lasers raises
+        def beat() -> bool:
+            try:
+                self.heartbeat()
+            except DeviceError:
+                return False  # dark; the next use of the lasers raises
+            return True
 
-        thread = threading.Thread(target=beat, daemon=True)
-        thread.start()
-        try:
+        with repeated(beat, TICK_S):
             yield
-        finally:
-            ended.set()
-            thread.join()
 
     def close(self) -> None:
         """End the guard, which goes dark first. May be called again."""

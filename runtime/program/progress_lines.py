@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from threading import Event, Lock, Thread
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from threading import Lock
+
+from firmware_iface.repeated import repeated
 
 EVERY_S = 10.0  # seconds between two lines
 EVERY_STEP_S = 1.0  # seconds between two lines of `--verbose` and `--log`, where steps are fast
@@ -54,23 +56,15 @@ class ProgressLines:
             self._done, self._doing = done, what or self._doing
             self._say_if_time()
 
-    @contextmanager
-    def going_on(self) -> Iterator[None]:
+    def going_on(self) -> AbstractContextManager[None]:
         """Say a line when it is time to also while the work itself says nothing, for as long as this lasts."""
-        ended = Event()
 
-        def watch() -> None:
-            while not ended.wait(self._every_s / 10):
-                with self._lock:
-                    self._say_if_time()
+        def watch() -> bool:
+            with self._lock:
+                self._say_if_time()
+            return True
 
-        thread = Thread(target=watch, name="progress lines", daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            ended.set()
-            thread.join()
+        return repeated(watch, self._every_s / 10)
 
     def _say_if_time(self) -> None:
         now, what = self._clock(), self._doing
