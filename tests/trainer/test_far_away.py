@@ -17,8 +17,8 @@ from trainer.captures.batches import Batch, load
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.held_out import capture_roles
 from trainer.captures.smoothing import smoothed
-from trainer.diagnosis.diagnosis import screen_candidates
 from trainer.diagnosis.explanation import explain
+from trainer.diagnosis.screening import screen_candidates
 from trainer.diagnosis.together import JointExplanation, explain_together
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import Catalogue, catalogue

@@ -17,7 +17,9 @@ def near(monkeypatch: pytest.MonkeyPatch, before: float, few: dict[str, float], 
     monkeypatch.setattr(ranking, "telling_captures", lambda *_: [])
     monkeypatch.setattr(ranking, "evaluate_captures", lambda *_: left)
     effect = SimpleNamespace(rugged=False, orders=(0,))
-    screened: list[Any] = [SimpleNamespace(effect=name, start=SimpleNamespace(effect=effect)) for name in few]
+    screened: list[Any] = [
+        SimpleNamespace(effect=name, whole=True, start=SimpleNamespace(effect=effect)) for name in few
+    ]
 
     def fitted(task: Any, arguments: list[Any], progress: Any = None) -> list[Any]:
         if task is ranking.try_on_few:

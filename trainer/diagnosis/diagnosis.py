@@ -14,18 +14,18 @@ from trainer.captures.bench_file import Camera
 from trainer.captures.camera_numbers import camera_of_residual
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.capture_table import ids_of
-from trainer.captures.held_out import CaptureRoles, capture_roles, scenes
+from trainer.captures.held_out import CaptureRoles, capture_roles
 from trainer.diagnosis.bench_facts import EqualFact, EqualFacts, camera_facts, equal_facts
 from trainer.diagnosis.fitted_ranking import fitted_ranking
 from trainer.diagnosis.previews import CandidatePreview, previews
 from trainer.diagnosis.probes import ProbeResult, probe
 from trainer.diagnosis.ranking import RankedEffect
-from trainer.diagnosis.screen import ScreenResult, screen, shares_of_work
+from trainer.diagnosis.screen import ScreenResult
+from trainer.diagnosis.screening import screen_candidates
 from trainer.diagnosis.separate import captures_that_separate
 from trainer.diagnosis.table_facts import DRIFT, exposure_facts, facts_sentence, plane_facts
-from trainer.diagnosis.telling import screened_captures
 from trainer.diagnosis.verdict import Thresholds, below_the_noise, noise_floor, verdict_of
-from trainer.effects.definition import STAGES, Effect
+from trainer.effects.definition import STAGES
 from trainer.effects.effect_catalogue import Catalogue
 from trainer.fitting.gains import with_gains
 from trainer.fitting.pixel_values import pixel_noise
@@ -290,29 +290,6 @@ def _exposures(roles: CaptureRoles, model: Model, names: Collection[str]) -> tup
     """Exposures that captures.csv states wrongly, where a gain of each capture is among the effects that help."""
     rows = {c.capture: c for c in (*roles.fitted, *roles.held_out)}
     return exposure_facts(roles.captures, tuple(rows.values()), model) if DRIFT in names else ()
-
-
-def tells(effect: Effect, captures: CaptureSet) -> bool:
-    """Whether captures can tell an effect from the one that it equals at one colour and plane."""
-    return not effect.same_as or len(scenes(captures.captures)) > 1
-
-
-def screen_candidates(
-    roles: CaptureRoles, model: Model, known: Catalogue, pool: Pool, report: Progress
-) -> list[ScreenResult]:
-    """Screen the effects that a model lacks and that the captures can tell, shared out among the pool's workers."""
-    candidates = [e for e in known.values() if e.name not in model.names and tells(e, roles.captures)]
-    # One share for each worker, as each costs the slopes of all that is present.
-    shares = shares_of_work(candidates, model, pool.workers)
-    ids = ids_of(screened_captures(roles, model))
-    what = f"screening {len(candidates)} effects"
-    report(0.05, what)
-    results = pool.map(
-        screen,
-        [(roles.folder, ids, model, tuple(share)) for share in shares],
-        lambda n: report(0.05 + 0.25 * n / len(shares), what),
-    )
-    return [one for share in results for one in share]
 
 
 def probe_all(

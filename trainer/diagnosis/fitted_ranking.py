@@ -21,6 +21,7 @@ from trainer.diagnosis.ranking import (
     try_together_with_present,
 )
 from trainer.diagnosis.screen import ScreenResult
+from trainer.diagnosis.screening import screened_whole
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import Catalogue
 from trainer.fitting.pool import Pool
@@ -102,7 +103,8 @@ def fitted_ranking(
         return [*found, *(r for r in ranking if r.effect.name not in names)]
 
     if model.present:  # the screen lets them move, and sees what they hide
-        found = jointly({s.effect: model.having(s.start) for s in order[:FITTED_TOGETHER]})
+        first = screened_whole(roles, model, order[:FITTED_TOGETHER], pool)
+        found = jointly({s.effect: model.having(s.start) for s in first})
         if found[0].worth_adding and found[0].held_out.excess < CLEARLY * before.excess:
             return before_others(found), fits
     rest = [s for s in order if s.effect not in {f.effect for f in fits}]

@@ -21,6 +21,7 @@ from trainer.diagnosis.candidate_fits import (
     try_with_present,
 )
 from trainer.diagnosis.screen import ScreenResult
+from trainer.diagnosis.screening import screened_whole
 from trainer.diagnosis.telling import telling_captures
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.definition import Effect
@@ -109,7 +110,7 @@ def try_all(
     """
     ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
     # The longest first, so that no process is left with one of them at the end.
-    screened = sorted(screened, key=lambda s: not s.start.effect.rugged)
+    screened = sorted(screened_whole(roles, model, screened, pool), key=lambda s: not s.start.effect.rugged)
 
     def fitted(count: int) -> None:
         report(start + (end - start) * count / max(1, len(screened)), "fitting candidates")
@@ -158,7 +159,7 @@ def try_near(
         return try_all(roles, model, screened, pool, report, start, end)
     telling = telling_captures(roles.captures, roles.fitted, model)
     few = ids_of(telling)
-    screened = sorted(screened, key=lambda s: not s.start.effect.rugged)
+    screened = sorted(screened_whole(roles, model, screened, pool), key=lambda s: not s.start.effect.rugged)
     ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
     before, *compared = (
         evaluate_captures(roles.captures, telling, one).excess for one in (model, *(f.model for f in others))
@@ -253,6 +254,7 @@ def fit_with_present(
         Excess that makes no difference.
     """
     ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
+    screened = screened_whole(roles, model, screened, pool)
     few = ids_of(telling_captures(roles.captures, roles.fitted, model)) if len(screened) > 1 else ids
     begun: list[tuple[ScreenResult, Model | None]] = [(s, None) for s in screened]
     if len(few) < len(ids):

@@ -46,12 +46,15 @@ class ScreenResult:
         Where a fit should start.
     before, after : float
         Excess on the screened captures, without the effect and as expected with it.
+    whole : bool
+        Of a capture of each colour and plane; False: of one alone, and `after` is so much of `before` as it is there.
     """
 
     effect: str
     start: EffectInstance
     before: float
     after: float
+    whole: bool = True
 
     @property
     def removed_excess(self) -> float:
@@ -136,6 +139,12 @@ def _needs_wider_band(model: Model, start: EffectInstance, predictors: Sequence[
     """Whether an effect opens the iris farther than there is room: then wider starts looked like this one."""
     needed = Predictor(model.having(start), predictors[0].batch).scene.grid.band
     return max(needed) > max(predictors[0].scene.grid.band)
+
+
+def starts_from_one(effect: Effect) -> bool:
+    """Whether one colour and plane say where a fit of an effect starts in all of them."""
+    alike = effect.colours == "alike" or (effect.colours == "either" and effect.rugged)
+    return alike and effect.starts is None
 
 
 def shares_of_work(effects: Sequence[Effect], model: Model, count: int) -> list[list[Effect]]:

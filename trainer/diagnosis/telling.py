@@ -1,4 +1,4 @@
-"""Captures that say most of what a model lacks: of each colour and plane, the one that it explains worst."""
+"""Captures that say most of what a model lacks: those that it explains worst."""
 
 from __future__ import annotations
 
@@ -15,9 +15,20 @@ from trainer.fitting.side_by_side import side_by_side
 from trainer.model.model import Model
 
 
-@torch.no_grad()
 def telling_captures(captures: CaptureSet, rows: Sequence[Capture], model: Model) -> list[Capture]:
     """The capture of each colour and plane of which a model leaves most unexplained, in counts."""
+    ordered = _by_unexplained(captures, rows, model)
+    return list({(c.channel, c.plane_mm): c for c in ordered}.values())
+
+
+def most_telling_capture(captures: CaptureSet, rows: Sequence[Capture], model: Model) -> Capture:
+    """The capture of which a model leaves most unexplained, in counts."""
+    return _by_unexplained(captures, rows, model)[-1]
+
+
+@torch.no_grad()
+def _by_unexplained(captures: CaptureSet, rows: Sequence[Capture], model: Model) -> list[Capture]:
+    """Captures, the one of which a model leaves least unexplained first."""
 
     def left(row: Capture) -> float:
         batch = load_batch(captures, [row])
@@ -26,8 +37,7 @@ def telling_captures(captures: CaptureSet, rows: Sequence[Capture], model: Model
 
     panel = captures.bench.panel
     unexplained = side_by_side(left, rows, panel.width * panel.height)
-    ordered = sorted(zip(unexplained, rows, strict=True), key=lambda one: one[0])
-    return list({(c.channel, c.plane_mm): c for _, c in ordered}.values())
+    return [row for _, row in sorted(zip(unexplained, rows, strict=True), key=lambda one: one[0])]
 
 
 def screened_captures(roles: CaptureRoles, model: Model) -> Sequence[Capture]:
