@@ -112,6 +112,12 @@ def test_an_order_is_raised_as_far_as_the_captures_ask_and_no_farther(tmp_path: 
     best = raise_orders(lowest, ["vignetting"], batches, least_for_order)
     assert best.model.present[0].order == 4
     assert best.model.present[0].values["log_gain"] == pytest.approx(terms, abs=3e-3)
+    # Where the camera's noise is all but a tenth of what a complete model may leave, captures ask for nothing.
+    errors = lowest.errors
+    share = 3e-5 * float(errors.variance.sum() / errors.squared.sum())
+    noisy = replace(lowest, errors=replace(errors, noise=(1 - share) * errors.squared))
+    assert noisy.errors.excess == pytest.approx(3e-5)
+    assert raise_orders(noisy, ["vignetting"], batches, least_for_order) is noisy
 
 
 def test_orders_of_two_effects_are_raised_together(tmp_path: Path) -> None:

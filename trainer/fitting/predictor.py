@@ -194,5 +194,17 @@ def excess_on(model: Model, batches: Sequence[Batch]) -> float:
 
 def telling(model: Model, batch: Batch, count: int) -> Batch:
     """The captures of a batch of which a model leaves most unexplained, in counts, in their order."""
-    left = (batch.mask * (batch.signal - Predictor(model, batch).predict(model)) ** 2).sum((1, 2))
+    left = _unexplained(model, batch)
     return batch.only(sorted(left.argsort(descending=True)[:count].tolist()))
+
+
+def telling_batches(model: Model, batches: Sequence[Batch], count: int) -> Sequence[Batch]:
+    """The batches with the captures of which a model leaves most unexplained, in counts; that one first."""
+    if len(batches) <= count:
+        return batches
+    return sorted(batches, key=lambda b: -float(_unexplained(model, b).max()))[:count]
+
+
+def _unexplained(model: Model, batch: Batch) -> Tensor:
+    """Squared error of each capture [B], in counts."""
+    return (batch.mask * (batch.signal - Predictor(model, batch).predict(model)) ** 2).sum((1, 2))

@@ -10,14 +10,15 @@ import torch
 from trainer.captures.batches import Batch
 from trainer.fitting.further_numbers import with_numbers_that_pay
 from trainer.fitting.gauss_newton import ROUGH, FitResult, fit
-from trainer.fitting.predictor import Predictor, telling
+from trainer.fitting.predictor import Predictor, telling, telling_batches
 from trainer.fitting.start_points import pattern_search
 from trainer.model.model import EffectInstance, Model
 
-SEARCH_PIXELS = 2 * 240 * 320  # of a scene, at least one capture: a pattern search need only come near
-SEARCH_SCENES = 3
+# A pattern search need only come near: of so many colours and planes, and with so many pixels in all, or one capture.
+SEARCH_SCENES, SEARCH_PIXELS = 3, 6 * 240 * 320
 # An iris's edge goes one frequency sample a step: its fit goes on while each turn leaves less than this share.
 RUGGED_TURNS, RUGGED_LEFT = 3, 0.8
+NOTHING = 5e-5  # excess, a tenth of what a complete model may leave: captures say no more of it
 # Of the excess that further numbers must remove: where a straight line expects less, it is not fitted.
 LEAST_EXPECTED = 0.5
 
@@ -43,10 +44,7 @@ def fit_from(
     """
     if start.effect.rugged:
         with torch.no_grad():
-            few = [
-                telling(model, b, max(1, SEARCH_PIXELS // b.signal[0].numel()))
-                for b in batches[:SEARCH_SCENES]
-            ]
+            few = _for_search(model, batches)
             predictors = [Predictor(model.having(start), b) for b in few]
             points = [p.trace(model) for p in predictors]
             start = pattern_search(model, predictors, points, start)
@@ -59,9 +57,20 @@ def fit_from(
     return fitted
 
 
+def _for_search(model: Model, batches: Sequence[Batch]) -> list[Batch]:
+    """Captures for a pattern search, of which a model leaves most unexplained."""
+    pixels = batches[0].signal[0].numel()
+    scenes = min(SEARCH_SCENES, max(1, SEARCH_PIXELS // pixels))
+    each = max(1, SEARCH_PIXELS // (SEARCH_SCENES * pixels))
+    return [telling(model, b, each) for b in telling_batches(model, batches, scenes)]
+
+
 def least_for_order(excess: float) -> float:
-    """Excess that a higher order must remove: a twentieth of what is left, and more than what noise can."""
-    return max(0.05 * excess, 1e-5)
+    """Excess that a higher order must remove: a twentieth of what is left, and more than what noise can.
+
+    None removes enough where next to nothing is left.
+    """
+    return math.inf if excess < NOTHING else max(0.05 * excess, 1e-5)
 
 
 def raise_orders(
@@ -91,6 +100,8 @@ def raise_orders(
     rising = [n for n in names if n not in {name for name, _ in fixed}]
     while True:
         needed = gain_needed(fitted.errors.excess)
+        if needed > fitted.errors.excess:
+            return fitted
         trial = with_numbers_that_pay(fitted.model, names, rising, batches, LEAST_EXPECTED * needed)
         if trial is None:
             return fitted
