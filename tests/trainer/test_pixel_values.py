@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
+from PIL import Image
 
 from tests.trainer.hidden import bench_file
 from trainer.captures.acquire import acquire_from
@@ -46,6 +49,30 @@ def test_what_is_left_of_a_fixed_pattern_is_what_noise_leaves(drifts: bool, tmp_
     left = evaluate_captures(captures, roles.held_out, model).excess
     assert left > 1e-3
     assert pixel_noise(captures, model) == pytest.approx(left, rel=0.15)
+
+
+def test_a_slow_panels_first_capture_says_nothing_of_pixels(tmp_path: Path) -> None:
+    """Nobody knows what it showed before: with that capture, twice as much was left."""
+    names = ("slow_response", "fixed_pattern")
+    captures = captured(tmp_path, *(f'kind = "{name}"' for name in names))
+    roles = capture_roles(captures)
+    model = with_gains(captures, Model(captures.bench), roles.fitted)
+    for name in names:
+        start = absent(catalogue()[name], captures.bench)
+        model = fit_from(model, start, load(captures, roles.fitted)).model
+    model = with_pixel_values(captures, model)
+    left = evaluate_captures(captures, roles.held_out, model).excess
+    assert 1e-3 < left < 1.4 * pixel_noise(captures, model)
+
+    def gains(one: Model) -> NDArray:
+        return with_pixel_values(captures, one).instance("fixed_pattern").values["gain"]
+
+    of_slow, of_quick = gains(model), gains(model.without("slow_response"))
+    first = captures.captures[0].image
+    Image.fromarray(np.asarray(Image.open(first)) // 2).save(first)
+    captures = read_captures(captures.folder)
+    np.testing.assert_array_equal(gains(model), of_slow)
+    assert np.abs(gains(model.without("slow_response")) - of_quick).max() > 0.01
 
 
 def test_a_model_that_leaves_the_noise_of_pixels_is_complete_and_says_so(tmp_path: Path) -> None:

@@ -6,8 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from trainer.captures.batches import Batch, load, signal_variance
+from trainer.captures.batches import Batch, load, load_batch, signal_variance
 from trainer.captures.capture_set import CaptureSet
+from trainer.captures.capture_table import Capture
 from trainer.captures.held_out import split
 from trainer.effects.definition import Effect
 from trainer.fitting.gauss_newton import with_measured_values
@@ -26,7 +27,7 @@ def is_by_pixel(effect: Effect) -> bool:
 def with_pixel_values(captures: CaptureSet, model: Model) -> Model:
     """The model with its values by pixel read off all captures that fits may see: the more, the less of their noise."""
     names = [p.effect.name for p in model.present if is_by_pixel(p.effect)]
-    return with_measured_values(model, names, load(captures, split(captures).fitted)) if names else model
+    return with_measured_values(model, names, load(captures, _read_off(captures, model))) if names else model
 
 
 @torch.no_grad()
@@ -56,7 +57,7 @@ def pixel_noise(captures: CaptureSet, model: Model) -> float:
     if not values or not roles.is_held_out:
         return 0.0
     told = torch.zeros(1, dtype=torch.float64)
-    for batch in load(captures, roles.fitted):
+    for batch in load(captures, _read_off(captures, model)):
         slopes = _slopes(model, values, batch)
         told = told + torch.einsum("kbyx,lbyx,byx->yxkl", slopes, slopes, (batch.mask / batch.noise).double())
     found = torch.stack([torch.from_numpy(model.instance(e).values[p]).to(told) for e, p in values], dim=-1)
@@ -67,6 +68,14 @@ def pixel_noise(captures: CaptureSet, model: Model) -> float:
         slopes = _slopes(model, values, batch)
         left += float(torch.einsum("kbyx,yxkl,lbyx,byx->", slopes, scatter, slopes, batch.mask.double()))
     return left / signal_variance(held_out)
+
+
+def _read_off(captures: CaptureSet, model: Model) -> list[Capture]:
+    """The captures that fits may see; of a slow panel not the set's first: nobody knows what was shown before."""
+    first, *_ = captures.captures
+    parts = Predictor(model, load_batch(captures, [first])).parts(model)
+    slow = any(stages.drive.persistence is not None for _, stages in parts)
+    return [row for row in split(captures).fitted if not slow or row.capture != first.capture]
 
 
 def _slopes(model: Model, values: list[tuple[str, str]], batch: Batch) -> Tensor:
