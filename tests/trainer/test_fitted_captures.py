@@ -18,6 +18,14 @@ def test_of_a_repeated_pattern_the_last_capture_is_taken() -> None:
     assert sorted(c.capture for c in sample(rows, 1, 8)) == ["1", "3", "4"]
 
 
+def test_a_sets_first_capture_is_taken_last() -> None:
+    """A fit of a slow panel's response to it would be a fit to what was never shown."""
+    rows = [row(k, f"p{k}") for k in range(8)]
+    assert sample(rows, 1, 3)[0] is rows[0]
+    assert [c.capture for c in sample(rows, 1, 3, rows[0])] == ["4", "2", "6"]
+    assert sorted(c.capture for c in sample(rows, 1, 8, rows[0])) == [c.capture for c in rows]
+
+
 def test_each_plane_has_a_capture_and_patterns_are_spread() -> None:
     rows = [row(k, f"p{k}") for k in range(8)] + [row(8 + k, f"p{k}", 40.0) for k in range(8)]
     taken = sample(rows, 1, 4)

@@ -98,10 +98,13 @@ def with_stopping(rows: Sequence[Capture], most: int) -> tuple[list[Capture], li
     return first, last
 
 
-def sample(captures: Iterable[Capture], pixels: int, most: int) -> list[Capture]:
+def sample(
+    captures: Iterable[Capture], pixels: int, most: int, first: Capture | None = None
+) -> list[Capture]:
     """Different patterns for a fit, spread over colours and planes, each as it was captured last.
 
-    A repeat follows its own pattern. What a slow panel showed before the first capture of a set, nobody knows.
+    A repeat follows its own pattern. What a slow panel showed before the first capture of a set, nobody knows: that one
+    is the last to be chosen.
 
     Parameters
     ----------
@@ -110,6 +113,8 @@ def sample(captures: Iterable[Capture], pixels: int, most: int) -> list[Capture]
         Of one capture; FIT_PIXELS in all are enough for each colour and plane.
     most : int
         Captures at most, but at least one for each colour and plane.
+    first : Capture, optional
+        Of the set.
 
     Returns
     -------
@@ -121,6 +126,7 @@ def sample(captures: Iterable[Capture], pixels: int, most: int) -> list[Capture]
     columns = [list(patterns.values()) for patterns in by_scene.values()]
     # Patterns of one kind often follow each other: spread the choice over the whole list.
     columns = [[column[i] for i in _spread(len(column))] for column in columns]
+    columns = [sorted(column, key=lambda c: c is first) for column in columns]
     needed = max(len(columns), min(most, FIT_PIXELS * max(1, len(columns)) // max(1, pixels)))
     chosen: list[Capture] = []
     depth = 0
@@ -189,7 +195,8 @@ def capture_roles(captures: CaptureSet) -> CaptureRoles:
     height, width = captures.bench.panel.shape
     pixels = height * width
     count = len(scenes(divided.fitted))
-    fitted = sample(divided.fitted, pixels, max(FIT_CAPTURES, count))
+    first = captures.captures[0]
+    fitted = sample(divided.fitted, pixels, max(FIT_CAPTURES, count), first)
     # A panel that still shows the pattern before is seen only where that was another one.
     after_another = {b.capture for a, b in pairwise(captures.captures) if a.pattern != b.pattern}
 
@@ -198,7 +205,7 @@ def capture_roles(captures: CaptureSet) -> CaptureRoles:
         return found if len(scenes(found)) == count else rows
 
     screened = sample(telling(divided.fitted), pixels, count)
-    probed = sample(divided.fitted, pixels // 2, max(PROBE_CAPTURES, count))
+    probed = sample(divided.fitted, pixels // 2, max(PROBE_CAPTURES, count), first)
     most = max(2 * count, HELD_PIXELS // pixels)
     held_out = list(divided.held_out)
     if len(held_out) > most:
