@@ -153,16 +153,21 @@ def test_a_plainer_one_that_is_not_worth_adding_does_not_come_first() -> None:
     ]
 
 
-@pytest.mark.parametrize(("told", "on_all"), [(("a",), False), (("a", "b"), True)])
-def test_a_fit_goes_on_from_the_rough_one(
-    told: tuple[str, ...], on_all: bool, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("told", "expected"),
+    [
+        (("a",), ["try_together_on_few", "try_with_present"]),
+        (("a", "b"), ["try_with_present"]),  # one capture a colour: few are all that a fit has
+    ],
+)
+def test_no_candidate_is_fitted_twice_to_the_same_captures(
+    told: tuple[str, ...], expected: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And knows where that was to all captures: one capture a colour is all that a large set's fit has."""
-    asked: dict[str, list[Any]] = {}
+    asked: list[str] = []
 
     def noted(task: Any, tasks: list[Any]) -> list[Any]:
-        asked[task.__name__] = tasks
-        return [(Model(BENCH), excess) for excess, _ in zip((0.001, 0.1), tasks, strict=False)]
+        asked.append(task.__name__)
+        return [(Model(BENCH), 0.1) for _ in tasks]
 
     def captures(*names: str) -> list[Any]:
         return [SimpleNamespace(capture=name) for name in names]
@@ -171,12 +176,10 @@ def test_a_fit_goes_on_from_the_rough_one(
     roles: Any = SimpleNamespace(
         captures=None, folder=None, fitted=captures("a", "b"), held_out=captures("c")
     )
-    screened: Any = [SimpleNamespace(start=name, whole=True) for name in ("near", "far")]
+    screened: Any = [SimpleNamespace(start=None, whole=True) for _ in range(2)]
     pool: Any = SimpleNamespace(map=noted, map_here_if_one=noted)
-    assert len(fit_with_present(roles, Model(BENCH), screened, 0.0002, pool)) == 1
-    assert [task[-1] for task in asked["try_together_on_few"]] == ["near", "far"]
-    ((*_, start, begun, there),) = asked["try_with_present"]
-    assert (start, begun is not None, there) == ("near", True, on_all)
+    assert len(fit_with_present(roles, Model(BENCH), screened, 0.0002, pool)) == 2
+    assert asked == expected
 
 
 @pytest.mark.parametrize(("left", "tried"), [(0.0001, 0), (0.0003, 1)])

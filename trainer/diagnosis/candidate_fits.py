@@ -173,26 +173,23 @@ def try_with_present(
     held_ids: tuple[str, ...],
     model: Model,
     start: EffectInstance,
-    begun: Model | None = None,
-    on_all: bool = False,
+    on_few: Model | None = None,
 ) -> CandidateFit:
     """Fit one effect to a model, then all of its effects together at the orders that they have, and judge it.
 
     Parameters
     ----------
-    begun : Model, optional
-        The same, all fitted roughly, perhaps to a few of the captures alone: where to begin, if that leaves less than
-        the effect alone, which is not fitted where it leaves less than a tenth of what there is.
-    on_all : bool
-        That was fitted to all of the captures, so there is where to begin.
+    on_few : Model, optional
+        The same, all fitted to a few of the captures: where to begin, if that leaves less than the effect alone, which
+        is not fitted where it leaves less than a tenth of what there is.
     """
     captures = opened(folder)
     batches = load(captures, chosen(captures, ids))
-    left = math.inf if begun is None else excess_on(begun, batches)
-    started = begun
-    if begun is None or not (on_all or left <= THERE * excess_on(model, batches)):
+    left = math.inf if on_few is None else excess_on(on_few, batches)
+    started = on_few
+    if on_few is None or left > THERE * excess_on(model, batches):
         alone = fit_from(model, start, batches, iterations=8)
-        started = begun if left < alone.errors.excess else alone.model
+        started = on_few if left < alone.errors.excess else alone.model
     assert started is not None
     together = fit(started, started.names, batches)
     return replace(_judged(start.effect.name, together.model, captures, held_ids), together=together)

@@ -246,7 +246,7 @@ def fit_with_present(
 ) -> list[CandidateFit]:
     """Fit candidates at their lowest order, each together with the effects that are present.
 
-    Several are fitted roughly first, to few captures where a fit has more, and those that come near the best there on.
+    Several are fitted to few captures first, where a fit has more, and those that come near the best there to all.
 
     Parameters
     ----------
@@ -257,12 +257,12 @@ def fit_with_present(
     screened = screened_whole(roles, model, screened, pool)
     few = ids_of(telling_captures(roles.captures, roles.fitted, model)) if len(screened) > 1 else ids
     begun: list[tuple[ScreenResult, Model | None]] = [(s, None) for s in screened]
-    if len(screened) > 1:
-        roughly = pool.map(try_together_on_few, [(roles.folder, few, model, s.start) for s in screened])
-        most = NEAR * min(excess for _, excess in roughly) + least
-        begun = [(s, there) for s, (there, excess) in zip(screened, roughly, strict=True) if excess <= most]
+    if len(few) < len(ids):
+        on_few = pool.map(try_together_on_few, [(roles.folder, few, model, s.start) for s in screened])
+        most = NEAR * min(excess for _, excess in on_few) + least
+        begun = [(s, there) for s, (there, excess) in zip(screened, on_few, strict=True) if excess <= most]
     return pool.map_here_if_one(
-        try_with_present, [(roles.folder, ids, held, model, s.start, there, few == ids) for s, there in begun]
+        try_with_present, [(roles.folder, ids, held, model, s.start, there) for s, there in begun]
     )
 
 
