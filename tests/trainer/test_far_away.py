@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.held_out import capture_roles
 from trainer.captures.smoothing import smoothed
 from trainer.diagnosis.explanation import explain
+from trainer.diagnosis.screen import ScreenResult
 from trainer.diagnosis.screening import screen_candidates
 from trainer.diagnosis.together import JointExplanation, explain_together
 from trainer.diagnosis.verdict import Thresholds
@@ -123,6 +125,30 @@ def test_what_is_not_needed_is_left_out_again(captures: CaptureSet, together: Jo
     before = evaluate_captures(captures, roles.held_out, ideal).excess
     assert set(together.model.names) == set(HIDDEN)
     assert [name for name, _ in together.ladder] != [] and together.ladder[-1][1].excess < 0.02 * before
+
+
+@pytest.mark.parametrize(("left", "alone"), [(0.45, True), (0.55, False)])
+def test_an_effect_that_only_takes_a_wrong_structure_away_gets_nowhere(
+    left: float, alone: bool, captures: CaptureSet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Even light leaves an excess of 1, half of what a prediction does that is bright where the picture is dark."""
+
+    class AllTogetherError(Exception):
+        """Effects were about to be fitted together."""
+
+    def together(*_: object) -> None:
+        raise AllTogetherError
+
+    roles = capture_roles(captures)
+    ideal = with_gains(captures, Model(captures.bench), roles.fitted)
+    errors = evaluate_captures(captures, roles.held_out, ideal)
+    assert errors.excess > 1.1
+    monkeypatch.setattr("trainer.diagnosis.together.joint_start", together)
+    start = absent(catalogue()["stray_light"], captures.bench)
+    screened = [ScreenResult("stray_light", start, errors.excess, left)]
+    with open_pool(1) as pool, nullcontext() if alone else pytest.raises(AllTogetherError):
+        found = explain_together(roles, ideal, errors, catalogue(), screened, Thresholds(), pool)
+        assert found is None
 
 
 def test_one_strong_effect_alone_is_not_far_away(tmp_path: Path) -> None:

@@ -23,7 +23,11 @@ from trainer.fitting.predictor import evaluate_captures
 from trainer.model.model import Model
 
 FAR = 0.3  # held-out excess from which several strong effects may hide one another
-HELPS = 0.5  # share of the excess that one effect leaves at most if it gets anywhere alone
+# Share of the excess that one effect leaves at most if it gets anywhere alone; of EVEN, what a picture without any
+# structure leaves, where that is less: an effect that only takes a wrong structure away gets nowhere.
+HELPS, EVEN = 0.5, 1.0
+# Excess from which other effects are missing: before these are there, to fit each one anew costs much and says little.
+OTHERS = 0.1
 MOVED = "misregistration"  # to smoothed pictures it does what tilt, curvature and distance do
 
 
@@ -76,13 +80,14 @@ def explain_together(
         not.
     """
     report = progress or no_progress
-    if min((s.after for s in screened), default=errors.excess) < HELPS * errors.excess:
+    half = HELPS * min(errors.excess, EVEN)
+    if min((s.after for s in screened), default=errors.excess) < half:
         return None
     batches = load(roles.captures, roles.fitted)
     joint = joint_start(model, known, batches, part_of(report, 0.0, 0.6))
     joint = fit(joint, joint.names, batches).model
     after = evaluate_captures(roles.captures, roles.held_out, joint)
-    if after.excess > HELPS * errors.excess:
+    if after.excess > half:
         return None
     report(0.6, "looking whether maps go on")
     found, before_maps = joint, after
@@ -93,7 +98,7 @@ def explain_together(
         left = evaluate_captures(roles.captures, roles.held_out, still)
         if left.excess < before_maps.excess:
             joint, after = _with_maps(roles, still, left, thresholds)
-    if not thresholds.complete(after.excess, errors.excess):
+    if after.excess < OTHERS and not thresholds.complete(after.excess, errors.excess):
         report(0.75, "looking whether an effect ends better from another start")
         better = from_another_start(roles, joint, after, pool)
         if better is not None:
