@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from runtime.excess import PredictionErrors
 from runtime.program.progress import Progress, no_progress, part_of
 from trainer.captures.batches import load
+from trainer.captures.capture_set import chosen, opened
+from trainer.captures.capture_table import ids_of
 from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.addition import gone_on
 from trainer.diagnosis.another_start import from_another_start
@@ -28,7 +31,8 @@ FAR = 0.3  # held-out excess from which several strong effects may hide one anot
 HELPS, EVEN = 0.5, 1.0
 # Excess from which other effects are missing: before these are there, to fit each one anew costs much and says little.
 OTHERS = 0.1
-MOVED = "misregistration"  # to smoothed pictures it does what tilt, curvature and distance do
+# To smoothed pictures a moved camera does what tilt, curvature and distance do.
+TAKEN_FOR_EACH_OTHER = ("misregistration", "panel_wavefront")
 
 
 @dataclass(frozen=True)
@@ -92,10 +96,12 @@ def explain_together(
     report(0.6, "looking whether maps go on")
     found, before_maps = joint, after
     joint, after = _with_maps(roles, joint, after, thresholds)
-    if MOVED in found.names and not thresholds.complete(after.excess, errors.excess):
-        report(0.7, "looking whether the camera looks where bench.toml says")
-        still = without_effect(found, MOVED, batches)
-        left = evaluate_captures(roles.captures, roles.held_out, still)
+    doubted = [name for name in TAKEN_FOR_EACH_OTHER if name in found.names]
+    if doubted and not thresholds.complete(after.excess, errors.excess):
+        report(0.7, "looking whether a moved camera and a bent wavefront are taken for each other")
+        ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
+        others = pool.map(_without, [(roles.folder, ids, held, found, name) for name in doubted])
+        still, left = min(others, key=lambda one: one[1].excess)
         if left.excess < before_maps.excess:
             joint, after = _with_maps(roles, still, left, thresholds)
     if after.excess < OTHERS and not thresholds.complete(after.excess, errors.excess):
@@ -110,6 +116,15 @@ def explain_together(
         dropped, joint, after = smaller
         names = names[names.index(dropped) + 1 :]
     return JointExplanation(joint, _ladder(roles, joint, after))
+
+
+def _without(
+    folder: Path, ids: tuple[str, ...], held_ids: tuple[str, ...], model: Model, name: str
+) -> tuple[Model, PredictionErrors]:
+    """A joint model without one effect, the others fitted from smoothed pictures again, and its held-out errors."""
+    captures = opened(folder)
+    rest = without_effect(model, name, load(captures, chosen(captures, ids)))
+    return rest, evaluate_captures(captures, chosen(captures, held_ids), rest)
 
 
 def _with_maps(
