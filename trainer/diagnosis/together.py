@@ -80,8 +80,8 @@ def explain_together(
     Returns
     -------
     JointExplanation or None
-        None where the screen expects that one effect alone removes half of what is missing, and where all together do
-        not.
+        None where the screen expects that one effect alone leaves less than half of what is missing, or of what even
+        light leaves, and where all together leave more.
     """
     report = progress or no_progress
     half = HELPS * min(errors.excess, EVEN)
