@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from trainer.fitting.pixel_values import pixel_noise, with_pixel_values
 from trainer.fitting.pool import open_pool
 from trainer.fitting.predictor import evaluate_captures
 from trainer.fitting.refit import fit_from
-from trainer.model.model import Model, absent
+from trainer.model.model import Model, absent, instance_with
 
 
 def captured(folder: Path, *defects: str, patterns: int = 6) -> CaptureSet:
@@ -73,6 +74,20 @@ def test_a_slow_panels_first_capture_says_nothing_of_pixels(tmp_path: Path) -> N
     captures = read_captures(captures.folder)
     np.testing.assert_array_equal(gains(model), of_slow)
     assert np.abs(gains(model.without("slow_response")) - of_quick).max() > 0.01
+
+
+def test_a_slow_panels_only_capture_is_read_all_the_same(tmp_path: Path) -> None:
+    every = captured(tmp_path, 'kind = "slow_response"', 'kind = "fixed_pattern"')
+    first, other = every.captures[0], every.captures[2]
+    captures = replace(every, captures=(first, other))
+    roles = capture_roles(captures)
+    assert roles.fitted == (first,) and roles.held_out == (other,)
+    model = with_gains(captures, Model(captures.bench), roles.fitted)
+    slow = instance_with(catalogue()["slow_response"], captures.bench, {"share": 0.08})
+    model = model.having(slow).having(absent(catalogue()["fixed_pattern"], captures.bench))
+    model = with_pixel_values(captures, model)
+    assert np.abs(model.instance("fixed_pattern").values["gain"]).max() > 0
+    assert pixel_noise(captures, model) > 0
 
 
 def test_a_model_that_leaves_the_noise_of_pixels_is_complete_and_says_so(tmp_path: Path) -> None:

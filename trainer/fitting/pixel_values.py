@@ -71,11 +71,15 @@ def pixel_noise(captures: CaptureSet, model: Model) -> float:
 
 
 def _read_off(captures: CaptureSet, model: Model) -> list[Capture]:
-    """The captures that fits may see; of a slow panel not the set's first: nobody knows what was shown before."""
+    """The captures that fits may see; of a slow panel not the set's first: nobody knows what was shown before.
+
+    Where there is no other, it is better than none.
+    """
     first, *_ = captures.captures
     parts = Predictor(model, load_batch(captures, [first])).parts(model)
     slow = any(stages.drive.persistence is not None for _, stages in parts)
-    return [row for row in split(captures).fitted if not slow or row.capture != first.capture]
+    fitted = list(split(captures).fitted)
+    return [row for row in fitted if not slow or row.capture != first.capture] or fitted
 
 
 def _slopes(model: Model, values: list[tuple[str, str]], batch: Batch) -> Tensor:
