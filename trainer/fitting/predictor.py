@@ -199,7 +199,7 @@ def telling(model: Model, batch: Batch, count: int) -> Batch:
 
 
 def telling_batches(model: Model, batches: Sequence[Batch], count: int) -> Sequence[Batch]:
-    """The batches with the captures of which a model leaves most unexplained, in counts; that one first."""
+    """The batches with the captures of which a model leaves most unexplained, in counts; all if there are no more."""
     if len(batches) <= count:
         return batches
     return sorted(batches, key=lambda b: -float(_unexplained(model, b).max()))[:count]
