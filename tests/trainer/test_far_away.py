@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ import torch
 
 from runtime.program.progress import no_progress
 from tests.trainer.hidden import bench_file
-from tests.trainer.test_unregistered import taken
+from tests.trainer.test_unregistered import PIXEL_UM, taken
+from tests.trainer.test_unregistered import moved as stated_aside
 from trainer.captures.acquire import acquire_from
 from trainer.captures.batches import Batch, load
 from trainer.captures.capture_set import CaptureSet, read_captures
@@ -21,12 +23,12 @@ from trainer.captures.smoothing import smoothed
 from trainer.diagnosis.explanation import explain
 from trainer.diagnosis.screen import ScreenResult
 from trainer.diagnosis.screening import screen_candidates
-from trainer.diagnosis.together import JointExplanation, explain_together
+from trainer.diagnosis.together import JointExplanation, explain_together, gets_nowhere
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import Catalogue, catalogue
 from trainer.fitting.gains import with_gains
 from trainer.fitting.gauss_newton import HOLD, fit
-from trainer.fitting.joint_start import without_effect
+from trainer.fitting.joint_start import joint_start, without_effect
 from trainer.fitting.pool import open_pool
 from trainer.fitting.predictor import Predictor, evaluate_captures, excess_on
 from trainer.model.model import Model, absent, instance_with
@@ -59,8 +61,7 @@ def together(captures: CaptureSet) -> JointExplanation:
     errors = evaluate_captures(captures, roles.held_out, ideal)
     names = known(*HIDDEN, "zero_order")
     with open_pool(1) as pool:
-        screened = screen_candidates(roles, ideal, names, pool, no_progress)
-        found = explain_together(roles, ideal, errors, names, screened, Thresholds(), pool)
+        found = explain_together(roles, ideal, errors, names, Thresholds(), pool)
     assert found is not None
     return found
 
@@ -119,6 +120,27 @@ def test_numbers_stay_near_absent_where_pictures_cannot_tell(captures: CaptureSe
     assert farthest(HOLD) < 0.5 * farthest(0.0)
 
 
+def test_a_joint_start_moves_the_camera_and_does_not_tilt_the_wavefront(tmp_path: Path) -> None:
+    """Smoothed pictures cannot tell the two apart; next to a blur that nothing stands for, sharp ones hardly can."""
+    blurred = 'kind = "sensor_blur"\nsigma_x_px = 0.7\nsigma_y_px = 0.5'
+    bent = 'kind = "panel_wavefront"\npeak_to_valley_nm = 1137\norientation_deg = 129.3'
+    leaking = (
+        'kind = "zero_order"\nfill_factor = 0.9272\nsurface_amplitude = 0.0809\nsurface_phase_deg = 285.8'
+    )
+    off = 'kind = "distance"\noffset_mm = 0.55'
+    hidden = (off, bent, leaking, blurred, 'kind = "laser_drift"\nsine_share = 0.0912')
+    true = taken(tmp_path, *hidden, panel=(128, 160), camera=(167, 209), degrees=0.6)
+    captures = stated_aside(true, dx=1.36, dy=-1.77)
+    batches = batches_of(captures)
+    ideal = with_gains(captures, Model(captures.bench), capture_roles(captures).fitted)
+    found = joint_start(ideal, catalogue(), batches)
+    shift = found.instance("misregistration").values
+    a_pixel = PIXEL_UM / 8  # of the camera, in the panel's
+    assert float(shift["shift_x"]) == pytest.approx(-1.36 / a_pixel, abs=0.1)
+    assert float(shift["shift_y"]) == pytest.approx(1.77 / a_pixel, abs=0.1)
+    assert excess_on(found, batches) < 0.005 * excess_on(ideal, batches)
+
+
 def test_what_is_not_needed_is_left_out_again(captures: CaptureSet, together: JointExplanation) -> None:
     roles = capture_roles(captures)
     ideal = with_gains(captures, Model(captures.bench), roles.fitted)
@@ -127,28 +149,34 @@ def test_what_is_not_needed_is_left_out_again(captures: CaptureSet, together: Jo
     assert [name for name, _ in together.ladder] != [] and together.ladder[-1][1].excess < 0.02 * before
 
 
-@pytest.mark.parametrize(("left", "alone"), [(0.45, True), (0.55, False)])
+@pytest.mark.parametrize(("left", "somewhere"), [(0.45, True), (0.55, False)])
 def test_an_effect_that_only_takes_a_wrong_structure_away_gets_nowhere(
-    left: float, alone: bool, captures: CaptureSet, monkeypatch: pytest.MonkeyPatch
+    left: float, somewhere: bool, captures: CaptureSet
 ) -> None:
     """Even light leaves an excess of 1, half of what a prediction does that is bright where the picture is dark."""
+    roles = capture_roles(captures)
+    ideal = with_gains(captures, Model(captures.bench), roles.fitted)
+    errors = evaluate_captures(captures, roles.held_out, ideal)
+    assert errors.excess > 1.1
+    assert gets_nowhere(left, errors) is not somewhere
 
+
+def test_effects_are_fitted_together_where_one_alone_does_less_than_the_screen_expected(
+    captures: CaptureSet, monkeypatch: pytest.MonkeyPatch
+) -> None:
     class AllTogetherError(Exception):
         """Effects were about to be fitted together."""
 
     def together(*_: object) -> None:
         raise AllTogetherError
 
-    roles = capture_roles(captures)
-    ideal = with_gains(captures, Model(captures.bench), roles.fitted)
-    errors = evaluate_captures(captures, roles.held_out, ideal)
-    assert errors.excess > 1.1
-    monkeypatch.setattr("trainer.diagnosis.together.joint_start", together)
-    start = absent(catalogue()["stray_light"], captures.bench)
-    screened = [ScreenResult("stray_light", start, errors.excess, left)]
-    with open_pool(1) as pool, nullcontext() if alone else pytest.raises(AllTogetherError):
-        found = explain_together(roles, ideal, errors, catalogue(), screened, Thresholds(), pool)
-        assert found is None
+    def hopeful(*arguments: Any) -> list[ScreenResult]:
+        return [replace(s, after=0.1 * s.before) for s in screen_candidates(*arguments)]
+
+    monkeypatch.setattr("trainer.diagnosis.way.screen_candidates", hopeful)
+    monkeypatch.setattr("trainer.diagnosis.way.explain_together", together)
+    with open_pool(1) as pool, pytest.raises(AllTogetherError):
+        explain(captures, Model(captures.bench), known("distance", "phase_response"), pool)
 
 
 def test_one_strong_effect_alone_is_not_far_away(tmp_path: Path) -> None:
@@ -159,8 +187,7 @@ def test_one_strong_effect_alone_is_not_far_away(tmp_path: Path) -> None:
     errors = evaluate_captures(captures, roles.held_out, ideal)
     with open_pool(1) as pool:
         screened = screen_candidates(roles, ideal, known("distance", "illumination"), pool, no_progress)
-        found = explain_together(roles, ideal, errors, catalogue(), screened, Thresholds(), pool)
-    assert found is None
+    assert not gets_nowhere(min(s.after for s in screened), errors)
 
 
 def test_what_was_taken_for_a_moved_camera_is_given_back_to_the_wavefront(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,12 +13,11 @@ from trainer.captures.capture_table import ids_of
 from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.addition import gone_on
 from trainer.diagnosis.another_start import from_another_start
-from trainer.diagnosis.screen import ScreenResult
 from trainer.diagnosis.unnecessary import without_one
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import Catalogue
 from trainer.fitting.gains import with_gains
-from trainer.fitting.gauss_newton import fit
+from trainer.fitting.gauss_newton import ROUGH, fit
 from trainer.fitting.joint_start import joint_start, without_effect
 from trainer.fitting.pool import Pool
 from trainer.fitting.predictor import evaluate_captures
@@ -56,12 +54,16 @@ def is_far(roles: CaptureRoles, model: Model, errors: PredictionErrors) -> bool:
     return not model.present and errors.excess >= FAR and roles.is_held_out
 
 
+def gets_nowhere(alone: float, errors: PredictionErrors) -> bool:
+    """Whether an effect that leaves this much alone leaves more than half of what is missing, or of even light's."""
+    return alone >= HELPS * min(errors.excess, EVEN)
+
+
 def explain_together(
     roles: CaptureRoles,
     model: Model,
     errors: PredictionErrors,
     known: Catalogue,
-    screened: Sequence[ScreenResult],
     thresholds: Thresholds,
     pool: Pool,
     progress: Progress | None = None,
@@ -71,27 +73,21 @@ def explain_together(
     Parameters
     ----------
     model : Model
-        For which `is_far` holds, with fitted gains.
+        For which `is_far` holds, with fitted gains, and for which no effect alone gets anywhere.
     errors : PredictionErrors
         Of `model` on the held-out captures.
-    screened : sequence of ScreenResult
-        What the screen expects of each effect alone.
 
     Returns
     -------
     JointExplanation or None
-        None where the screen expects that one effect alone leaves less than half of what is missing, or of what even
-        light leaves, and where all together leave more.
+        None where all together leave more than half of what is missing, or of what even light leaves.
     """
     report = progress or no_progress
-    half = HELPS * min(errors.excess, EVEN)
-    if min((s.after for s in screened), default=errors.excess) < half:
-        return None
     batches = load(roles.captures, roles.fitted)
     joint = joint_start(model, known, batches, part_of(report, 0.0, 0.6))
-    joint = fit(joint, joint.names, batches).model
+    joint = fit(joint, joint.names, batches, tolerance=ROUGH).model
     after = evaluate_captures(roles.captures, roles.held_out, joint)
-    if after.excess > half:
+    if gets_nowhere(after.excess, errors):
         return None
     report(0.6, "looking whether maps go on")
     found, before_maps = joint, after

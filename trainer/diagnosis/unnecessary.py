@@ -8,12 +8,12 @@ from pathlib import Path
 import torch
 
 from runtime.excess import PredictionErrors, removed_excess
-from trainer.captures.batches import load, signal_variance
+from trainer.captures.batches import Batch, load, signal_variance
 from trainer.captures.capture_set import chosen, opened
 from trainer.captures.capture_table import ids_of
 from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.verdict import Thresholds
-from trainer.fitting.gauss_newton import HOLD, fit
+from trainer.fitting.gauss_newton import HOLD, FitResult, fit
 from trainer.fitting.jacobian import away_from_absent, keys_of, remaining, stacked
 from trainer.fitting.least_squares_gain import with_gain
 from trainer.fitting.many_numbers import has_many
@@ -25,8 +25,9 @@ from trainer.model.model import Model
 FEW_STEPS = 3
 # An effect is needed where the most telling capture of each colour and plane says so: where it changes that picture, in
 # a way that a straight-line step of the others could not, by CHANGES times what is left or makes a difference, or where
-# the others, fitted to that capture alone, leave NEEDED times as much there. All captures leave no less.
-CHANGES, NEEDED = 30.0, 10.0
+# the others, fitted to that capture alone, leave NEEDED times as much there. All captures leave no less. Fitted to the
+# end there, they may as well be compared with what is left, where they leave NEEDED times what makes a difference.
+CHANGES, NEEDED, NEEDED_AT_LAST = 30.0, 10.0, 1.5
 
 
 def without_one(
@@ -126,9 +127,19 @@ def fitted_without(
     batches = load(captures, chosen(captures, ids))
     rest = model.without(name)
     rest = with_gain(rest, [Predictor(rest, b) for b in batches])  # it may have had the gains' work
-    few = [telling(rest, b, 1) for b in batches]
-    left = fit(rest, rest.names, few, FEW_STEPS, hold=HOLD).errors.excess
-    if left > NEEDED * max(excess_on(model, few), least):
+    # what shows from capture to capture does not in one
+    count = 2 if model.instance(name).effect.measure else 1
+    few = [telling(rest, b, count) for b in batches]
+    left = excess_on(model, few)
+    near = fit(rest, rest.names, few, FEW_STEPS, hold=HOLD)
+    if near.errors.excess > NEEDED * max(left, least):
         return None
-    fitted = settled(rest, batches) if raising else fit(rest, rest.names, batches, iterations)
+
+    def to_the_end(start: Model, some: Sequence[Batch]) -> FitResult:
+        return settled(start, some) if raising else fit(start, start.names, some, iterations)
+
+    most = max(NEEDED_AT_LAST * left, NEEDED * least)
+    if near.errors.excess > most and to_the_end(near.model, few).errors.excess > most:
+        return None
+    fitted = to_the_end(rest, batches)
     return fitted.model, evaluate_captures(captures, chosen(captures, held_ids), fitted.model)

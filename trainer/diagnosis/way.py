@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -20,7 +21,7 @@ from trainer.diagnosis.fitted_ranking import expects_the_rest
 from trainer.diagnosis.ranking import RankedEffect
 from trainer.diagnosis.screen import ScreenResult
 from trainer.diagnosis.second_way import Fork, fork_at, is_hopeless
-from trainer.diagnosis.together import explain_together, is_far
+from trainer.diagnosis.together import explain_together, gets_nowhere, is_far
 from trainer.diagnosis.unnecessary import without_one
 from trainer.diagnosis.verdict import Thresholds, below_the_noise
 from trainer.effects.effect_catalogue import Catalogue
@@ -153,15 +154,14 @@ class Way:
         progress : callable
             Called with the share that is done and what is being done.
         """
-        screened = self._begin_together(progress) if is_far(self._roles, self.model, self.errors) else None
+        first = self._first_look(progress) if is_far(self._roles, self.model, self.errors) else None
         while True:
             done = len(self.steps) - 1
             report = part_of(progress, 1 - 0.6**done, 1 - 0.6**done * 0.6)
             diagnosing = part_of(report, 0, 0.9)
-            if self.model.present:
-                screened = self._look_again(diagnosing)
-            found = self._diagnosed(diagnosing, screened)
-            screened = None
+            screened = self._look_again(diagnosing) if self.model.present else None
+            found = first or self._diagnosed(diagnosing, screened)
+            first = None
             if found.best is None or len(self.model.names) >= MOST_EFFECTS:
                 if not self._go_on_outside(found, part_of(report, 0.8, 0.9)):
                     break
@@ -242,28 +242,41 @@ class Way:
         self.errors = errors
         self._took(ExplanationStep(added, errors, alike, removed, refined, form or {}))
 
-    def _begin_together(self, progress: Progress) -> list[ScreenResult] | None:
-        """Begin with several effects at once where no single one gets anywhere; else give the model's screen."""
-        screened = self._screened(progress)
+    def _first_look(self, progress: Progress) -> Diagnosis | None:
+        """What a model lacks that is far away; None where it began with several effects at once."""
+        looking = part_of(progress, 0, 0.3)
+        screened = self._screened(looking)
+        somewhere = not gets_nowhere(min((s.after for s in screened), default=math.inf), self.errors)
+        if not somewhere and self._begin_together(progress):
+            return None
+        found = self._diagnosed(looking, screened)
+        alone = min((r.held_out.excess for r in found.ranking), default=math.inf)
+        # The screen's straight lines may expect more of an effect than it then does.
+        if somewhere and gets_nowhere(alone, self.errors) and self._begin_together(progress):
+            self.diagnoses.pop()
+            return None
+        return found
+
+    def _begin_together(self, progress: Progress) -> bool:
+        """Begin with several effects at once where no single one gets anywhere; whether that leads anywhere."""
         together = explain_together(
             self._roles,
             self.model,
             self.errors,
             self._known,
-            screened,
             self._thresholds,
             self._pool,
             part_of(progress, 0.3, 0.4),
         )
         if together is None:
-            return screened
+            return False
         history = self.model
         for name, errors in together.ladder:
             history = recorded(history, name, errors)
             self.errors = errors
         self.model = replace(together.model, history=history.history)
         self._took(*(ExplanationStep(*rung) for rung in together.ladder))
-        return None  # it was of another model
+        return True
 
     def _look_again(self, progress: Progress) -> list[ScreenResult] | None:
         """Exchange effects for rivals, fit them anew or go on with them, and give the screen of what is lacking then.

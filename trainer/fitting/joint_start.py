@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 
@@ -17,7 +18,7 @@ from trainer.captures.batches import Batch
 from trainer.effects.effect_catalogue import Catalogue
 from trainer.effects.evidence import Evidence
 from trainer.effects.own_effect import starts_of
-from trainer.fitting.gauss_newton import HOLD, fit, with_measured_values
+from trainer.fitting.gauss_newton import HOLD, ROUGH, fit, with_measured_values
 from trainer.fitting.least_squares_gain import with_gain
 from trainer.fitting.predictor import Predictor, lights_of, telling
 from trainer.fitting.refit import least_for_order, raise_orders
@@ -28,7 +29,9 @@ TOGETHER = ("misregistration", "illumination", "panel_wavefront", "distance", "p
 # Where the panel is bent, only a leak that is flat tells curvature from distance and size. A leak of any shape would
 # take up what the panel's own shape still lacks.
 ORDERS = {"zero_order": 2}
+WAVEFRONT, TILTS = ("panel_wavefront", "wavefront"), 2  # the first two of its terms
 FIXED = (("zero_order", "leak_wavefront"),)
+FINE = ("sensor_blur",)  # smoothed pictures say nothing of it; next to it, pictures as they are hardly fit
 AT_LAST = ("laser_drift",)  # while pictures do not fit, a gain for each only takes up what is wrong
 SMOOTHING_PX = (8.0, 4.0, 2.0, 1.0)
 ITERATIONS, TOLERANCE = 6, 0.05
@@ -43,7 +46,7 @@ def joint_start(
     Parameters
     ----------
     known : Catalogue
-        Effects of TOGETHER and AT_LAST that it lacks are left out.
+        Effects of TOGETHER, FINE and AT_LAST that it lacks are left out.
     progress : callable, optional
         Called with the share that is done and what is being done.
 
@@ -53,8 +56,9 @@ def joint_start(
         Fitted to a few of the captures.
     """
     report = progress or no_progress
-    names = [n for n in TOGETHER if n in known and n not in model.names]
-    late = [n for n in AT_LAST if n in known and n not in model.names]
+    names, fine, late = (
+        [n for n in some if n in known and n not in model.names] for some in (TOGETHER, FINE, AT_LAST)
+    )
     for name in names:
         model = model.having(absent(known[name], model.bench, ORDERS.get(name)))
     coarse = _smoothed(model, batches, SMOOTHING_PX[0])
@@ -65,8 +69,10 @@ def joint_start(
             k / (len(SMOOTHING_PX) + 1),
             f"fitting {len(names)} effects together, smoothed by {sigma:g} pixels",
         )
-        model = _fitted_to_smoothed(model, batches, sigma)
-    report(len(SMOOTHING_PX) / (len(SMOOTHING_PX) + 1), f"fitting {len(names)} effects together")
+        model = _fitted_to_smoothed(_shifted_not_tilted(model), batches, sigma)
+    report(len(SMOOTHING_PX) / (len(SMOOTHING_PX) + 1), f"fitting {len(names + fine)} effects together")
+    for name in fine:
+        model = model.having(absent(known[name], model.bench))
     model = _with_orders_raised(model, batches)
     for name in late:
         model = with_measured_values(model.having(absent(known[name], model.bench)), [name], batches)
@@ -83,7 +89,21 @@ def without_effect(model: Model, name: str, batches: Sequence[Batch]) -> Model:
     for sigma in SMOOTHING_PX[1:]:
         model = _fitted_to_smoothed(model, batches, sigma)
     model = _with_orders_raised(model, batches)
-    return fit(model, model.names, batches).model
+    return fit(model, model.names, batches, tolerance=ROUGH).model
+
+
+def _shifted_not_tilted(model: Model) -> Model:
+    """The model without a tilt of its wavefront, where a moved camera can do its work.
+
+    Smoothed pictures cannot tell the two apart, and fitted to pictures as they are, some of each does not become one.
+    """
+    if not {"misregistration", WAVEFRONT[0]} <= set(model.names):
+        return model
+    name, parameter = WAVEFRONT
+    bent = model.instance(name)
+    flat = bent.values[parameter].copy()
+    flat[..., :TILTS] = 0.0
+    return model.having(replace(bent, values={**bent.values, parameter: flat}))
 
 
 def _fitted_to_smoothed(model: Model, batches: Sequence[Batch], sigma_px: float) -> Model:
