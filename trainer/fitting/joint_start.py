@@ -31,7 +31,8 @@ TOGETHER = ("misregistration", "illumination", "panel_wavefront", "distance", "p
 ORDERS = {"zero_order": 2}
 WAVEFRONT, TILTS = ("panel_wavefront", "wavefront"), 2  # the first two of its terms
 FIXED = (("zero_order", "leak_wavefront"),)
-FINE = ("sensor_blur",)  # smoothed pictures say nothing of it; next to it, pictures as they are hardly fit
+# smoothed pictures say nothing of them; next to them, pictures as they are hardly fit
+FINE = ("sensor_blur", "crosstalk")
 AT_LAST = ("laser_drift",)  # while pictures do not fit, a gain for each only takes up what is wrong
 SMOOTHING_PX = (8.0, 4.0, 2.0, 1.0)
 ITERATIONS, TOLERANCE = 6, 0.05
