@@ -18,7 +18,7 @@ from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import Catalogue
 from trainer.fitting.gains import with_gains
 from trainer.fitting.gauss_newton import ROUGH, fit
-from trainer.fitting.joint_start import joint_start, without_effect
+from trainer.fitting.joint_start import TAKEN_FOR_EACH_OTHER, joint_start, without_effect
 from trainer.fitting.pool import Pool
 from trainer.fitting.predictor import evaluate_captures
 from trainer.model.model import Model
@@ -29,8 +29,6 @@ FAR = 0.3  # held-out excess from which several strong effects may hide one anot
 HELPS, EVEN = 0.5, 1.0
 # Excess from which other effects are missing: before these are there, to fit each one anew costs much and says little.
 OTHERS = 0.1
-# To smoothed pictures a moved camera does what tilt, curvature and distance do.
-TAKEN_FOR_EACH_OTHER = ("misregistration", "panel_wavefront")
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,9 @@ TOGETHER = ("misregistration", "illumination", "panel_wavefront", "distance", "p
 # Where the panel is bent, only a leak that is flat tells curvature from distance and size. A leak of any shape would
 # take up what the panel's own shape still lacks.
 ORDERS = {"zero_order": 2}
-WAVEFRONT, TILTS = ("panel_wavefront", "wavefront"), 2  # the first two of its terms
+# To smoothed pictures a moved camera does what tilt, curvature and distance do.
+TAKEN_FOR_EACH_OTHER = ("misregistration", "panel_wavefront")
+TILTS = 2  # the first two terms of a wavefront
 FIXED = (("zero_order", "leak_wavefront"),)
 # smoothed pictures say nothing of them; next to them, pictures as they are hardly fit
 FINE = ("sensor_blur", "crosstalk")
@@ -98,13 +100,12 @@ def _shifted_not_tilted(model: Model) -> Model:
 
     Smoothed pictures cannot tell the two apart, and fitted to pictures as they are, some of each does not become one.
     """
-    if not {"misregistration", WAVEFRONT[0]} <= set(model.names):
+    if not set(TAKEN_FOR_EACH_OTHER) <= set(model.names):
         return model
-    name, parameter = WAVEFRONT
-    bent = model.instance(name)
-    flat = bent.values[parameter].copy()
-    flat[..., :TILTS] = 0.0
-    return model.having(replace(bent, values={**bent.values, parameter: flat}))
+    bent = model.instance("panel_wavefront")
+    wavefront = bent.values["wavefront"].copy()
+    wavefront[..., :TILTS] = 0.0
+    return model.having(replace(bent, values={**bent.values, "wavefront": wavefront}))
 
 
 def _fitted_to_smoothed(model: Model, batches: Sequence[Batch], sigma_px: float) -> Model:
