@@ -26,6 +26,7 @@ from runtime.lightpath.overdrive import overdrive_tables
 from runtime.networks.onnx_approximator import approximator_of
 from runtime.service.configuration import Configuration
 from runtime.solver import Solution, Solver, shown
+from runtime.solver.block_motion import Change, change_between
 
 Result = TypeVar("Result")
 
@@ -109,6 +110,9 @@ class PatternSolver:
         # What one colour's solver does on one core alone, another's is computed beside.
         several = len(paths) > 1 and self._solvers[0].on.host_cores > 1
         self._pool = ThreadPoolExecutor(len(paths), "colours") if several else None
+        # The picture before, of which lit colours, so that they look for its motion only once.
+        self._before: Any = None
+        self._lit: list[int] = []
         self._white = 0.0  # what a white picture gets in the colour that gets least, once that is known
 
     def rehearse(self) -> None:
@@ -147,14 +151,14 @@ class PatternSolver:
             return
         if self.fields > 1 and not self._white:
             self.rehearse()
-        gray = np.zeros((self._frames, *self.shape), np.uint8)
         began = time.monotonic_ns()
-        solved = dict(zip(lit, self._each(lambda k: self._solvers[k].frame(target[k], 0), lit), strict=True))
-        for k, solution in solved.items():
-            gray[:, k] = solution.gray
+        there = self._solvers[0].on.xp.asarray(target)
+        change = self._change(there, lit)
+        firsts = self._each(lambda k: self._solvers[k].frame(there[k], 0, change=change), lit)
+        solved, self._lit = dict(zip(lit, firsts, strict=True)), lit
         now = time.monotonic_ns()
         enough = deadline_ns - now > now - began  # as much as another start costs
-        yield self._pattern(gray, solved, target, final=not enough)
+        yield self._pattern(solved, final=not enough)
         if enough:
 
             def improve(k: int) -> Solution:
@@ -162,13 +166,11 @@ class PatternSolver:
                 share_ms = left_ms / (1 if self._pool else len(lit) - lit.index(k))
                 if share_ms <= 0:
                     return first
-                better = self._solvers[k].solve(target[k], deadline_ms=share_ms, start=first.phase)
+                better = self._solvers[k].solve(there[k], deadline_ms=share_ms, start=first.phase)
                 # with a panel's few levels in the loop, a descent that time cuts short can end below its start
                 return better if better.expected_psnr_db >= first.expected_psnr_db else first
 
-            for k, solution in zip(lit, self._each(improve, lit), strict=True):
-                solved[k], gray[:, k] = solution, solution.gray
-            yield self._pattern(gray, solved, target, final=True)
+            yield self._pattern(dict(zip(lit, self._each(improve, lit), strict=True)), final=True)
 
     def _each(self, work: Callable[[int], Result], colours: Sequence[int]) -> list[Result]:
         """What `work` returns for each colour, all at the same time where there are several cores."""
@@ -176,11 +178,19 @@ class PatternSolver:
             return [work(k) for k in colours]
         return list(self._pool.map(work, colours))
 
-    def _pattern(
-        self, patterns: np.ndarray, solved: dict[int, Solution], target: np.ndarray, final: bool
-    ) -> Pattern:
-        """What is known of patterns [N, C, H, W], whose colours without a solution are dark."""
-        gray = patterns.copy()
+    def _change(self, target: Any, lit: list[int]) -> Change | None:
+        """What has become of the picture before, of all lit colours together; None where each has to find that."""
+        if len(self._paths) == 1:
+            return None
+        before, followed = self._before, self._lit
+        self._before, self._lit = target[lit].sum(0), []  # until all of them are solved
+        return change_between(before, self._before, self._solvers[0].on) if followed == lit else None
+
+    def _pattern(self, solved: dict[int, Solution], final: bool) -> Pattern:
+        """What is known of the colours' patterns; colours without a solution are dark."""
+        gray = np.empty((self._frames, *self.shape), np.uint8)
+        for k in range(len(self.colours)):
+            gray[:, k] = solved[k].gray if k in solved else 0
         shares: tuple[float, ...] = ()
         if self._mrad:
             for k, path in enumerate(self._paths):

@@ -1,4 +1,4 @@
-"""Where the solver's arrays live and what transforms them: NumPy on the CPU's cores, or CuPy on a GPU.
+"""Where the solver's arrays live and what transforms them: NumPy on the CPU's cores, or CuPy on a GPU (`gpu_backend`).
 
 The namespace is chosen once, by `backend()`. Everything the inner loop does is in place: elementwise work goes
 over strips of rows that fit a core's cache, several cores at a time; transforms write to a given array.
@@ -18,7 +18,9 @@ from firmware_iface.errors import InputError, nearest
 from runtime.lightpath import fft
 
 Array = Any
-Strip = Callable[[int, slice], "tuple[float, ...] | None"]
+Number = Any  # a float; on a GPU an array of no dimension, which stays there
+Strip = Callable[[int, slice], "tuple[Number, ...] | None"]
+Work = Callable[..., None]
 
 STRIP_BYTES = 1 << 19  # of one row buffer: a share of a core's second-level cache
 COLUMNS = 96  # of a column transform by one core
@@ -47,7 +49,7 @@ class Backend:
         """Rows of `width` complex samples in a strip."""
         return max(1, STRIP_BYTES // (8 * width))
 
-    def over_rows(self, rows: int, size: int, work: Strip) -> tuple[float, ...]:
+    def over_rows(self, rows: int, size: int, work: Strip) -> tuple[Number, ...]:
         """Call `work` for all rows, in strips.
 
         Parameters
@@ -60,7 +62,7 @@ class Backend:
 
         Returns
         -------
-        tuple of float
+        tuple of number
             The sums of what `work` returns.
         """
 
@@ -134,6 +136,36 @@ class Backend:
         """As a NumPy array."""
         return np.asarray(x)
 
+    def recorded(self, work: Work) -> Work:
+        """`work`, for calls with the same arrays again and again: a GPU repeats what it did for them as a whole.
+
+        `work` must leave nothing behind but what it writes to arrays that are there already, must not ask for a
+        number's value, and must do the same each time that its arguments are the same arrays and the same values.
+        """
+        return work
+
+    def number(self, x: Any) -> Number:
+        """A number to go on computing with, where the arrays are."""
+        return float(x)
+
+    def floats(self, *numbers: Number) -> tuple[float, ...]:
+        """Numbers as the host knows them; from a GPU they all come at once."""
+        return tuple(map(float, numbers))
+
+    def dot(self, a: Array, b: Array, weight: Array | None = None) -> Number:
+        """Sum of a b, or of a b weight, of arrays [H, W]."""
+        if weight is None:
+            return float(self.xp.einsum("ij,ij->", a, b))
+        return float(self.xp.einsum("ij,ij,ij->", a, b, weight))
+
+    def total(self, x: Array) -> Number:
+        """Sum of an array of any shape."""
+        return float(x.sum())
+
+    def mean(self, x: Array) -> Number:
+        """Mean of an array of any shape, to more digits than its own."""
+        return float(x.mean(dtype=np.float64))
+
 
 class Room:
     """Arrays that several light paths use one after the other: for each name and shape there is one."""
@@ -147,58 +179,6 @@ class Room:
         if key not in self._arrays:
             self._arrays[key] = self._xp.zeros(shape, dtype)
         return self._arrays[key]
-
-
-class CupyBackend(Backend):
-    """CuPy arrays on the GPU: a strip is the whole array, and streams do what threads do on a CPU."""
-
-    name = "cupy"
-
-    def __init__(self) -> None:
-        import cupy
-        import cupyx.scipy.fft
-
-        self.xp, self._fft = cupy, cupyx.scipy.fft
-        self.threads, self.host_cores, self.pool = 1, fft.THREADS, None
-
-    def strip_rows(self, width: int) -> int:
-        return 1 << 30
-
-    def rows_fft(self, x: Array, out: Array, forward: bool) -> None:
-        self._transform(x, out, 1, forward)
-
-    def columns_fft(self, x: Array, forward: bool) -> None:
-        self._transform(x, x, 0, forward)
-
-    def column_blocks(self, x: Array) -> dict[int, Array]:
-        return {0: x}
-
-    def column_room(self, x: Array) -> list[Array]:
-        return []
-
-    def through_columns(
-        self, x: Array, factors: dict[int, Array], room: list[Array], multiply: Callable[[Array, Array], None]
-    ) -> None:
-        self.columns_fft(x, True)
-        multiply(x, factors[0])
-        self.columns_fft(x, False)
-
-    def _transform(self, x: Array, out: Array, axis: int, forward: bool) -> None:
-        if forward:
-            out[...] = self._fft.fft(x, axis=axis)
-        else:
-            out[...] = self._fft.ifft(x, axis=axis, norm="forward")
-
-    def filter(self, image: Array, transfer: Array, spectrum: Array) -> None:
-        spectrum[...] = self._fft.rfft2(image)
-        spectrum *= transfer
-        image[...] = self._fft.irfft2(spectrum, s=image.shape)
-
-    def take(self, table: Array, index: Array, out: Array) -> None:
-        self.xp.take(table, index, out=out)
-
-    def to_host(self, x: Array) -> np.ndarray:
-        return np.asarray(self.xp.asnumpy(x))
 
 
 @cache
@@ -224,6 +204,8 @@ def backend(name: str | None = None) -> Backend:
         raise InputError(f"there is no backend '{name}': {nearest(name, BACKENDS)}")
     if name == "numpy":
         return Backend()
+    from runtime.solver.gpu_backend import CupyBackend
+
     try:
         found = CupyBackend()
         if found.xp.cuda.runtime.getDeviceCount() > 0:

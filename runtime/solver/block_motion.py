@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from runtime.solver.array_backend import Backend
-from runtime.solver.video_motion import motion_between
+from runtime.solver.video_motion import is_cut, motion_between
 
 Array = Any
 
@@ -35,6 +35,32 @@ class Part:
     rows: slice
     columns: slice
     motion: tuple[int, int] | None
+
+
+@dataclass(frozen=True)
+class Change:
+    """What has become of a picture in the next one.
+
+    Attributes
+    ----------
+    motion : (int, int), pixels
+        Of most of it: down, right.
+    parts : list of Part
+        What moves otherwise, and what is new.
+    cut : bool
+        Whether it is another scene.
+    """
+
+    motion: tuple[int, int]
+    parts: list[Part]
+    cut: bool
+
+
+def change_between(before: Array, after: Array, on: Backend, motion: tuple[int, int] | None = None) -> Change:
+    """What has become of a picture [H, W] in the next one; `motion` is that of the whole, where it is known."""
+    whole = motion_between(before, after) if motion is None else motion
+    motion, parts = block_motions(before, after, whole, on)
+    return Change(motion, parts, is_cut(before, after, motion))
 
 
 def block_motions(

@@ -29,7 +29,7 @@ RISE_LEAST = 3  # as RISE, of a still picture: a tilt that rises over less crowd
 WIDE = 0.9  # of the panel's band: with a wider iris double phase errs by more than its edges
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Tilt:
     """How the light in an image is tilted, and what the panel's end does to it.
 
@@ -98,6 +98,7 @@ class Start:
         height, width = path.grid.shape
         pair = path.source.dtype
         self.wave = xp.zeros((height, width), pair)
+        self.loud = xp.ones((), path.response.dtype)  # factor on the wave that makes its brightest pixels 1
         self.lit = xp.ones((height, width), bool)
         strip = (3, objective.strip, width)
         self.rooms = [xp.empty(strip, path.response.dtype) for _ in range(self.backend.threads)]
@@ -120,6 +121,8 @@ class Start:
         if not all(map(np.array_equal, *tilts)):
             self.moving = self._tilt(tilts[1], half_open)
         self.light = self.still
+        self._fill_wave = self.backend.recorded(self._wave)
+        self._split = self.backend.recorded(self._split_now)
 
     def tilt(self, moves: bool) -> None:
         """Take the tilt for a still picture or for one that moves.
@@ -148,29 +151,43 @@ class Start:
         ----------
         Hsueh and Sawchuk 1978; Maimone et al. 2017.
         """
-        self._wave(amplitude, self.light)
-        xp, wave = self.backend.xp, self.wave
-        some = xp.abs(wave[::SAMPLED, ::SAMPLED]).ravel()
+        self._fill_wave(amplitude, self.light)
+        xp = self.backend.xp
+        some = xp.abs(self.wave[::SAMPLED, ::SAMPLED]).ravel()
         rank = min(some.size - 1, int(LOUD * some.size))
-        loud = 1 / max(float(xp.partition(some, rank)[rank]), 1e-30)
-        unmodulated = self.unmodulated
+        self.loud[...] = 1 / xp.maximum(xp.partition(some, rank)[rank], 1e-30)
+        if others:
+            self._split_now(phase, self.light, sum(moved) % 2, others, moved)
+        else:
+            self._split(phase, self.light, sum(moved) % 2)
+
+    def _split_now(
+        self,
+        phase: Array,
+        light: Tilt,
+        odd: int,
+        others: Sequence[Array] = (),
+        moved: tuple[int, int] = (0, 0),
+    ) -> None:
+        """Fill `phase`, and `others`, from the wave, which is used up; `odd`: the chequerboard is the other one."""
+        xp, wave, unmodulated = self.backend.xp, self.wave, self.unmodulated
 
         def work(worker: int, rows: slice) -> None:
             count = rows.stop - rows.start
             part, new, here = self.objective.part[worker][:count], phase[rows], wave[rows]
             half, one, two = (room[:count] for room in self.rooms[worker])
-            here *= loud
+            here *= self.loud
             if unmodulated is not None:
                 here -= unmodulated[rows]
             xp.abs(here, out=part)
             xp.greater_equal(part, LIT, out=self.lit[rows])
             xp.minimum(part, 1, out=part)
             arccos_into(xp, part, half, one)
-            odd = rows.start % 2
-            half[odd::2, 1::2] *= -1
-            half[1 - odd :: 2, ::2] *= -1
-            if sum(moved) % 2:
-                half[self._inside(rows)] *= -1
+            shifted = rows.start % 2
+            half[shifted::2, 1::2] *= -1
+            half[1 - shifted :: 2, ::2] *= -1
+            if odd:
+                half[self._inside(rows, light)] *= -1
             angle_into(xp, here.imag, here.real, new, (one, two, part))
             for number, other in enumerate(others, 1):
                 other[rows] = new + self._alternating(number, rows, moved) * half
@@ -197,13 +214,13 @@ class Start:
             return (1 - 2 * ((board + along + number) % 2)).astype(np.int8)
 
         y, x = xp.arange(rows.start, rows.stop)[:, None], xp.arange(width)
-        found, inside = signs(y, x), self._inside(rows)
+        found, inside = signs(y, x), self._inside(rows, self.light)
         found[inside] = signs(y - moved[0], x - moved[1])[inside]
         return found
 
-    def _inside(self, rows: slice) -> tuple[slice, slice]:
+    def _inside(self, rows: slice, light: Tilt) -> tuple[slice, slice]:
         """The part of these rows that is not along the panel's edges, counted from the first of them."""
-        (edge, side), (height, width) = self.light.edges, self.wave.shape
+        (edge, side), (height, width) = light.edges, self.wave.shape
         first = max(edge, rows.start)
         last = max(min(height - edge, rows.stop), first)
         return slice(first - rows.start, last - rows.start), slice(side, width - side)
@@ -213,7 +230,7 @@ class Start:
 
         A better start than double phase where the panel does not reach a whole turn and the iris is open (WIDE).
         """
-        self._wave(amplitude, self.light)
+        self._fill_wave(amplitude, self.light)
         xp, wave = self.backend.xp, self.wave
 
         def work(worker: int, rows: slice) -> None:

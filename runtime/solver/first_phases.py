@@ -105,8 +105,7 @@ class FirstPhases:
         xp = self.backend.xp
         for c, (drive, start) in enumerate(zip(self.drives, self.starts, strict=True)):
             phase, *others = phases[c * self.frames : (c + 1) * self.frames]
-            mean = float(targets[c, 0].mean(dtype=np.float64))
-            xp.multiply(targets[c, 0], 1 / mean, out=self.amplitude)
+            xp.multiply(targets[c, 0], 1 / self.backend.mean(targets[c, 0]), out=self.amplitude)
             xp.sqrt(self.amplitude, out=self.amplitude)
             alike: Sequence[Array] = ()
             network = self.initialiser

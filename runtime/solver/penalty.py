@@ -10,10 +10,9 @@ A floor, a share of the mean light, is added under every square root, whose slop
 
 from __future__ import annotations
 
-from typing import Any
+from runtime.solver.array_backend import Array, Backend, Number
 
-Array = Any
-Sums = tuple[float, ...]
+Sums = tuple[Number, ...]
 
 FLOOR = 1e-4  # of the mean light
 ROUNDING = 1e-2  # of the root mean square amplitude: below it, l1 is rounded off
@@ -22,28 +21,28 @@ ROUNDING = 1e-2  # of the root mean square amplitude: below it, l1 is rounded of
 class Amplitude:
     """sum w (c sqrt(I) - sqrt(t))^2: Chakravarthula et al. 2020, eq. 14, with f the squared error of amplitude."""
 
-    def __init__(self, xp: Any) -> None:
-        self.xp = xp
+    def __init__(self, backend: Backend) -> None:
+        self.backend, self.xp = backend, backend.xp
 
-    def measure(self, light: Array, wanted: Array, weight: Array | None, floor: float) -> Sums:
+    def measure(self, light: Array, wanted: Array, weight: Array | None, floor: Number) -> Sums:
         """`light` becomes its square root; `wanted` is the target's."""
         xp = self.xp
         xp.maximum(light, 0, out=light)
         light += floor
         xp.sqrt(light, out=light)
-        return _dots(xp, light, wanted, weight)
+        return self._dots(light, wanted, weight)
 
-    @staticmethod
-    def scale(sums: Sums, most: float) -> float:
+    def scale(self, sums: Sums, most: Number) -> Number:
         """c, from the summed results of `measure`, up to `most`, a factor on amplitude."""
-        return min(sums[0] / max(sums[1], 1e-30), most)
+        xp = self.xp
+        return self.backend.number(xp.minimum(sums[0] / xp.maximum(sums[1], 1e-30), most))
 
-    def slope(self, root: Array, wanted: Array, weight: Array | None, scale: float, error: Array) -> Sums:
+    def slope(self, root: Array, wanted: Array, weight: Array | None, scale: Number, error: Array) -> Sums:
         """`root`, from `measure`, becomes dLoss / dI; `error` is room."""
         xp = self.xp
         xp.multiply(root, scale, out=error)
         error -= wanted
-        square = _squares(xp, error, weight)
+        square = self.backend.dot(error, error, weight)
         xp.divide(error, root, out=root)
         root *= scale
         if weight is not None:
@@ -71,17 +70,20 @@ class Amplitude:
         """
         return scale**2
 
+    def _dots(self, light: Array, wanted: Array, weight: Array | None) -> Sums:
+        return self.backend.dot(light, wanted, weight), self.backend.dot(light, light, weight)
+
 
 class SmoothL1(Amplitude):
     """sum w |c sqrt(I) - sqrt(t)|, rounded off near zero so that it has a slope everywhere."""
 
-    def slope(self, root: Array, wanted: Array, weight: Array | None, scale: float, error: Array) -> Sums:
+    def slope(self, root: Array, wanted: Array, weight: Array | None, scale: Number, error: Array) -> Sums:
         xp = self.xp
         xp.multiply(root, scale, out=error)
         error -= wanted
-        square = _squares(xp, error, weight)
+        square = self.backend.dot(error, error, weight)
         size = xp.sqrt(error * error + ROUNDING**2)
-        loss = float(size.sum()) if weight is None else float((size * weight).sum())
+        loss = self.backend.total(size if weight is None else size * weight)
         xp.divide(error, root, out=root)
         root /= size
         root *= scale / 2
@@ -97,23 +99,22 @@ class SmoothL1(Amplitude):
 class Irradiance(Amplitude):
     """sum w (c I - t)^2."""
 
-    def measure(self, light: Array, wanted: Array, weight: Array | None, floor: float) -> Sums:
+    def measure(self, light: Array, wanted: Array, weight: Array | None, floor: Number) -> Sums:
         """`light` stays; `wanted` is the target itself."""
-        return _dots(self.xp, light, wanted, weight)
+        return self._dots(light, wanted, weight)
 
-    @staticmethod
-    def scale(sums: Sums, most: float) -> float:
-        return Amplitude.scale(sums, most**2)
+    def scale(self, sums: Sums, most: Number) -> Number:
+        return super().scale(sums, most**2)
 
-    def slope(self, light: Array, wanted: Array, weight: Array | None, scale: float, error: Array) -> Sums:
+    def slope(self, light: Array, wanted: Array, weight: Array | None, scale: Number, error: Array) -> Sums:
         xp = self.xp
         xp.multiply(light, scale, out=light)
         xp.maximum(light, 0, out=error)
         xp.sqrt(error, out=error)
         error -= xp.sqrt(wanted)
-        square = _squares(xp, error, weight)
+        square = self.backend.dot(error, error, weight)
         light -= wanted
-        loss = _squares(xp, light, weight)
+        loss = self.backend.dot(light, light, weight)
         light *= 2 * scale
         if weight is not None:
             light *= weight
@@ -125,16 +126,3 @@ class Irradiance(Amplitude):
 
 
 PENALTIES: dict[str, type[Amplitude]] = {"amplitude": Amplitude, "irradiance": Irradiance, "l1": SmoothL1}
-
-
-def _dots(xp: Any, a: Array, b: Array, weight: Array | None) -> Sums:
-    """Sums of a b and a a."""
-    if weight is None:
-        return float(xp.einsum("ij,ij->", a, b)), float(xp.einsum("ij,ij->", a, a))
-    return float(xp.einsum("ij,ij,ij->", a, b, weight)), float(xp.einsum("ij,ij,ij->", a, a, weight))
-
-
-def _squares(xp: Any, a: Array, weight: Array | None) -> float:
-    if weight is None:
-        return float(xp.einsum("ij,ij->", a, a))
-    return float(xp.einsum("ij,ij,ij->", a, a, weight))

@@ -11,10 +11,9 @@ import math
 from collections.abc import Sequence
 from typing import Any, Protocol
 
+from runtime.solver.array_backend import Array, Number
 from runtime.solver.drive_range import DriveRange
 from runtime.solver.objective import Objective
-
-Array = Any
 
 LONGEST = 0.5  # step of a pixel, rad, where its range has ends
 
@@ -46,6 +45,8 @@ class MemorylessBfgs:
         real = objective.light.dtype
         self.gradient, self.before, self.move = (xp.zeros(objective.shape, real) for _ in range(3))
         self.bounded = any(drive.bounded for drive in drives)
+        self.products = xp.zeros(3)
+        self._multiply = self.backend.recorded(self._multiply_now)
         self.begin()
 
     def begin(self) -> None:
@@ -72,8 +73,8 @@ class MemorylessBfgs:
         if self.first:
             return steepest, 0.0, 0.0
         gradient, before, move = self.gradient, self.before, self.move
-        gg, go, sg = self._dots(((gradient, gradient), (gradient, before), (move, gradient)))
-        oo, so = known or self._dots(((before, before), (move, before)))
+        gg, go, sg = self._dots(gradient, gradient, gradient, before, move, gradient)
+        oo, so = known or self._dots(before, before, move, before)
         sy, yy, yg = sg - so, gg - 2 * go + oo, gg - go
         if not sy > 1e-12 * yy > 0:  # without curvature, or where rounding is all that is left of the change
             return steepest, 0.0, 0.0
@@ -84,16 +85,21 @@ class MemorylessBfgs:
             self.known = gg, a * gg + b * go + c * sg
         return [a] * len(steepest), b, c
 
-    def _dots(self, pairs: Sequence[tuple[Array, Array]]) -> tuple[float, ...]:
-        """Scalar products of pairs of arrays [C, H, W]."""
-        dot, sums = self.backend.xp.einsum, []
+    def _dots(self, *arrays: Array) -> list[float]:
+        """Scalar products of arrays [C, H, W], each with the one after it in pairs."""
+        self._multiply(*arrays)
+        return list(self.backend.to_host(self.products)[: len(arrays) // 2].tolist())
+
+    def _multiply_now(self, *arrays: Array) -> None:
+        pairs, dot, sums = list(zip(arrays[::2], arrays[1::2], strict=True)), self.backend.dot, []
         for colour in range(len(self.gradient)):
 
-            def work(worker: int, rows: slice, colour: int = colour) -> tuple[float, ...]:
-                return tuple(float(dot("ij,ij->", u[colour, rows], v[colour, rows])) for u, v in pairs)
+            def work(worker: int, rows: slice, colour: int = colour) -> tuple[Number, ...]:
+                return tuple(dot(u[colour, rows], v[colour, rows]) for u, v in pairs)
 
             sums.append(self.backend.over_rows(self.gradient.shape[1], self.objective.strip, work))
-        return tuple(map(sum, zip(*sums, strict=True)))
+        for n, each in enumerate(zip(*sums, strict=True)):
+            self.products[n] = sum(each)
 
     def _move(self, colour: int, a: float, b: float, c: float, phase: Array, out: Array) -> None:
         xp, drive = self.backend.xp, self.drives[colour]

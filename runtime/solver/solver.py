@@ -23,7 +23,7 @@ from firmware_iface.errors import InputError, nearest
 from runtime.lightpath.light_path import LightPath
 from runtime.networks.onnx_approximator import Approximator, predistorted
 from runtime.solver.array_backend import Backend, backend
-from runtime.solver.block_motion import Part, block_motions
+from runtime.solver.block_motion import Change, change_between
 from runtime.solver.deadline import Paces, check_deadline
 from runtime.solver.descent import Descent, IterationReport
 from runtime.solver.drive_range import DriveRange
@@ -42,7 +42,6 @@ from runtime.solver.solver_input import (
     checked_target,
     stacked,
 )
-from runtime.solver.video_motion import is_cut, motion_between
 
 GRIDS = ("panel", "fine")
 WAYS = ("gradient", "predistorted")
@@ -198,6 +197,7 @@ class Solver:
         *,
         deadline_ms: float | None = None,
         motion: tuple[int, int] | None = None,
+        change: Change | None = None,
     ) -> Solution:
         """`solve` for the next frame of a video, beginning with the pattern of the picture solved before.
 
@@ -210,22 +210,24 @@ class Solver:
         motion : (int, int) or None, pixels
             How far content has moved since as a whole: down, right. None: found from the frames. What moves by itself
             is found.
+        change : Change or None
+            All that has become of the picture before, where it is known: of one that has other colours, too.
         """
         targets, begun = self._begun(target, iterations, deadline_ms)
-        picture = _grayscale(targets)
-        parts: list[Part] = []
-        if self.follows:
-            whole = motion_between(self.before, picture) if motion is None else motion
-            motion, parts = block_motions(self.before, picture, whole, self.on)
+        if not self.follows:
+            change = None
+        elif change is None:
+            change = change_between(self.before, _grayscale(targets), self.on, motion)
         optics_targets = self._aim(targets)
-        if self.follows and motion is not None and not is_cut(self.before, picture, motion):
+        cold = change is None or change.cut
+        if change is None or change.cut:
+            self.first.cold(optics_targets, self.descent.start, soon=True)
+        else:
             descent, still = self.descent, self._is_still(targets)
             room = descent.next_start()
-            self.first.warm(descent.best, motion, parts, optics_targets, descent.start, room, still)
-            cold = False
-        else:
-            self.first.cold(optics_targets, self.descent.start, soon=True)
-            cold = True
+            self.first.warm(
+                descent.best, change.motion, change.parts, optics_targets, descent.start, room, still
+            )
         return self._improve(targets, begun, iterations, deadline_ms, cold, None)
 
     def rehearse(self, target: np.ndarray | None = None) -> Solution:
@@ -319,7 +321,7 @@ class Solver:
 
     def _checked(self, target: np.ndarray) -> Any:
         there = self.on.xp.asarray(target)
-        return checked_target(there, len(self.stacks), len(self.stacks[0]), self.shape)
+        return checked_target(there, len(self.stacks), len(self.stacks[0]), self.shape, self.on)
 
 
 def _grayscale(targets: Any) -> Any:

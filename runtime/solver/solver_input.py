@@ -10,8 +10,7 @@ from array_api_compat import array_namespace
 
 from firmware_iface.errors import InputError
 from runtime.lightpath.light_path import LightPath
-
-Array = Any
+from runtime.solver.array_backend import Array, Backend
 
 BRIGHTEST = (1e-20, 1e20)  # of a target's brightest pixel: single precision also holds its square
 MOST_FRAMES = 32  # patterns for each colour of a picture; each takes as much memory as a colour
@@ -48,7 +47,7 @@ def stacked(paths: Any) -> list[list[LightPath]]:
     return stacks
 
 
-def checked_target(target: Array, colours: int, planes: int, shape: tuple[int, int]) -> Array:
+def checked_target(target: Array, colours: int, planes: int, shape: tuple[int, int], on: Backend) -> Array:
     """A target for each colour and plane, without copying what already has that shape.
 
     Parameters
@@ -59,6 +58,8 @@ def checked_target(target: Array, colours: int, planes: int, shape: tuple[int, i
         C and K.
     shape : (int, int), pixels
         Of the panel.
+    on : Backend
+        Where the target is.
 
     Returns
     -------
@@ -83,8 +84,8 @@ def checked_target(target: Array, colours: int, planes: int, shape: tuple[int, i
             f"the target is {' x '.join(map(str, target.shape))}; for {colours} colours and {planes} planes "
             f"give {colours} x {planes} x {shape[0]} x {shape[1]}, or one picture for all"
         )
-    brightest = [float(one.max()) for one in target.reshape(-1, *shape)]
-    low, high, darkest = float(target.min()), max(brightest), min(brightest)
+    low, *brightest = on.floats(target.min(), *(one.max() for one in target.reshape(-1, *shape)))
+    high, darkest = max(brightest), min(brightest)
     if not (math.isfinite(low) and math.isfinite(high)) or low < 0:
         raise InputError("the target has negative or non-finite values: irradiance is never below zero")
     if darkest == 0:

@@ -14,7 +14,8 @@ import pytest
 from firmware_iface.errors import InputError
 from runtime.lightpath.light_path import LightPath
 from runtime.solver import Solver
-from runtime.solver.array_backend import Backend, CupyBackend, backend
+from runtime.solver.array_backend import Backend, backend
+from runtime.solver.gpu_backend import CupyBackend
 from runtime.solver.in_place_path import Optics
 from tests.runtime.benches import PATHS, converted, ideal_path, scene
 from tests.runtime.second_array_library import in_cupys_place
@@ -69,6 +70,40 @@ def test_the_stand_in_refuses_what_cupy_refuses(monkeypatch: pytest.MonkeyPatch)
         np.asarray(far)
 
 
+def test_what_is_recorded_is_done_again_with_what_the_arrays_hold_then(gpu: CupyBackend) -> None:
+    """A number that the work has computed, also; and what the host has taken into it, for other values of that."""
+    xp, calls = gpu.xp, []
+
+    def work(x: Any, out: Any, twice: bool) -> None:
+        calls.append(twice)
+        xp.multiply(x, x.sum(), out=out)
+        if twice:
+            out *= 2
+
+    again, held, out = gpu.recorded(work), (xp.zeros(3), xp.zeros(3)), xp.zeros(3)
+    for n in range(5):
+        for k, x in enumerate(held):
+            for twice in (False, True):
+                values = np.array([1.0, n, k])
+                x[...] = xp.asarray(values)
+                again(x, out, twice)
+                np.testing.assert_allclose(gpu.to_host(out), values * values.sum() * (1 + twice))
+    assert len(calls) == 8, "once by itself and once to record it, for each of two arrays and two values"
+
+
+def test_what_cannot_be_recorded_is_done_step_by_step(gpu: CupyBackend) -> None:
+    xp, x, out = gpu.xp, gpu.xp.arange(3.0), gpu.xp.zeros(3)
+
+    def work(x: Any, out: Any) -> None:
+        out += x
+        xp.add(out, float(x.sum()), out=out)  # the host waits for a number
+
+    again = gpu.recorded(work)
+    for n in range(4):
+        again(x, out)
+        assert gpu.to_host(out).tolist() == [3.0 * (n + 1), 4.0 * (n + 1), 5.0 * (n + 1)]
+
+
 @pytest.mark.parametrize("whole", [False, True])
 @pytest.mark.parametrize("name", PATHS)
 def test_light_and_gradients_are_the_same(name: str, whole: bool, gpu: CupyBackend) -> None:
@@ -95,6 +130,28 @@ def test_a_solve_goes_the_same_way(name: str, gpu: CupyBackend) -> None:
     assert np.isfinite(here.psnr_db).all() and len(here.psnr_db) > 1
     np.testing.assert_allclose(there.psnr_db, here.psnr_db, atol=1e-6)
     assert np.mean(there.gray != here.gray) < 0.01
+
+
+@pytest.mark.parametrize("name", [*LIT, *(name for name in SOLVES if name != "gerchberg_saxton")])
+def test_all_that_an_iteration_repeats_is_recorded(name: str, gpu: CupyBackend) -> None:
+    """Three arrays for phases and two for gradients are used in turn: twelve calls at most, however many iterations."""
+    calls: dict[str, int] = {}
+    record = gpu.recorded
+
+    def counted(work: Any) -> Any:
+        def count(*arguments: Any) -> None:
+            calls[work.__name__] = calls.get(work.__name__, 0) + 1
+            work(*arguments)
+
+        return record(count)
+
+    paths, options = SOLVES[name] if name in SOLVES else (LIT[name], {})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gpu, "recorded", counted)
+        solver = Solver(paths, on=gpu, **options)
+    for _ in range(3):
+        solver.solve(pictures(paths), 20)
+    assert calls["_measure_now"] <= 12 and calls["_go_back_now"] <= 12 and calls.get("_multiply_now", 0) <= 12
 
 
 @pytest.mark.parametrize("frames", [1, 2])
