@@ -1,20 +1,17 @@
-"""Where the solver's arrays live and what transforms them: NumPy on the CPU's cores, or CuPy on a GPU (`gpu_backend`).
+"""Where the solver's arrays live and what transforms them: NumPy here, on the CPU's cores; CuPy in `gpu_backend`.
 
-The namespace is chosen once, by `backend()`. Everything the inner loop does is in place: elementwise work goes
-over strips of rows that fit a core's cache, several cores at a time; transforms write to a given array.
+Everything the inner loop does is in place: elementwise work goes over strips of rows that fit a core's cache, several
+cores at a time; transforms write to a given array.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 from typing import Any
 
 import numpy as np
 
-from firmware_iface.errors import InputError, nearest
 from runtime.lightpath import fft
 
 Array = Any
@@ -24,7 +21,6 @@ Work = Callable[..., None]
 
 STRIP_BYTES = 1 << 19  # of one row buffer: a share of a core's second-level cache
 COLUMNS = 96  # of a column transform by one core
-BACKENDS = ("numpy", "cupy")
 
 
 class Backend:
@@ -179,40 +175,3 @@ class Room:
         if key not in self._arrays:
             self._arrays[key] = self._xp.zeros(shape, dtype)
         return self._arrays[key]
-
-
-@cache
-def backend(name: str | None = None) -> Backend:
-    """The machine's backend: CuPy where it is installed and has a GPU, else NumPy; or the one that is named.
-
-    Parameters
-    ----------
-    name : str or None
-        One of BACKENDS; None: the value of HOLOLOOP_BACKEND in the environment, if it is set.
-
-    Returns
-    -------
-    Backend
-
-    Raises
-    ------
-    InputError
-        For one that does not exist or cannot start.
-    """
-    name = name or os.environ.get("HOLOLOOP_BACKEND") or None
-    if name not in (None, *BACKENDS):
-        raise InputError(f"there is no backend '{name}': {nearest(name, BACKENDS)}")
-    if name == "numpy":
-        return Backend()
-    from runtime.solver.gpu_backend import CupyBackend
-
-    try:
-        found = CupyBackend()
-        if found.xp.cuda.runtime.getDeviceCount() > 0:
-            return found
-    except Exception as error:  # not installed, no driver, no device: library versions raise different errors
-        if name == "cupy":
-            raise InputError(f"the CuPy backend cannot start ({error}): use numpy") from error
-    if name == "cupy":
-        raise InputError("the CuPy backend finds no GPU: use numpy")
-    return Backend()

@@ -9,7 +9,8 @@ import numpy as np
 
 from firmware_iface.errors import InputError
 from runtime.lightpath.light_path import LightPath
-from runtime.solver.array_backend import Backend, backend
+from runtime.solver.array_backend import Backend
+from runtime.solver.chosen_backend import backend
 
 Array = Any
 

@@ -22,8 +22,9 @@ import numpy as np
 from firmware_iface.errors import InputError, nearest
 from runtime.lightpath.light_path import LightPath
 from runtime.networks.onnx_approximator import Approximator, predistorted
-from runtime.solver.array_backend import Backend, backend
+from runtime.solver.array_backend import Backend
 from runtime.solver.block_motion import Change, change_between
+from runtime.solver.chosen_backend import backend
 from runtime.solver.deadline import Paces, check_deadline
 from runtime.solver.descent import Descent, IterationReport
 from runtime.solver.drive_range import DriveRange

@@ -27,7 +27,8 @@ from runtime.lightpath import fft
 from runtime.lightpath.ideal_path import ideal_path, single
 from runtime.program.large_blocks import keep_large_blocks
 from runtime.service.frame_solver import PatternSolver
-from runtime.solver.array_backend import Backend, backend
+from runtime.solver.array_backend import Backend
+from runtime.solver.chosen_backend import backend
 
 COLOURS = ("red", "green", "blue")
 IRISES = {"half": 0.5, "open": 1.0}  # half-width, as a share of the panel's band

@@ -9,8 +9,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from runtime.solver import Solver, quality, shown
-from runtime.solver.array_backend import backend
 from runtime.solver.block_motion import BLOCK, Part, block_motions, follow
+from runtime.solver.chosen_backend import backend
 from runtime.solver.video_motion import motion_between
 from tests.runtime.benches import ideal_path
 

@@ -14,7 +14,8 @@ import pytest
 from firmware_iface.errors import InputError
 from runtime.lightpath.light_path import LightPath
 from runtime.solver import Solver
-from runtime.solver.array_backend import Backend, backend
+from runtime.solver.array_backend import Backend
+from runtime.solver.chosen_backend import backend
 from runtime.solver.gpu_backend import CupyBackend
 from runtime.solver.in_place_path import Optics
 from tests.runtime.benches import PATHS, converted, ideal_path, scene

@@ -16,7 +16,8 @@ from runtime.lightpath.light_path import (
     states,
 )
 from runtime.lightpath.light_path_adjoint import irradiance_and_pullback, pixel_irradiance_adjoint
-from runtime.solver.array_backend import Backend, backend
+from runtime.solver.array_backend import Backend
+from runtime.solver.chosen_backend import backend
 from runtime.solver.in_place_path import Optics
 from tests.runtime.benches import PATHS, converted, torch_path
 
