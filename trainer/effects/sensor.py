@@ -197,21 +197,32 @@ def vignetting(sensor: Sensor, log_gain: Tensor) -> Sensor:
             typical=(-400, 400),
             example=(150.0, 0.0, 100.0),
             terms=surface_terms_with_mean,
-        )
+        ),
+        Parameter(
+            "laser_share",
+            "1",
+            scale=0.1,
+            low=0,
+            high=1,
+            about="of the added light: what follows the laser's power from capture to capture",
+            typical=(0, 1),
+        ),
     ],
-    formula=r"N' = N + \sum_{i,j}\,b_{ij}\,P_i(y)\,P_j(x)",
+    formula=r"N'_k = N_k + [1 + s\,(g_k - 1)]\,\sum_{i,j}\,b_{ij}\,P_i(y)\,P_j(x)",
 )
-def stray_light(sensor: Sensor, counts: Tensor) -> Sensor:
+def stray_light(sensor: Sensor, counts: Tensor, laser_share: Tensor) -> Sensor:
     """Light is simply added, smooth over the picture.
 
     Room light, glare in the camera's lens or a black level that is wrong add counts that no pattern controls. Dark
-    places show it first.
+    places show it first. Glare is the laser's own light: where the laser's power varies (`laser_drift`), so does the
+    glare.
 
     References
     ----------
     Talvala et al. 2007, Veiling glare in high dynamic range imaging, ACM Trans. Graph. 26, 37.
     """
-    return sensor.brightened(legendre_surface(counts, sensor.y, sensor.x, lowest=0))
+    added = sensor.brightened(legendre_surface(counts, sensor.y, sensor.x, lowest=0))
+    return replace(added, laser_share=laser_share)
 
 
 def _bent(sensor: Sensor, deviation: Tensor) -> Sensor:

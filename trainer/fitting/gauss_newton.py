@@ -30,6 +30,7 @@ from trainer.fitting.least_squares_gain import with_gain
 from trainer.fitting.many_numbers import ManySlopes, has_many
 from trainer.fitting.predictor import Predictor, lights_of
 from trainer.model.model import Model, Values
+from trainer.prediction.predict import Trace
 
 HOLD = 0.01  # `hold` of fits far from the truth
 ROUGH = 5e-3  # `tolerance` of fits that only compare, or that others follow
@@ -120,8 +121,7 @@ def _fit(
     scale = signal_variance(batches)
     first = min((model.instance(n).effect.stage for n in free), key=STAGES.index, default="sensor")
     points = [p.trace(model) for p in predictors]
-    if not model.gain or any(b.channel not in model.gain for b in batches):
-        model = with_gain(model, predictors, lights_of(model, predictors, points))
+    model = _having_gains(model, predictors, points)
     channels = list(dict.fromkeys(b.channel for b in batches))
     slopes = slopes_of(model, keys, channels, predictors, points)
     residuals, errors = weighted_residuals(model, predictors, points)
@@ -193,8 +193,7 @@ def _fit_many(
     first = min((model.instance(n).effect.stage for n in free), key=STAGES.index)
     keys = keys_of(model, few)
     points = [p.trace(model) for p in predictors]
-    if not model.gain or any(b.channel not in model.gain for b in batches):
-        model = with_gain(model, predictors, lights_of(model, predictors, points))
+    model = _having_gains(model, predictors, points)
     channels = list(dict.fromkeys(b.channel for b in batches))
     residuals, errors = weighted_residuals(model, predictors, points)
     settled = True
@@ -242,6 +241,17 @@ def _fit_many(
     spread = np.concatenate([_spread(keys, covariance, normal), spread_of_many])
     model = with_measured_values(_with_errors(model, every, spread), free, batches)
     return FitResult(model, errors, whole, every, settled)
+
+
+def _having_gains(model: Model, predictors: Sequence[Predictor], points: Sequence[Trace]) -> Model:
+    """The model with gains, where it lacks them, and where captures have their own, of which these are the mean.
+
+    What light the laser adds is counted in them, and steps leave them as they are.
+    """
+    known = all(p.batch.channel in model.gain for p in predictors)
+    if known and not any(p.stages(model).sensor.free_capture_gain for p in predictors):
+        return model
+    return with_gain(model, predictors, lights_of(model, predictors, points))
 
 
 def is_too_slow(removed: float, steps: int, error: float, enough: float) -> bool:

@@ -125,8 +125,9 @@ def columns(
     -------
     tensor [B, h, w], counts
     list of tensors [B, h, w], or what is kept of them
-        Change a unit of each parameter, then of the logarithm of the gain. Zero for another colour's number, and for
-        one that changes nothing here, where the difference would be rounding alone.
+        Change a unit of each parameter, then of the logarithm of the gain. Zero for another colour's number, for one
+        that changes nothing here, where the difference would be rounding alone, and for the gain where each capture
+        has its own.
     """
     near = predictor.motions(model, point)
     light = predictor.light(model, point, near)
@@ -146,8 +147,13 @@ def columns(
         return slope(moved, step, effect.parameter(key[1]).scale)
 
     result = side_by_side(of_number, keys, base[0].numel())
-    louder = replace(model, gain={c: g * 1.01 for c, g in model.gain.items()})
-    result.append(slope(predictor.counts(louder, light), 0.01, 1.0))
+    if predictor.stages(
+        model
+    ).sensor.free_capture_gain:  # only in what laser light is counted in, its gain differs
+        result.append(kept(torch.zeros_like(base)))
+    else:
+        louder = replace(model, gain={c: g * 1.01 for c, g in model.gain.items()})
+        result.append(slope(predictor.counts(louder, light), 0.01, 1.0))
     return base, result
 
 

@@ -45,8 +45,14 @@ class EffectInstance:
         """Whether it is the other one's plain form, less rare, or has half of its numbers."""
         if other.effect.same_as == self.effect.name or other.effect.rare > self.effect.rare:
             return True
-        own, others = (sum(values.size for values in one.values.values()) for one in (self, other))
-        return self.effect.measure is None and 2 * own <= others
+        return self.effect.measure is None and 2 * self.numbers <= other.numbers
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers it has, without those that a fit found the captures to say nothing of."""
+        fitted = self.errors if self.errors is not None and self.effect.measure is None else {}
+        unknown = sum(int(np.isnan(errors).sum()) for errors in fitted.values())
+        return sum(values.size for values in self.values.values()) - unknown
 
     def with_values(self, values: Mapping[str, np.ndarray]) -> EffectInstance:
         """The same with other values, without errors."""

@@ -132,10 +132,12 @@ def counts(
     signal = light * gain
     if sensor.gain is not None:
         signal = signal * sensor.gain
+    if (by_laser := sensor.added_by_laser) is not None:
+        signal = signal + by_laser
     if sensor.free_capture_gain and measured is not None:
         signal = signal * own_gain(sensor, signal, measured)
-    if sensor.offset is not None:
-        signal = signal + sensor.offset
+    if (always := sensor.added_always) is not None:
+        signal = signal + always
     if sensor.response is not None:
         signal = sensor.response(signal / sensor.full_scale) * sensor.full_scale
     return signal

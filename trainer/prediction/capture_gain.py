@@ -23,7 +23,7 @@ def own_gain(sensor: Sensor, signal: Tensor, measured: tuple[Tensor, Tensor]) ->
     sensor : Sensor
         Its response is taken into account: where counts are not proportional to light, neither is the factor to counts.
     signal : Tensor [B, h, w], counts
-        Of the camera without added light and with a straight response.
+        Of the camera with a straight response and without light that is added in every capture alike.
     measured : (Tensor, Tensor)
         Counts above black, and weight, [B, h, w].
 
@@ -33,8 +33,8 @@ def own_gain(sensor: Sensor, signal: Tensor, measured: tuple[Tensor, Tensor]) ->
     """
     observed, weight = measured
     if sensor.response is None:
-        if sensor.offset is not None:
-            observed = observed - sensor.offset
+        if (always := sensor.added_always) is not None:
+            observed = observed - always
         return _sum(observed * signal * weight) / _sum(signal**2 * weight)
 
     def step() -> Tensor:
@@ -81,7 +81,7 @@ def brightness_step(along: Tensor, power: Tensor) -> Tensor:
 
 def _counts(sensor: Sensor, light: Tensor) -> Tensor:
     assert sensor.response is not None
-    counts = light if sensor.offset is None else light + sensor.offset
+    counts = light if (always := sensor.added_always) is None else light + always
     return sensor.response(counts / sensor.full_scale) * sensor.full_scale
 
 

@@ -272,6 +272,8 @@ class Sensor:
         dy and dx, each [h, w].
     gain : Tensor [h, w] or None
     offset : Tensor [h, w] or None, counts
+    laser_share : Tensor or None
+        Of `offset`: what follows each capture's own gain, as light of the laser does.
     response : callable or None
         A function of the signal as a share of full scale.
     free_capture_gain : bool
@@ -294,10 +296,30 @@ class Sensor:
     displacement: tuple[Tensor, Tensor] | None = None
     gain: Tensor | None = None
     offset: Tensor | None = None
+    laser_share: Tensor | None = None
     response: Callable[[Tensor], Tensor] | None = None
     free_capture_gain: bool = False
     free_capture_shift: bool = False
     capture_blur: Callable[[Tensor], Tensor] | None = None
+
+    @property
+    def added_by_laser(self) -> Tensor | None:
+        """The part of `offset` that follows each capture's own gain, counts."""
+        share = self.laser_share
+        return None if share is None or self.offset is None else self.offset * share
+
+    @property
+    def added_always(self) -> Tensor | None:
+        """The part of `offset` that is the same in every capture, counts."""
+        laser = self.added_by_laser
+        return self.offset if laser is None or self.offset is None else self.offset - laser
+
+    def as_bright(self, own: Tensor) -> Sensor:
+        """The sensor of captures whose own gain is known: the light that it adds to them."""
+        laser, always = self.added_by_laser, self.added_always
+        if laser is None or always is None:
+            return self
+        return replace(self, offset=own * laser + always, laser_share=None)
 
     @property
     def moves(self) -> bool:

@@ -11,7 +11,7 @@ with the difference carried from the camera's pixels to the panel's where the tw
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -189,6 +189,7 @@ def expected_counts(model: Model, batch: Batch) -> tuple[Scene, Stages, Tensor, 
         light = predictor.light(model, predictor.trace(model))
         own = _own_gain(stages, light, model, batch)
         gain = model.gain[batch.channel] * batch.exposure[:, None, None] * own
+        stages = replace(stages, sensor=stages.sensor.as_bright(own))
     with torch.enable_grad():
         light.requires_grad_(True)
         expected = counts(scene, stages, light, gain, None)
@@ -204,6 +205,8 @@ def _own_gain(stages: Stages, light: Tensor, model: Model, batch: Batch) -> Tens
     signal = light * model.gain[batch.channel] * batch.exposure[:, None, None]
     if sensor.gain is not None:
         signal = signal * sensor.gain
+    if (by_laser := sensor.added_by_laser) is not None:
+        signal = signal + by_laser
     return own_gain(sensor, signal, (batch.signal, batch.mask))
 
 
