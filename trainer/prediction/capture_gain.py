@@ -10,6 +10,7 @@ from torch import Tensor
 from trainer.prediction.stages import Sensor
 
 STEPS = 8  # of Gauss-Newton, of which a smooth response takes three or four
+SOME = 4  # one of so many rows and columns says a capture's brightness nearly
 APART = 0.01  # of the light: between the two brightnesses whose difference is the slope
 MOST = 0.7  # that one step may change the logarithm of the brightness
 SETTLED = 1e-5
@@ -37,20 +38,25 @@ def own_gain(sensor: Sensor, signal: Tensor, measured: tuple[Tensor, Tensor]) ->
             observed = observed - always
         return _sum(observed * signal * weight) / _sum(signal**2 * weight)
 
-    def step() -> Tensor:
-        return brightness_step(
-            *brightness_terms(lambda f: _counts(sensor, f * own * signal), observed, weight)
-        )
-
     own = torch.ones_like(signal[:, :1, :1])
-    with torch.no_grad():
-        for _ in range(STEPS):
-            change = step()
-            own = own * torch.exp(change)
-            if float(change.abs().max()) < SETTLED:
-                break
+    with torch.no_grad():  # some pixels say it nearly, and all of them the rest
+        for some in (slice(None, None, SOME), slice(None)):
+            for _ in range(STEPS):
+                change = _step(sensor, own, signal, observed, weight, some)
+                own = own * torch.exp(change)
+                if float(change.abs().max()) < SETTLED:
+                    break
     # The last step has the derivatives of the whole search, as the ones before have come to rest.
-    return own * torch.exp(step()) if torch.is_grad_enabled() else own
+    return own * torch.exp(_step(sensor, own, signal, observed, weight)) if torch.is_grad_enabled() else own
+
+
+def _step(
+    sensor: Sensor, own: Tensor, signal: Tensor, observed: Tensor, weight: Tensor, some: slice = slice(None)
+) -> Tensor:
+    """Change of the logarithm of each capture's gain, from some of the pictures' rows and columns."""
+    signal, observed, weight = (t[..., some, some] for t in (signal, observed, weight))
+    terms = brightness_terms(lambda f: _counts(sensor, f * own * signal, some), observed, weight)
+    return brightness_step(*terms)
 
 
 def brightness_terms(
@@ -79,9 +85,9 @@ def brightness_step(along: Tensor, power: Tensor) -> Tensor:
     return torch.clamp(along / torch.where(power > 0, power, torch.ones_like(power)), -MOST, MOST)
 
 
-def _counts(sensor: Sensor, light: Tensor) -> Tensor:
+def _counts(sensor: Sensor, light: Tensor, some: slice) -> Tensor:
     assert sensor.response is not None
-    counts = light if (always := sensor.added_always) is None else light + always
+    counts = light if (always := sensor.added_always) is None else light + always[..., some, some]
     return sensor.response(counts / sensor.full_scale) * sensor.full_scale
 
 
