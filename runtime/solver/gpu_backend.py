@@ -150,9 +150,8 @@ class Recorded:
             stream.begin_capture()
             try:
                 self._work(*arguments)
-            except (
-                Exception
-            ):  # the library raises different errors, and the recording is spoilt by any of them
+            except Exception:
+                # The library raises different errors, any of which spoils the recording.
                 with suppress(Exception):
                     stream.end_capture()
                 return None

@@ -106,10 +106,8 @@ class Objective:
         self.measured = xp.zeros((colours, len(MEASURED)), np.float64)
         self.found = np.ones((colours, len(MEASURED)))
         self.fresh = True
-        self._measure, self._go_back = (
-            backend.recorded(self._measure_now),
-            backend.recorded(self._go_back_now),
-        )
+        self._measure = backend.recorded(self._measure_now)
+        self._go_back = backend.recorded(self._go_back_now)
 
     def aim(self, targets: Array) -> None:
         """Change to other targets, irradiance [C, K, H, W] of any scale, none of them dark."""

@@ -53,6 +53,25 @@ def test_colours_that_are_computed_at_the_same_time_do_not_disturb_each_other() 
         assert one.psnr_db == pytest.approx(several.psnr_db, abs=1e-3)
 
 
+def test_colours_move_together_and_one_that_was_dark_looks_for_its_motion_itself() -> None:
+    """A pan that all colours share, each with a part of the picture's content; green is dark in every fourth frame."""
+    shape = (90, 120)
+    path = ideal_path(shape, 5e-3, 0.5, np.float32)
+    together = PatternSolver({"red": path, "green": path}, grid="panel")
+    alone = [PatternSolver({"red": path}, grid="panel") for _ in range(2)]
+    content = scene(shape).astype(np.float32)
+    pictures = np.stack([content, 0.5 * content[:, ::-1]])
+    for n in range(9):
+        target = np.roll(pictures, 2 * n, 2)
+        if n % 4 == 3:
+            target[1] = 0
+        found = next(together.patterns(target, time.monotonic_ns()))
+        for k in range(2 if target[1].any() else 1):
+            one = next(alone[k].patterns(target[k : k + 1], time.monotonic_ns()))
+            assert np.mean(found.gray[k] != one.gray[0]) < 1e-3, (n, k)
+        assert target[1].any() or not found.gray[1].any()
+
+
 def test_a_picture_keeps_its_pattern_while_its_refinement_makes_the_first_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
