@@ -89,6 +89,7 @@ def parameters(given: Any) -> list[ParameterText]:
         {name: {"value", "error", "unit"}} or {name: value}. A value is a number, a list, or {colour: number or list}.
     """
     lines = []
+    fitted = any(_has_error(one) for one in (given or {}).values())
     for name, one in (given or {}).items():
         entry = one if isinstance(one, Mapping) and "value" in one else {"value": one}
         value, error, unit = entry["value"], entry.get("error"), str(entry.get("unit") or "")
@@ -97,11 +98,20 @@ def parameters(given: Any) -> list[ParameterText]:
             for colour, own in value.items():
                 own_error = error.get(colour) if isinstance(error, Mapping) else None
                 lines.append(_parameter(f"{label}, {colour}", own, own_error, unit))
+        elif fitted and isinstance(value, int | float) and value == 0 and not _has_error(one):
+            lines.append(ParameterText(label, "not told by these captures"))
         elif isinstance(value, int | float | list | tuple | np.ndarray):
             lines.append(_parameter(label, value, error, unit))
         elif value is not None:
             lines.append(ParameterText(label, str(value)))
     return lines
+
+
+def _has_error(entry: Any) -> bool:
+    """Whether a parameter's value, or one of its values, has a standard error."""
+    error = entry.get("error") if isinstance(entry, Mapping) else None
+    own = list(error.values()) if isinstance(error, Mapping) else [error]
+    return any(bool(np.isfinite(np.asarray(one, dtype=float)).any()) for one in own if one is not None)
 
 
 def _label(name: str, unit: str) -> str:

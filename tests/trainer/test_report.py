@@ -318,6 +318,15 @@ def test_parameters_by_colour_and_long_lists_are_one_line_each() -> None:
     assert "6 terms, together 0.500 rad" in shown[3].text and len(shown[3].terms) == 6
 
 
+@pytest.mark.parametrize(("error", "value"), [(float("nan"), 0.0), (None, 0.0), (0.2, 0.0), (None, 3.0)])
+def test_a_number_of_which_the_captures_say_nothing_is_no_zero(error: float | None, value: float) -> None:
+    share = {"value": value, "error": error, "unit": "1"}
+    fitted = {"counts": {"value": [70.0, 2.0], "error": [0.5, 0.6], "unit": "counts"}, "laser_share": share}
+    text = parameters(fitted)[1].text
+    assert (text == "not told by these captures") == (error != 0.2 and value == 0)
+    assert parameters({"laser_share": share})[0].text != "not told by these captures"  # nothing was fitted
+
+
 def test_a_map_that_went_on_is_a_step_of_the_ladder() -> None:
     errors = {"nrmse": 0.1, "noise_nrmse": 0.05, "excess": 0.01}
     steps = [
