@@ -97,11 +97,9 @@ def parameters(given: Any) -> list[ParameterText]:
         if isinstance(value, Mapping):
             for colour, own in value.items():
                 own_error = error.get(colour) if isinstance(error, Mapping) else None
-                lines.append(_parameter(f"{label}, {colour}", own, own_error, unit))
-        elif fitted and isinstance(value, int | float) and value == 0 and not _has_error(one):
-            lines.append(ParameterText(label, "not told by these captures"))
+                lines.append(_parameter(f"{label}, {colour}", own, own_error, unit, fitted))
         elif isinstance(value, int | float | list | tuple | np.ndarray):
-            lines.append(_parameter(label, value, error, unit))
+            lines.append(_parameter(label, value, error, unit, fitted))
         elif value is not None:
             lines.append(ParameterText(label, str(value)))
     return lines
@@ -120,7 +118,8 @@ def _label(name: str, unit: str) -> str:
     return plain(name.removesuffix(f"_{suffix}") if suffix else name)
 
 
-def _parameter(label: str, value: Any, error: Any, unit: str) -> ParameterText:
+def _parameter(label: str, value: Any, error: Any, unit: str, fitted: bool) -> ParameterText:
+    """A parameter's line; `fitted`: other parameters of the effect have errors."""
     values = np.atleast_1d(np.asarray(value, dtype=float)).ravel()
     errors = np.full(values.shape, np.nan)
     if error is not None:
@@ -130,6 +129,8 @@ def _parameter(label: str, value: Any, error: Any, unit: str) -> ParameterText:
     tail = "" if unit in UNITLESS else f" {unit}"
     if len(terms) == 0:
         return ParameterText(label, "–")
+    if fitted and not values.any() and not np.isfinite(errors).any():
+        return ParameterText(label, "not told by these captures")
     if len(terms) <= TERMS:
         return ParameterText(label, ", ".join(terms) + tail)
     largest = int(np.argmax(np.abs(values)))

@@ -159,7 +159,7 @@ class Backend:
         return float(x.sum())
 
     def mean(self, x: Array) -> Number:
-        """Mean of an array of any shape, to more digits than its own."""
+        """Mean of an array of any shape; on a CPU to more digits than its own."""
         return float(x.mean(dtype=np.float64))
 
 

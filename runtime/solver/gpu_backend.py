@@ -75,14 +75,15 @@ class CupyBackend(Backend):
     def filter(self, image: Array, transfer: Array, spectrum: Array) -> None:
         with self._planning:
             # A recording needs its plans as long as it lives; the library's own cache forgets them.
-            for key, x, kind in (("there", image, "R2C"), ("back", spectrum, "C2R")):
-                if (key, image.shape, image.dtype.char) not in self._plans:
-                    plan = self._fft.get_fft_plan(x, image.shape, (0, 1), kind)
-                    self._plans[key, image.shape, image.dtype.char] = plan
-            with self._plans["there", image.shape, image.dtype.char]:
+            key, plan = (image.shape, image.dtype.char), self._fft.get_fft_plan
+            if key not in self._plans:
+                ways = ((image, "R2C"), (spectrum, "C2R"))
+                self._plans[key] = [plan(x, image.shape, (0, 1), kind) for x, kind in ways]
+            there, back = self._plans[key]
+            with there:
                 spectrum[...] = self._fft.rfft2(image)
             spectrum *= transfer
-            with self._plans["back", image.shape, image.dtype.char]:
+            with back:
                 image[...] = self._fft.irfft2(spectrum, s=image.shape)
 
     def take(self, table: Array, index: Array, out: Array) -> None:

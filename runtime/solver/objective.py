@@ -154,9 +154,11 @@ class Objective:
         if self.frames > 1:
             self.light *= 1 / self.frames
         for c, light in enumerate(self.light):
-            self.measured[c, LIT] = self._mean(light)
+            self.measured[c, LIT] = mean = self._mean(light)
             if first:
-                self.measured[c, MEAN] = mean = self.backend.total(light) / light.size
+                if self.weight is not None:  # of all pixels, also those that do not count
+                    mean = self.backend.total(light) / light.size
+                self.measured[c, MEAN] = mean
                 self.floor[c] = FLOOR * mean
 
     def _measure_now(self, phase: Array, first: bool) -> None:

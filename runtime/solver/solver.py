@@ -220,10 +220,11 @@ class Solver:
         elif change is None:
             change = change_between(self.before, _grayscale(targets), self.on, motion)
         optics_targets = self._aim(targets)
-        cold = change is None or change.cut
         if change is None or change.cut:
+            cold = True
             self.first.cold(optics_targets, self.descent.start, soon=True)
         else:
+            cold = False
             descent, still = self.descent, self._is_still(targets)
             room = descent.next_start()
             self.first.warm(

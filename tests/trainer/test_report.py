@@ -325,6 +325,11 @@ def test_a_number_of_which_the_captures_say_nothing_is_no_zero(error: float | No
     text = parameters(fitted)[1].text
     assert (text == "not told by these captures") == (error != 0.2 and value == 0)
     assert parameters({"laser_share": share})[0].text != "not told by these captures"  # nothing was fitted
+    apart = {"value": {"red": 0.0, "blue": 0.4}, "error": {"red": None, "blue": 0.1}, "unit": "1"}
+    assert [p.text for p in parameters({"laser_share": apart})] == [
+        "not told by these captures",
+        "0.40 ± 0.10",
+    ]
 
 
 def test_a_map_that_went_on_is_a_step_of_the_ladder() -> None:

@@ -249,7 +249,7 @@ def _having_gains(model: Model, predictors: Sequence[Predictor], points: Sequenc
     What light the laser adds is counted in them, and steps leave them as they are.
     """
     known = all(p.batch.channel in model.gain for p in predictors)
-    if known and not any(p.stages(model).sensor.free_capture_gain for p in predictors):
+    if known and not any(p.has_own_gains(model) for p in predictors):
         return model
     return with_gain(model, predictors, lights_of(model, predictors, points))
 

@@ -147,9 +147,7 @@ def columns(
         return slope(moved, step, effect.parameter(key[1]).scale)
 
     result = side_by_side(of_number, keys, base[0].numel())
-    if predictor.stages(
-        model
-    ).sensor.free_capture_gain:  # only in what laser light is counted in, its gain differs
+    if predictor.has_own_gains(model):
         result.append(kept(torch.zeros_like(base)))
     else:
         louder = replace(model, gain={c: g * 1.01 for c, g in model.gain.items()})

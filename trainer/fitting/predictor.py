@@ -49,6 +49,10 @@ class Predictor:
         moments = self.batch.moments
         return stages_of(self.scene, model, moment=moments[k] if moments else None)
 
+    def has_own_gains(self, model: Model) -> bool:
+        """Whether each capture has its own gain; the colour's then only says what light of the laser is counted in."""
+        return self.stages(model).sensor.free_capture_gain
+
     def parts(self, model: Model) -> list[tuple[slice, Stages]]:
         """Captures of the batch that share their stages, with these: all, or each where the model changes in time."""
         if not model.in_time:

@@ -129,17 +129,23 @@ def counts(
     Tensor [B, h, w], counts above black
     """
     sensor = stages.sensor
-    signal = light * gain
-    if sensor.gain is not None:
-        signal = signal * sensor.gain
-    if (by_laser := sensor.added_by_laser) is not None:
-        signal = signal + by_laser
+    signal = laser_counts(sensor, light, gain)
     if sensor.free_capture_gain and measured is not None:
         signal = signal * own_gain(sensor, signal, measured)
     if (always := sensor.added_always) is not None:
         signal = signal + always
     if sensor.response is not None:
         signal = sensor.response(signal / sensor.full_scale) * sensor.full_scale
+    return signal
+
+
+def laser_counts(sensor: Sensor, light: Tensor, gain: Tensor) -> Tensor:
+    """Counts [B, h, w] of all light that follows the laser's power, for light on the camera, by a straight response."""
+    signal = light * gain
+    if sensor.gain is not None:
+        signal = signal * sensor.gain
+    if (by_laser := sensor.added_by_laser) is not None:
+        signal = signal + by_laser
     return signal
 
 

@@ -27,7 +27,7 @@ from trainer.fitting.predictor import Predictor
 from trainer.model.bundle_export import acting_on_display
 from trainer.model.model import Model
 from trainer.model.model_stages import scene_for, stages_of
-from trainer.prediction.camera_light import counts
+from trainer.prediction.camera_light import counts, laser_counts
 from trainer.prediction.capture_gain import own_gain
 from trainer.prediction.predict import light_path
 from trainer.prediction.scene import Scene, Stages
@@ -187,27 +187,16 @@ def expected_counts(model: Model, batch: Batch) -> tuple[Scene, Stages, Tensor, 
     scene, stages = predictor.scene, predictor.stages(model)
     with torch.no_grad():
         light = predictor.light(model, predictor.trace(model))
-        own = _own_gain(stages, light, model, batch)
-        gain = model.gain[batch.channel] * batch.exposure[:, None, None] * own
-        stages = replace(stages, sensor=stages.sensor.as_bright(own))
+        gain = model.gain[batch.channel] * batch.exposure[:, None, None]
+        if stages.sensor.free_capture_gain:
+            signal = laser_counts(stages.sensor, light, gain)
+            own = own_gain(stages.sensor, signal, (batch.signal, batch.mask))
+            gain, stages = gain * own, replace(stages, sensor=stages.sensor.as_bright(own))
     with torch.enable_grad():
         light.requires_grad_(True)
         expected = counts(scene, stages, light, gain, None)
         (sensitivity,) = torch.autograd.grad(expected.sum(), light)
     return scene, stages, expected.detach(), sensitivity.expand_as(expected)
-
-
-def _own_gain(stages: Stages, light: Tensor, model: Model, batch: Batch) -> Tensor:
-    """A capture's own gain where laser power drifts, else 1."""
-    sensor = stages.sensor
-    if not sensor.free_capture_gain:
-        return torch.ones(1, 1, 1)
-    signal = light * model.gain[batch.channel] * batch.exposure[:, None, None]
-    if sensor.gain is not None:
-        signal = signal * sensor.gain
-    if (by_laser := sensor.added_by_laser) is not None:
-        signal = signal + by_laser
-    return own_gain(sensor, signal, (batch.signal, batch.mask))
 
 
 def display_irradiance(model: Model, batch: Batch) -> Tensor:
