@@ -13,11 +13,15 @@ import torch
 from tests.trainer.hidden import bench_file
 from tests.trainer.test_effects import gray, predicted, present, scene_of
 from trainer.captures.acquire import acquire_from
+from trainer.captures.batches import load
 from trainer.captures.capture_set import read_captures
 from trainer.diagnosis.explanation import explain
 from trainer.effects.effect_catalogue import catalogue
+from trainer.fitting.gauss_newton import fit
+from trainer.fitting.jacobian import column_step, columns, keys_of, stepped
 from trainer.fitting.pool import open_pool
-from trainer.model.model import Model
+from trainer.fitting.predictor import Predictor
+from trainer.model.model import Model, absent
 from trainer.model.model_stages import stages_for
 from trainer.prediction.camera_light import counts, light_on_camera
 from trainer.prediction.predict import trace
@@ -68,6 +72,28 @@ def test_light_that_is_added_drifts_as_far_as_it_is_the_lasers(share: float, ben
     drifting = stages_for(scene, (stray, present("laser_drift", spread=3.0), *effects))
     found = counts(scene, drifting, light, brightness, (truth, torch.ones_like(truth)))
     torch.testing.assert_close(found, truth, rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("bent", [(), (-0.9, 0.2)], ids=["straight", "bent"])
+def test_each_captures_own_gain_follows_in_derivatives(bent: tuple[float, ...], tmp_path: Path) -> None:
+    """Where the model is right, what a number does to predictions is what it does with gains found anew."""
+    hidden = ('kind = "laser_drift"\nsine_share = 0.3', *(['kind = "sensor_response"'] if bent else ()))
+    acquire_from(str(bench_file(tmp_path, *hidden)), tmp_path / "captures", patterns=4)
+    captures = read_captures(tmp_path / "captures")
+    (batch,) = load(captures, captures.captures)
+    model = Model(captures.bench)
+    moved = ("distance", "vignetting", *(["sensor_response"] if bent else ()))
+    for name in ("laser_drift", *moved):
+        model = model.having(absent(catalogue()[name], captures.bench))
+    model = fit(model, model.names, [batch]).model
+    predictor, keys = Predictor(model, batch), keys_of(model, moved)
+    with torch.no_grad():
+        _, slopes = columns(model, keys, predictor, predictor.trace(model))
+        for key, slope in zip(keys, slopes, strict=False):
+            step = column_step(model, key)
+            anew = (predictor.predict(stepped(model, key, step)) - predictor.predict(model)) / step
+            off = float(torch.linalg.vector_norm(slope - anew)) / float(torch.linalg.vector_norm(anew))
+            assert off < 0.1, key  # of secants one step wide; 0.1 to 2.3 where the gains are held
 
 
 @pytest.mark.parametrize("room", [False, True], ids=["of the laser", "of the room"])

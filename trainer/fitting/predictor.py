@@ -17,7 +17,14 @@ from trainer.captures.capture_table import Capture
 from trainer.fitting.side_by_side import side_by_side
 from trainer.model.model import Model
 from trainer.model.model_stages import scene_for, stages_of
-from trainer.prediction.camera_light import counts, light_on_camera, motion_near, motion_on_camera
+from trainer.prediction.camera_light import (
+    counts,
+    laser_counts,
+    light_on_camera,
+    motion_near,
+    motion_on_camera,
+)
+from trainer.prediction.capture_gain import own_gain
 from trainer.prediction.capture_motion import Motion, MotionNearby
 from trainer.prediction.predict import Trace, trace
 from trainer.prediction.scene import Scene, Stages
@@ -146,26 +153,58 @@ class Predictor:
     def _seen(self, part: slice) -> tuple[Tensor, Tensor]:
         return self.batch.signal[part], self.batch.mask[part]
 
-    def counts(self, model: Model, light: Tensor) -> Tensor:
-        """Counts above black [B, h, w], from the irradiance on the camera [B, h, w]."""
-        batch = self.batch
-        gain = model.gain[batch.channel] * batch.exposure[:, None, None]
+    def counts(self, model: Model, light: Tensor, own: Tensor | None = None) -> Tensor:
+        """Counts above black [B, h, w], from the irradiance on the camera [B, h, w].
+
+        Parameters
+        ----------
+        own : Tensor [B, 1, 1], optional
+            The captures' own gains, as `own_gains` gives them; without it they are found anew.
+        """
+        gain = self._gain(model)
         found = [
-            counts(self.scene, stages, light[part], gain[part], self._seen(part))
+            counts(
+                self.scene,
+                stages,
+                light[part],
+                gain[part],
+                self._seen(part),
+                None if own is None else own[part],
+            )
             for part, stages in self.parts(model)
         ]
-        return batch.as_compared(found[0] if len(found) == 1 else torch.cat(found))
+        return self.batch.as_compared(found[0] if len(found) == 1 else torch.cat(found))
+
+    def own_gains(self, model: Model, light: Tensor) -> Tensor | None:
+        """Each capture's own gain [B, 1, 1], from the irradiance on the camera [B, h, w]; None where it has none."""
+        if not self.has_own_gains(model):
+            return None
+        gain = self._gain(model)
+        found = [
+            own_gain(stages.sensor, laser_counts(stages.sensor, light[part], gain[part]), self._seen(part))
+            for part, stages in self.parts(model)
+        ]
+        return found[0] if len(found) == 1 else torch.cat(found)
+
+    def _gain(self, model: Model) -> Tensor:
+        """Counts [B, 1, 1] for one unit of light, before the captures' own gains."""
+        return model.gain[self.batch.channel] * self.batch.exposure[:, None, None]
 
     def predict(self, model: Model) -> Tensor:
         """Counts above black [B, h, w]."""
         return self.counts(model, self.light(model, self.trace(model)))
 
     def predict_nearby(
-        self, model: Model, start: str, before: Trace, near: NearMotions | None = None
+        self,
+        model: Model,
+        start: str,
+        before: Trace,
+        near: NearMotions | None = None,
+        own: Tensor | None = None,
     ) -> Tensor:
         """Counts above black [B, h, w] of a model that is a small step away from stage `start` on."""
         point = self.trace(model, start, before, nearby=True)
-        return self.counts(model, self.light(model, point, near))
+        return self.counts(model, self.light(model, point, near), own)
 
 
 def lights_of(

@@ -109,7 +109,12 @@ def _camera_transfer(scene: Scene, pupil: Pupil, sensor: Sensor) -> Tensor:
 
 
 def counts(
-    scene: Scene, stages: Stages, light: Tensor, gain: Tensor, measured: tuple[Tensor, Tensor] | None
+    scene: Scene,
+    stages: Stages,
+    light: Tensor,
+    gain: Tensor,
+    measured: tuple[Tensor, Tensor] | None,
+    own: Tensor | None = None,
 ) -> Tensor:
     """Counts above black for light on the camera.
 
@@ -123,6 +128,8 @@ def counts(
         Counts for one unit of light.
     measured : (Tensor, Tensor) or None
         Signal and weight [B, h, w], from which each capture's own gain is computed where laser power drifts.
+    own : Tensor [B, 1, 1], optional
+        Each capture's own gain, where it is known and need not be computed.
 
     Returns
     -------
@@ -130,8 +137,10 @@ def counts(
     """
     sensor = stages.sensor
     signal = laser_counts(sensor, light, gain)
-    if sensor.free_capture_gain and measured is not None:
-        signal = signal * own_gain(sensor, signal, measured)
+    if own is None and sensor.free_capture_gain and measured is not None:
+        own = own_gain(sensor, signal, measured)
+    if own is not None:
+        signal = signal * own
     if (always := sensor.added_always) is not None:
         signal = signal + always
     if sensor.response is not None:
