@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from trainer.effects.free_form import along, on_other_curve_nodes
 from trainer.fitting import free_form_effects
 from trainer.fitting.free_form_effects import with_free_form
 from trainer.fitting.gains import with_gains
+from trainer.fitting.predictor import excess_on
 from trainer.formatting import change_of
 from trainer.model.bundle_export import acting_on_display, baked_path
 from trainer.model.history import recorded
@@ -139,3 +141,22 @@ def test_a_curve_that_removes_next_to_nothing_is_given_up_before_the_rest_is_fit
     batches = [load(captures, captures.captures[:4]), load(captures, captures.captures[4:])]
     assert with_free_form(model, effect.name, *batches, 0.0) is None
     assert not refits
+
+
+def test_nodes_stay_where_few_captures_mislead_the_rest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a fit of the other numbers that leaves more on the captures that stop it, nothing is kept."""
+    captures = captured("sensor_response", tmp_path)
+    polynomials = fitted(captures, "sensor_response", free=False).model
+    present = replace(polynomials.instance("sensor_response"), effect=catalogue()["sensor_response"])
+    model = polynomials.having(present)
+    batches = [load(captures, captures.captures[:6]), load(captures, captures.captures[6:])]
+
+    def misled(model: Model, *_: Any, **__: Any) -> SimpleNamespace:
+        return SimpleNamespace(model=replace(model, gain={c: 1.3 * g for c, g in model.gain.items()}))
+
+    monkeypatch.setattr(free_form_effects, "fit", misled)
+    found = with_free_form(model, "sensor_response", *batches, 0.0)
+    assert found is not None and found.instance("sensor_response").nodes is not None
+    assert excess_on(found, batches[1]) < 0.5 * excess_on(model, batches[1])

@@ -101,15 +101,16 @@ def _turn(
 ) -> tuple[Model, float]:
     """The model with one effect's nodes fitted, then all other numbers, and its excess on `stopping`.
 
-    Where the nodes alone remove less than DESCENT of the excess that is needed, other numbers stay as they are.
+    Where the nodes alone remove less than DESCENT of the excess that is needed, other numbers stay as they are, and
+    where these then leave more on `stopping`: few captures may say too little of a response, say, where it saturates.
     """
     trial = _descended(model, name, shape, fitted, stopping, DESCENT * needed)
-    if needed:
-        excess = excess_on(trial, stopping)
-        if excess_on(model, stopping) - excess < DESCENT * needed:
-            return trial, excess
-    trial = fit(trial, trial.names, fitted, iterations=REFIT_ITERATIONS).model
-    return trial, excess_on(trial, stopping)
+    excess = excess_on(trial, stopping)
+    if needed and excess_on(model, stopping) - excess < DESCENT * needed:
+        return trial, excess
+    refitted = fit(trial, trial.names, fitted, iterations=REFIT_ITERATIONS).model
+    left = excess_on(refitted, stopping)
+    return (refitted, left) if left < excess else (trial, excess)
 
 
 def refined(model: Model, fitted: Sequence[Batch], stopping: Sequence[Batch]) -> Model:
