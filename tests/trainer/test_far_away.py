@@ -133,7 +133,7 @@ def test_a_joint_start_moves_the_camera_and_does_not_tilt_the_wavefront(tmp_path
     captures = stated_aside(true, dx=1.36, dy=-1.77)
     batches = batches_of(captures)
     ideal = with_gains(captures, Model(captures.bench), capture_roles(captures).fitted)
-    found = joint_start(ideal, catalogue(), batches)
+    found = joint_start(ideal, catalogue(), batches, Thresholds().least(1.0))
     shift = found.instance("misregistration").values
     a_pixel = PIXEL_UM / 8  # of the camera, in the panel's
     assert float(shift["shift_x"]) == pytest.approx(-1.36 / a_pixel, abs=0.1)

@@ -29,6 +29,7 @@ FAR = 0.3  # held-out excess from which several strong effects may hide one anot
 HELPS, EVEN = 0.5, 1.0
 # Excess from which other effects are missing: before these are there, to fit each one anew costs much and says little.
 OTHERS = 0.1
+NEARLY = 0.002  # excess below which effects are where they belong: what is left is for the ladder to explain
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,8 @@ def explain_together(
     """
     report = progress or no_progress
     batches = load(roles.captures, roles.fitted)
-    joint = joint_start(model, known, batches, part_of(report, 0.0, 0.6))
+    least = thresholds.least(errors.excess)
+    joint = joint_start(model, known, batches, least, part_of(report, 0.0, 0.6))
     joint = fit(joint, joint.names, batches, tolerance=ROUGH).model
     after = evaluate_captures(roles.captures, roles.held_out, joint)
     if gets_nowhere(after.excess, errors):
@@ -90,15 +92,18 @@ def explain_together(
     report(0.6, "looking whether maps go on")
     found, before_maps = joint, after
     joint, after = _with_maps(roles, joint, after, thresholds)
-    doubted = [name for name in TAKEN_FOR_EACH_OTHER if name in found.names]
-    if doubted and not thresholds.complete(after.excess, errors.excess):
+
+    def there() -> bool:
+        return after.excess < NEARLY or thresholds.complete(after.excess, errors.excess)
+
+    if set(TAKEN_FOR_EACH_OTHER) <= set(found.names) and not there():
         report(0.7, "looking whether a moved camera and a bent wavefront are taken for each other")
         ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
-        others = pool.map(_without, [(roles.folder, ids, held, found, name) for name in doubted])
+        others = pool.map(_without, [(roles.folder, ids, held, found, name) for name in TAKEN_FOR_EACH_OTHER])
         still, left = min(others, key=lambda one: one[1].excess)
         if left.excess < before_maps.excess:
             joint, after = _with_maps(roles, still, left, thresholds)
-    if after.excess < OTHERS and not thresholds.complete(after.excess, errors.excess):
+    if after.excess < OTHERS and not there():
         report(0.75, "looking whether an effect ends better from another start")
         better = from_another_start(roles, joint, after, pool)
         if better is not None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
-
 from runtime.excess import PredictionErrors, removed_excess
 from trainer.captures.batches import Batch, load, signal_variance
 from trainer.captures.capture_set import chosen, opened
@@ -14,9 +12,8 @@ from trainer.captures.capture_table import ids_of
 from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.verdict import Thresholds
 from trainer.fitting.gauss_newton import HOLD, FitResult, fit
-from trainer.fitting.jacobian import away_from_absent, keys_of, remaining, stacked
+from trainer.fitting.idle_effects import changes_without, most_telling
 from trainer.fitting.least_squares_gain import with_gain
-from trainer.fitting.many_numbers import has_many
 from trainer.fitting.pool import Pool
 from trainer.fitting.predictor import Predictor, evaluate_captures, excess_on, telling
 from trainer.fitting.refit import settled
@@ -71,24 +68,12 @@ def without_one(
     return None
 
 
-@torch.no_grad()
 def _in_doubt(roles: CaptureRoles, model: Model, names: Sequence[str], least: float) -> list[str]:
     """Those of the named effects that are not clearly needed."""
-    batches = [telling(model, b, 1) for b in load(roles.captures, roles.fitted)]
-    predictors = [Predictor(model, b) for b in batches]
-    keys = keys_of(model, [n for n in model.names if not has_many(model.instance(n))])
-    _, slopes = stacked(model, keys, predictors, [p.trace(model) for p in predictors])
-    away = torch.as_tensor([away_from_absent(model, key) for key in keys], dtype=slopes.dtype)
-    scale = signal_variance(batches)
-    matters = max(excess_on(model, batches), least)
-    doubted = []
-    for name in names:
-        own = [k for k, key in enumerate(keys) if key[0] == name]
-        others = [k for k in range(len(slopes)) if k not in own]
-        changed = remaining(away[own] @ slopes[own], slopes[others]) if own else 0.0
-        if changed < CHANGES * scale * matters:
-            doubted.append(name)
-    return doubted
+    batches = most_telling(model, load(roles.captures, roles.fitted))
+    change_without = changes_without(model, batches)
+    clear = CHANGES * signal_variance(batches) * max(excess_on(model, batches), least)
+    return [name for name in names if change_without({name}) < clear]
 
 
 def fitted_without(

@@ -18,7 +18,8 @@ from trainer.captures.batches import Batch
 from trainer.effects.effect_catalogue import Catalogue
 from trainer.effects.evidence import Evidence
 from trainer.effects.own_effect import starts_of
-from trainer.fitting.gauss_newton import HOLD, ROUGH, fit, with_measured_values
+from trainer.fitting.gauss_newton import HOLD, ROUGH, FitResult, fit, with_measured_values
+from trainer.fitting.idle_effects import without_idle
 from trainer.fitting.least_squares_gain import with_gain
 from trainer.fitting.predictor import Predictor, lights_of, telling
 from trainer.fitting.refit import least_for_order, raise_orders
@@ -34,22 +35,31 @@ TAKEN_FOR_EACH_OTHER = ("misregistration", "panel_wavefront")
 TILTS = 2  # the first two terms of a wavefront
 FIXED = (("zero_order", "leak_wavefront"),)
 # smoothed pictures say nothing of them; next to them, pictures as they are hardly fit
-FINE = ("sensor_blur", "crosstalk")
+FINE = ("sensor_blur", "crosstalk", "vignetting", "sensor_response")
 AT_LAST = ("laser_drift",)  # while pictures do not fit, a gain for each only takes up what is wrong
 SMOOTHING_PX = (8.0, 4.0, 2.0, 1.0)
 ITERATIONS, TOLERANCE = 6, 0.05
+NEAR = 0.01  # excess below which it shows which effects do nothing of their own
 NUMBERS = 1000  # independent ones that the pictures should hold, smoothed as they are
 
 
 def joint_start(
-    model: Model, known: Catalogue, batches: Sequence[Batch], progress: Progress | None = None
+    model: Model,
+    known: Catalogue,
+    batches: Sequence[Batch],
+    least: float,
+    progress: Progress | None = None,
 ) -> Model:
     """The model with the effects that most benches have, fitted together from coarse to fine, their orders raised.
+
+    Without those that then do nothing of their own.
 
     Parameters
     ----------
     known : Catalogue
         Effects of TOGETHER, FINE and AT_LAST that it lacks are left out.
+    least : float
+        Excess that makes no difference.
     progress : callable, optional
         Called with the share that is done and what is being done.
 
@@ -76,7 +86,10 @@ def joint_start(
     report(len(SMOOTHING_PX) / (len(SMOOTHING_PX) + 1), f"fitting {len(names + fine)} effects together")
     for name in fine:
         model = model.having(absent(known[name], model.bench))
-    model = _with_orders_raised(model, batches)
+    fitted = _with_orders_raised(model, batches, NEAR)
+    if fitted.errors.excess < NEAR:  # before, what is idle yet may do something when the others are right
+        fitted = _with_orders_raised(without_idle(fitted.model, batches, least), batches)
+    model = fitted.model
     for name in late:
         model = with_measured_values(model.having(absent(known[name], model.bench)), [name], batches)
     return model
@@ -91,7 +104,7 @@ def without_effect(model: Model, name: str, batches: Sequence[Batch]) -> Model:
     model = model.without(name)
     for sigma in SMOOTHING_PX[1:]:
         model = _fitted_to_smoothed(model, batches, sigma)
-    model = _with_orders_raised(model, batches)
+    model = _with_orders_raised(model, batches).model
     return fit(model, model.names, batches, tolerance=ROUGH).model
 
 
@@ -114,11 +127,15 @@ def _fitted_to_smoothed(model: Model, batches: Sequence[Batch], sigma_px: float)
     return fit(model, model.names, coarse, ITERATIONS, TOLERANCE, None, HOLD, FIXED).model
 
 
-def _with_orders_raised(model: Model, batches: Sequence[Batch]) -> Model:
-    """The model with all of its effects fitted to a few pictures as they are, their orders raised."""
+def _with_orders_raised(model: Model, batches: Sequence[Batch], enough: float = 0.0) -> FitResult:
+    """The model with all of its effects fitted to a few pictures as they are, orders raised until that is enough."""
     few = [_some(model, b, 0.0) for b in batches]
     fitted = fit(model, model.names, few, ITERATIONS, TOLERANCE, None, HOLD, FIXED)
-    return raise_orders(fitted, model.names, few, least_for_order, HOLD, FIXED).model
+
+    def needed(excess: float) -> float:
+        return math.inf if excess < enough else least_for_order(excess)
+
+    return raise_orders(fitted, model.names, few, needed, HOLD, FIXED)
 
 
 def _smoothed(model: Model, batches: Sequence[Batch], sigma_px: float) -> list[Batch]:
