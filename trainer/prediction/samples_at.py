@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ MOST_PLACES = 400_000  # whose weights are kept: 50 MB
 
 
 def samples_at(coefficients: Tensor, y: Tensor, x: Tensor) -> Tensor:
-    """`spline_samples`; on the processor with the weights of the places kept, where nothing is differentiated.
+    """`spline_samples`; on the processor with the weights of the places kept, where these are not differentiated.
 
     Parameters
     ----------
@@ -27,15 +28,31 @@ def samples_at(coefficients: Tensor, y: Tensor, x: Tensor) -> Tensor:
     -------
     Tensor [B, h, w]
     """
-    differentiated = any(t.requires_grad for t in (coefficients, y, x))
     kept = coefficients.device.type == "cpu" and coefficients.dtype == torch.float32
-    if differentiated or not kept or y.numel() > MOST_PLACES:
+    if y.requires_grad or x.requires_grad or not kept or y.numel() > MOST_PLACES:
         return spline_samples(coefficients, y, x)
     height, width = coefficients.shape[-2:]
     places = (array_of(t.double()).tobytes() for t in (y, x))
     weights = _weights(*places, (y.shape[-2], y.shape[-1]), (height, width))
-    sampled = [weights @ one.ravel() for one in array_of(coefficients)]
-    return torch.from_numpy(np.stack(sampled).reshape(-1, *y.shape))
+    return _Weighted.apply(coefficients, weights, tuple(y.shape))
+
+
+class _Weighted(torch.autograd.Function):
+    """Sums of each picture's samples by a matrix of weights, and their adjoint."""
+
+    @staticmethod
+    def forward(ctx: Any, coefficients: Tensor, weights: csr_matrix, places: tuple[int, int]) -> Tensor:
+        ctx.weights, ctx.shape = weights, coefficients.shape
+        return _each(weights, coefficients, places)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        return _each(ctx.weights.T, gradient, ctx.shape[-2:]), None, None
+
+
+def _each(weights: csr_matrix, pictures: Tensor, shape: tuple[int, int]) -> Tensor:
+    summed = [weights @ one.ravel() for one in array_of(pictures)]
+    return torch.from_numpy(np.stack(summed).reshape(-1, *shape))
 
 
 @lru_cache(maxsize=3)
