@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,11 +15,12 @@ from trainer.captures.capture_table import ids_of
 from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.addition import gone_on
 from trainer.diagnosis.another_start import from_another_start
+from trainer.diagnosis.screen import ScreenResult
 from trainer.diagnosis.unnecessary import without_one
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import Catalogue
 from trainer.fitting.gains import with_gains
-from trainer.fitting.gauss_newton import ROUGH, fit
+from trainer.fitting.gauss_newton import fit
 from trainer.fitting.joint_start import TAKEN_FOR_EACH_OTHER, joint_start, without_effect
 from trainer.fitting.pool import Pool
 from trainer.fitting.predictor import evaluate_captures
@@ -27,8 +30,12 @@ FAR = 0.3  # held-out excess from which several strong effects may hide one anot
 # Share of the excess that one effect leaves at most if it gets anywhere alone; of EVEN, what a picture without any
 # structure leaves, where that is less: an effect that only takes a wrong structure away gets nowhere.
 HELPS, EVEN = 0.5, 1.0
+# The same where the camera may lie elsewhere: a blur then removes much, of a wrong structure and not of what is wrong.
+HELPS_ELSEWHERE = 0.1
 # Excess from which other effects are missing: before these are there, to fit each one anew costs much and says little.
 OTHERS = 0.1
+# `tolerance` of the fit to all captures: what numbers take up slowly is for a map, which they would hide then.
+LOOSE = 0.02
 NEARLY = 0.002  # excess below which effects are where they belong: what is left is for the ladder to explain
 
 
@@ -51,6 +58,14 @@ class JointExplanation:
 def is_far(roles: CaptureRoles, model: Model, errors: PredictionErrors) -> bool:
     """Whether so much is missing from a model without effects that several strong ones may hide one another."""
     return not model.present and errors.excess >= FAR and roles.is_held_out
+
+
+def is_expected_somewhere(
+    roles: CaptureRoles, screened: Sequence[ScreenResult], errors: PredictionErrors
+) -> bool:
+    """Whether the screen expects that one effect alone gets somewhere."""
+    helps = HELPS if roles.captures.bench.camera.registered else HELPS_ELSEWHERE
+    return min((s.after for s in screened), default=math.inf) < helps * min(errors.excess, EVEN)
 
 
 def gets_nowhere(alone: float, errors: PredictionErrors) -> bool:
@@ -85,7 +100,7 @@ def explain_together(
     batches = load(roles.captures, roles.fitted)
     least = thresholds.least(errors.excess)
     joint = joint_start(model, known, batches, least, part_of(report, 0.0, 0.6))
-    joint = fit(joint, joint.names, batches, tolerance=ROUGH).model
+    joint = fit(joint, joint.names, batches, tolerance=LOOSE).model
     after = evaluate_captures(roles.captures, roles.held_out, joint)
     if gets_nowhere(after.excess, errors):
         return None

@@ -21,7 +21,7 @@ from trainer.diagnosis.fitted_ranking import expects_the_rest
 from trainer.diagnosis.ranking import RankedEffect
 from trainer.diagnosis.screen import ScreenResult
 from trainer.diagnosis.second_way import Fork, fork_at, is_hopeless
-from trainer.diagnosis.together import explain_together, gets_nowhere, is_far
+from trainer.diagnosis.together import explain_together, gets_nowhere, is_expected_somewhere, is_far
 from trainer.diagnosis.unnecessary import without_one
 from trainer.diagnosis.verdict import Thresholds, below_the_noise
 from trainer.effects.effect_catalogue import Catalogue
@@ -246,7 +246,7 @@ class Way:
         """What a model lacks that is far away; None where it began with several effects at once."""
         looking = part_of(progress, 0, 0.3)
         screened = self._screened(looking)
-        somewhere = not gets_nowhere(min((s.after for s in screened), default=math.inf), self.errors)
+        somewhere = is_expected_somewhere(self._roles, screened, self.errors)
         if not somewhere and self._begin_together(progress):
             return None
         found = self._diagnosed(looking, screened)

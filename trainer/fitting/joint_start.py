@@ -26,20 +26,31 @@ from trainer.fitting.refit import least_for_order, raise_orders
 from trainer.fitting.start_points import start_cost
 from trainer.model.model import Model, absent, instance_with
 
-TOGETHER = ("misregistration", "illumination", "panel_wavefront", "distance", "phase_response", "zero_order")
+TOGETHER = (
+    "misregistration",
+    "illumination",
+    "panel_wavefront",
+    "distance",
+    "phase_response",
+    "zero_order",
+    "sensor_response",
+)
 # Where the panel is bent, only a leak that is flat tells curvature from distance and size. A leak of any shape would
 # take up what the panel's own shape still lacks.
-ORDERS = {"zero_order": 2}
+# A response costs little to be bent as it may be, and what it lacks others take up.
+ORDERS = {"zero_order": 2, "sensor_response": 6}
 # To smoothed pictures a moved camera does what tilt, curvature and distance do.
 TAKEN_FOR_EACH_OTHER = ("misregistration", "panel_wavefront")
 TILTS = 2  # the first two terms of a wavefront
 FIXED = (("zero_order", "leak_wavefront"),)
 # smoothed pictures say nothing of them; next to them, pictures as they are hardly fit
-FINE = ("sensor_blur", "crosstalk", "vignetting", "sensor_response")
+FINE = ("sensor_blur", "crosstalk", "vignetting")
 AT_LAST = ("laser_drift",)  # while pictures do not fit, a gain for each only takes up what is wrong
 SMOOTHING_PX = (8.0, 4.0, 2.0, 1.0)
 ITERATIONS, TOLERANCE = 6, 0.05
-NEAR = 0.01  # excess below which it shows which effects do nothing of their own
+# Excess below which idle effects are left out. Then orders are raised to this excess, as far as that pays, and not at
+# all; after each, effects that have become idle are left out.
+NEAR, THEN = 0.01, (0.002, 0.0, math.inf)
 NUMBERS = 1000  # independent ones that the pictures should hold, smoothed as they are
 
 
@@ -87,8 +98,13 @@ def joint_start(
     for name in fine:
         model = model.having(absent(known[name], model.bench))
     fitted = _with_orders_raised(model, batches, NEAR)
-    if fitted.errors.excess < NEAR:  # before, what is idle yet may do something when the others are right
-        fitted = _with_orders_raised(without_idle(fitted.model, batches, least), batches)
+    for enough in THEN:
+        if fitted.errors.excess > NEAR:  # what is idle yet may do something when the others are right
+            break
+        smaller = without_idle(fitted.model, batches, least)
+        if smaller is fitted.model and enough == THEN[-1]:
+            break
+        fitted = _with_orders_raised(smaller, batches, enough)
     model = fitted.model
     for name in late:
         model = with_measured_values(model.having(absent(known[name], model.bench)), [name], batches)
