@@ -48,8 +48,8 @@ FINE = ("sensor_blur", "crosstalk", "vignetting")
 AT_LAST = ("laser_drift",)  # while pictures do not fit, a gain for each only takes up what is wrong
 SMOOTHING_PX = (8.0, 4.0, 2.0, 1.0)
 ITERATIONS, TOLERANCE = 6, 0.05
-# Excess below which idle effects are left out. Then orders are raised to this excess, as far as that pays, and not at
-# all; after each, effects that have become idle are left out.
+# Excess below which it shows which effects do nothing of their own. Each time that these are left out, orders are
+# raised until less than the next of THEN is left: at 0 as far as that pays, and at last not at all.
 NEAR, THEN = 0.01, (0.002, 0.0, math.inf)
 NUMBERS = 1000  # independent ones that the pictures should hold, smoothed as they are
 
