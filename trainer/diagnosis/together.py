@@ -65,12 +65,12 @@ def is_expected_somewhere(
 ) -> bool:
     """Whether the screen expects that one effect alone gets somewhere."""
     helps = HELPS if roles.captures.bench.camera.registered else HELPS_ELSEWHERE
-    return min((s.after for s in screened), default=math.inf) < helps * min(errors.excess, EVEN)
+    return not gets_nowhere(min((s.after for s in screened), default=math.inf), errors, helps)
 
 
-def gets_nowhere(alone: float, errors: PredictionErrors) -> bool:
-    """Whether an effect that leaves this much alone leaves more than half of what is missing, or of even light's."""
-    return alone >= HELPS * min(errors.excess, EVEN)
+def gets_nowhere(alone: float, errors: PredictionErrors, helps: float = HELPS) -> bool:
+    """Whether an effect that leaves this much alone leaves more than a share of what is missing, or of even light's."""
+    return alone >= helps * min(errors.excess, EVEN)
 
 
 def explain_together(

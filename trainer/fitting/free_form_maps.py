@@ -42,7 +42,7 @@ class FreeFormBatch:
         self.weight = batch.mask if inverse_variance is None else batch.mask * inverse_variance
         shared = [stages for _, stages in self.predictor.parts(model)]
         self.stages = shared if model.in_time else shared * len(batch.ids)
-        self.gain = model.gain[batch.channel] * batch.exposure[:, None, None]
+        self.gain = self.predictor.gain(model)
         with torch.no_grad():
             self.base = self.predictor.trace(model)
 

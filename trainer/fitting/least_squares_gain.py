@@ -69,7 +69,7 @@ def _through_response(model: Model, lit: Sequence[tuple[Predictor, Tensor]]) -> 
 def _counts_of(model: Model, predictor: Predictor, light: Tensor) -> Callable[[float], Tensor]:
     """Counts of a batch at so many times the light, without a gain of each capture's own."""
     batch = predictor.batch
-    gain = model.gain[batch.channel] * batch.exposure[:, None, None]
+    gain = predictor.gain(model)
 
     def found(factor: float) -> Tensor:
         parts = []

@@ -161,7 +161,7 @@ class Predictor:
         own : Tensor [B, 1, 1], optional
             The captures' own gains, as `own_gains` gives them; without it they are found anew.
         """
-        gain = self._gain(model)
+        gain = self.gain(model)
         found = [
             counts(
                 self.scene,
@@ -179,14 +179,14 @@ class Predictor:
         """Each capture's own gain [B, 1, 1], from the irradiance on the camera [B, h, w]; None where it has none."""
         if not self.has_own_gains(model):
             return None
-        gain = self._gain(model)
+        gain = self.gain(model)
         found = [
             own_gain(stages.sensor, laser_counts(stages.sensor, light[part], gain[part]), self._seen(part))
             for part, stages in self.parts(model)
         ]
         return found[0] if len(found) == 1 else torch.cat(found)
 
-    def _gain(self, model: Model) -> Tensor:
+    def gain(self, model: Model) -> Tensor:
         """Counts [B, 1, 1] for one unit of light, before the captures' own gains."""
         return model.gain[self.batch.channel] * self.batch.exposure[:, None, None]
 

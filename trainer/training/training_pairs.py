@@ -27,8 +27,7 @@ from trainer.fitting.predictor import Predictor
 from trainer.model.bundle_export import acting_on_display
 from trainer.model.model import Model
 from trainer.model.model_stages import scene_for, stages_of
-from trainer.prediction.camera_light import counts, laser_counts
-from trainer.prediction.capture_gain import own_gain
+from trainer.prediction.camera_light import counts
 from trainer.prediction.predict import light_path
 from trainer.prediction.scene import Scene, Stages
 from trainer.training.camera_to_panel import onto_panel
@@ -187,10 +186,8 @@ def expected_counts(model: Model, batch: Batch) -> tuple[Scene, Stages, Tensor, 
     scene, stages = predictor.scene, predictor.stages(model)
     with torch.no_grad():
         light = predictor.light(model, predictor.trace(model))
-        gain = model.gain[batch.channel] * batch.exposure[:, None, None]
-        if stages.sensor.free_capture_gain:
-            signal = laser_counts(stages.sensor, light, gain)
-            own = own_gain(stages.sensor, signal, (batch.signal, batch.mask))
+        gain = predictor.gain(model)
+        if (own := predictor.own_gains(model, light)) is not None:
             gain, stages = gain * own, replace(stages, sensor=stages.sensor.as_bright(own))
     with torch.enable_grad():
         light.requires_grad_(True)
