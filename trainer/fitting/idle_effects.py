@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 
-import numpy as np
 import torch
 
 from trainer.captures.batches import Batch, signal_variance
-from trainer.device import array_of
-from trainer.fitting.jacobian import away_from_absent, keys_of, stacked
+from trainer.fitting.jacobian import away_from_absent, keys_of, outside_span, stacked
 from trainer.fitting.many_numbers import has_many
 from trainer.fitting.predictor import Predictor, telling
 from trainer.model.model import Model
-
-ROUNDING = 1e-6  # of each number's square: what single precision leaves of numbers that change pictures alike
 
 
 def without_idle(model: Model, batches: Sequence[Batch], least: float) -> Model:
@@ -60,19 +56,14 @@ def changes_without(model: Model, batches: Sequence[Batch]) -> Callable[[Collect
     predictors = [Predictor(model, b) for b in batches]
     keys = keys_of(model, [n for n in model.names if not has_many(model.instance(n))])
     _, slopes = stacked(model, keys, predictors, [p.trace(model) for p in predictors])
-    products = array_of((slopes @ slopes.T).double())
-    away = np.array([away_from_absent(model, key) for key in keys])
+    products = (slopes @ slopes.T).double()
+    away = torch.zeros(len(products), dtype=torch.float64)  # the colours' gains, at the end, stay
+    away[: len(keys)] = torch.tensor([away_from_absent(model, key) for key in keys], dtype=torch.float64)
 
     def change_without(names: Collection[str]) -> float:
-        gone = np.array([k for k, key in enumerate(keys) if key[0] in names], dtype=int)
-        rest = np.setdiff1d(np.flatnonzero(np.diag(products) > 0), gone)
-        change = float(away[gone] @ products[np.ix_(gone, gone)] @ away[gone])
-        if not len(rest):
-            return change
-        norms = np.sqrt(np.diag(products)[rest])
-        normal = products[np.ix_(rest, rest)] / np.outer(norms, norms) + ROUNDING * np.eye(len(rest))
-        along = products[np.ix_(rest, gone)] @ away[gone] / norms
-        return change - float(along @ np.linalg.solve(normal, along))
+        gone = torch.tensor([k < len(keys) and keys[k][0] in names for k in range(len(products))])
+        along = products[:, gone] @ away[gone]
+        return outside_span(float(away[gone] @ along[gone]), along[~gone], products[~gone][:, ~gone])
 
     return change_without
 

@@ -214,13 +214,26 @@ def stacked(
 
 def remaining(residual: Tensor, slopes: Tensor) -> float:
     """Sum of squares of the residual outside the span of the columns."""
-    norms = torch.linalg.vector_norm(slopes, dim=1, dtype=torch.float64)
-    slopes = slopes[norms > 1e-9 * float(norms.max() + 1e-30)]
-    norms = norms[norms > 1e-9 * float(norms.max() + 1e-30)]
     total = float((residual.double() ** 2).sum())
-    if not len(norms):
+    return outside_span(total, (slopes @ residual).double(), (slopes @ slopes.T).double())
+
+
+def outside_span(total: float, along: Tensor, normal: Tensor) -> float:
+    """Sum of squares outside the span of n columns.
+
+    Parameters
+    ----------
+    total : float
+        All of it.
+    along, normal : Tensor [n], [n, n], float64
+        Products of the columns with what is summed, and with each other.
+    """
+    norms = normal.diagonal().clamp(min=0).sqrt()
+    shows = norms > 1e-9 * norms.max() if len(norms) else norms > 0
+    if not bool(shows.any()):
         return total
-    normal = (slopes @ slopes.T).double() / torch.outer(norms, norms)
-    along = (slopes @ residual).double() / norms
-    normal += 1e-6 * torch.eye(len(norms), dtype=torch.float64)
+    norms, along = norms[shows], along[shows] / norms[shows]
+    normal = normal[shows][:, shows] / torch.outer(norms, norms) + 1e-6 * torch.eye(
+        len(norms), dtype=torch.float64
+    )
     return total - float(along @ torch.linalg.solve(normal, along))
