@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 
 from trainer.captures.batches import Batch, signal_variance
-from trainer.fitting.jacobian import keys_of, remaining, stacked
+from trainer.fitting.jacobian import keys_of, outside_span, stacked
 from trainer.fitting.many_numbers import has_many
 from trainer.fitting.predictor import Predictor, telling
 from trainer.model.colours_apart import come_apart, may_come_apart
@@ -65,9 +65,12 @@ def with_numbers_that_pay(
         if first != key[2]:  # what colours have in common is the sum of their slopes
             slopes[keys.index((*key[:2], first))] += slopes[k]
     scale = signal_variance(few)
+    total = float((residual.double() ** 2).sum())
+    along, normal = (slopes @ residual).double(), (slopes @ slopes.T).double()
 
     def left(taken: Sequence[Further]) -> float:
-        return remaining(residual, slopes[[kind is None or kind in taken for kind in kinds]]) / scale
+        free = torch.tensor([kind is None or kind in taken for kind in kinds])
+        return outside_span(total, along[free], normal[free][:, free]) / scale
 
     offered = [kind for kind in dict.fromkeys(kinds) if kind is not None and kind[1] != BOTH]
     taken: list[Further] = []
