@@ -41,8 +41,9 @@ def kept_by_device(most: int) -> Callable[[F], F]:
 def kept_for_same(most: int) -> Callable[[F], F]:
     """Keep the last results of a function that makes tensors from objects that never change.
 
-    The arguments are compared by identity, as objects that hold arrays have no quick equality. The result is kept for
-    its device, within `MOST_BYTES`; with derivatives nothing is kept, as that would keep what the backward pass needs.
+    The arguments are compared by identity, as objects that hold arrays have no quick equality, but numbers by value.
+    The result is kept for its device, within `MOST_BYTES`; with derivatives nothing is kept, as that would keep what
+    the backward pass needs.
     """
 
     def kept(function: F) -> F:
@@ -52,7 +53,7 @@ def kept_for_same(most: int) -> Callable[[F], F]:
         def here(*args: Any) -> Any:
             if torch.is_grad_enabled():
                 return function(*args)
-            key = (torch.get_default_device(), *map(id, args))
+            key = (torch.get_default_device(), *(arg if isinstance(arg, int) else id(arg) for arg in args))
             found = known.get(key)
             # The arguments live on with the result, so that no other object gets their ids.
             return found[0] if found else known.keep(key, function(*args), args)

@@ -114,8 +114,15 @@ def finer_picture(spectrum: Array, shape: tuple[int, int], finer: int) -> Array:
     -------
     real array [..., finer n, finer m]
     """
-    rows = _taller(finer**2 * _below_highest(shape, spectrum) * spectrum, shape[0], finer)
-    return irfft(ifft(rows, axis=-2), finer * shape[1])  # the columns that a finer grid adds are zero
+    xp = array_namespace(spectrum)
+    (height, width), half = shape, (shape[0] + 1) // 2
+    # A finer grid adds rows and columns that are zero; so is the highest frequency of an even axis.
+    known = finer**2 * spectrum[..., : (width + 1) // 2]
+    below = known[..., height // 2 + 1 :, :]
+    added = (*known.shape[:-2], finer * height - half - below.shape[-2], known.shape[-1])
+    zeros = xp.zeros(added, dtype=known.dtype, device=known.device)
+    rows = xp.concat([known[..., :half, :], zeros, below], axis=-2)
+    return irfft(ifft(rows, axis=-2), finer * width)
 
 
 def finer_picture_adjoint(spectrum: Array, shape: tuple[int, int]) -> Array:
@@ -136,14 +143,6 @@ def finer_picture_adjoint(spectrum: Array, shape: tuple[int, int]) -> Array:
     half, columns = (shape[0] + 1) // 2, shape[1] // 2 + 1
     kept = xp.concat([spectrum[..., :half, :columns], spectrum[..., half - shape[0] :, :columns]], axis=-2)
     return kept * _below_highest(shape, kept)
-
-
-def _taller(spectrum: Array, rows: int, finer: int) -> Array:
-    """A half spectrum with zero rows for the frequencies that only a finer grid has."""
-    xp = array_namespace(spectrum)
-    half, shape = (rows + 1) // 2, (*spectrum.shape[:-2], (finer - 1) * rows, spectrum.shape[-1])
-    between = xp.zeros(shape, dtype=spectrum.dtype, device=spectrum.device)
-    return xp.concat([spectrum[..., :half, :], between, spectrum[..., half:, :]], axis=-2)
 
 
 def _below_highest(shape: tuple[int, int], like: Array) -> Array:

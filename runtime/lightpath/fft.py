@@ -24,6 +24,7 @@ except ImportError:  # pragma: no cover - exercised only where the wheel is miss
 Array = Any
 
 THREADS = cores()
+STRIP = 32  # rows that a core transforms at a time
 
 
 def fft(x: Array, axis: int, n: int | None = None) -> Array:
@@ -58,11 +59,28 @@ def irfft(x: Array, n: int) -> Array:
     """Inverse DFT of half a spectrum along the last axis, zero-padded at its end, to `n` real samples, divided by n."""
     host = _on_host(x)
     if host is not None:
-        whole = np.zeros((*host.shape[:-1], n // 2 + 1), host.dtype)
-        whole[..., : host.shape[-1]] = host
-        back = _ducc.c2r(whole, lastsize=n, axes=(-1,), forward=False, inorm=2, nthreads=_threads(x))
-        return of_kind(x, back)
+        return of_kind(x, _padded_rows(host, n, _threads(x)))
     return array_namespace(x).fft.irfft(x, n=n, axis=-1)
+
+
+def _padded_rows(half: np.ndarray, n: int, threads: int) -> np.ndarray:
+    """`irfft` by strips of rows that stay in a core's cache with their padding."""
+    spectra = half.reshape(-1, half.shape[-1])
+    rows = np.empty((len(spectra), n), half.real.dtype)
+    strip = np.zeros((min(STRIP * threads, len(spectra)), n // 2 + 1), half.dtype)
+    for begin in range(0, len(spectra), len(strip)):
+        some = spectra[begin : begin + len(strip)]
+        strip[: len(some), : some.shape[1]] = some
+        _ducc.c2r(
+            strip[: len(some)],
+            lastsize=n,
+            axes=(-1,),
+            forward=False,
+            inorm=2,
+            out=rows[begin : begin + len(some)],
+            nthreads=threads,
+        )
+    return rows.reshape(*half.shape[:-1], n)
 
 
 def has_ducc() -> bool:

@@ -44,3 +44,14 @@ def unit_phasor(angle: Array) -> Array:
     np.cos(host, out=turned.real)
     np.sin(host, out=turned.imag)
     return of_kind(angle, turned)
+
+
+def squared_modulus(field: Array) -> Array:
+    """|z|^2 of a complex array."""
+    host = on_host(field)
+    if host is None:
+        xp = array_namespace(field)
+        return xp.real(field) ** 2 + xp.imag(field) ** 2
+    power = np.square(host.real)
+    power += np.square(host.imag)
+    return of_kind(field, power)

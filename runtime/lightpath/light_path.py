@@ -31,7 +31,7 @@ from runtime.lightpath.grid import (
     image_frequencies,
     image_window,
 )
-from runtime.lightpath.host_arrays import unit_phasor
+from runtime.lightpath.host_arrays import squared_modulus, unit_phasor
 from runtime.lightpath.modulation import Modulation, factor_at
 from runtime.lightpath.periodic_axis import take
 
@@ -182,8 +182,7 @@ def sum_modes(path: LightPath, fields: Iterable[Array]) -> Array:
     """Sum of weighted |z|^2 over the modes' fields on the fine image grid."""
     total = None
     for mode, z in enumerate(fields):
-        xp = array_namespace(z)
-        light = path.weights[mode] * (xp.real(z) ** 2 + xp.imag(z) ** 2)
+        light = path.weights[mode] * squared_modulus(z)
         total = light if total is None else total + light
     return total
 

@@ -19,7 +19,7 @@ from runtime.camera.sampling import (
     spline_samples,
 )
 from runtime.camera.view import View, sampler_and_adjoint
-from runtime.lightpath.fft import irfft2, rfft2
+from runtime.lightpath.fft import irfft, irfft2, rfft2
 from runtime.lightpath.grid import FINE, at_pixels, grid_for
 from tests.runtime.benches import ideal_path
 
@@ -182,3 +182,14 @@ def test_a_rectified_picture_is_read_at_places_and_0_outside() -> None:
         read = rectified(counts, v, u)
         assert read.dtype == result
         np.testing.assert_allclose(read, 200 + 100 * (np.sin(v / 6) + np.cos(u / 7)), atol=2)
+
+
+@pytest.mark.parametrize("rows", [1, 32, 75])
+@pytest.mark.parametrize("kept", [20, 33])
+def test_rows_of_half_a_spectrum_are_transformed_with_the_rest_zero(rows: int, kept: int) -> None:
+    """However many rows are worked on at a time, none takes anything from the ones before."""
+    generator = np.random.default_rng(rows)
+    half = generator.normal(size=(2, rows, kept)) + 1j * generator.normal(size=(2, rows, kept))
+    before = half.copy()
+    np.testing.assert_allclose(irfft(half, 64), np.fft.irfft(half, 64), rtol=1e-12, atol=1e-14)
+    np.testing.assert_array_equal(half, before)

@@ -119,3 +119,18 @@ def test_results_for_the_same_objects_are_bounded_and_forgotten_alike(
     result(first)
     result(first)  # with derivatives, none is kept
     assert len(made) == 7
+
+
+def test_numbers_among_the_objects_are_compared_by_value() -> None:
+    made = []
+
+    @kept_for_same(4)
+    def result(of: list[int], size: int) -> Tensor:
+        made.append(size)
+        return made_of(size)
+
+    first = [0]
+    with torch.no_grad():
+        for size in ("1000", "1000", "1001"):
+            result(first, int(size))  # another object each time
+    assert made == [1000, 1001]

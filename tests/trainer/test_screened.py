@@ -15,9 +15,10 @@ from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.capture_table import Capture, ids_of
 from trainer.captures.held_out import capture_roles
-from trainer.diagnosis.screen import ScreenResult, screen, shares_of_work
+from trainer.diagnosis.screen import MEASURED, ScreenResult, screen, shares_of_work
 from trainer.diagnosis.screening import screen_candidates, screened_whole
 from trainer.diagnosis.telling import most_telling_capture, screened_captures
+from trainer.effects.definition import Parameter, effect
 from trainer.effects.effect_catalogue import catalogue
 from trainer.fitting.gains import with_gains
 from trainer.fitting.jacobian import keys_of
@@ -25,6 +26,7 @@ from trainer.fitting.pool import open_pool
 from trainer.fitting.predictor import telling_batches
 from trainer.fitting.start_points import start_points
 from trainer.model.model import Model, absent
+from trainer.prediction.stages import Sensor
 
 COLOURS = ("red", "green", "blue")
 
@@ -71,15 +73,31 @@ def test_workers_get_each_effect_once_and_about_the_same_work(made: CaptureSet, 
 
     def work(one: list) -> int:  # type: ignore[type-arg]
         there = [model.having(absent(e, made.bench)) for e in one]
-        return sum(
-            len(start_points(e, model)) + len(keys_of(m, [e.name])) for e, m in zip(one, there, strict=True)
-        )
+        starts = [len(start_points(e, model)) * (1 if e.measure is None else MEASURED) for e in one]
+        return sum(n + len(keys_of(m, [e.name])) for e, m, n in zip(one, there, starts, strict=True))
 
     shares = shares_of_work(effects, model, count)
     assert sorted(e.name for share in shares for e in share) == sorted(e.name for e in effects)
     assert len(shares) == min(count, len(effects))
     each = [work(share) for share in shares]
     assert max(each) - min(each) <= max(work([e]) for e in effects)
+
+
+@effect(
+    stage="sensor",
+    acts_on="camera",
+    parameters=[Parameter("slope", "1", scale=0.05, low=-1, high=1, starts=(-0.8, 0.1, 0.8))],
+)
+def fall_off(sensor: Sensor, slope: torch.Tensor) -> Sensor:
+    """Half of the picture is darker, whatever the sign of the slope."""
+    return sensor.multiplied(1 - slope**2 * sensor.x.clamp(min=0))
+
+
+def test_starts_that_do_alike_at_both_ends_are_not_taken_for_starts_that_do_nothing(made: CaptureSet) -> None:
+    roles = capture_roles(made)
+    ideal = with_gains(made, Model(made.bench), roles.fitted)
+    (found,) = screen(made.folder, ids_of(roles.fitted[:1]), ideal, (fall_off,))
+    assert found.start.values["slope"] == pytest.approx(0.1)
 
 
 def whole_screen(captures: CaptureSet, model: Model) -> dict[str, ScreenResult]:

@@ -103,3 +103,25 @@ def test_a_derivative_takes_light_from_aside_as_it_was_where_the_pupil_is_the_sa
     )
     assert float(whole.norm()) > 1e-4 * float(base.image.norm())
     assert float((near - whole).norm()) <= most * float(whole.norm())
+
+
+@pytest.mark.parametrize("changed", ["spatial_coherence", "iris", "panel_wavefront"])
+def test_a_points_picture_is_taken_from_before_only_where_it_is_the_same(changed: str) -> None:
+    """Another extent moves the picture that a point gives; another pupil or panel makes another one."""
+    extent = present("spatial_coherence", extent_y=0.8, extent_x=0.5)
+    other = {
+        "spatial_coherence": present("spatial_coherence", extent_y=0.3, extent_x=0.9),
+        "iris": present("iris", half_width=0.85),
+        "panel_wavefront": present("panel_wavefront", wavefront=np.array([0.0, 0.0, 0.5, 0.0, 0.2])),
+    }[changed]
+    scene = scene_of(extent, other)
+    here = {one.effect.name: one for one in (extent, absent(other.effect, bench()))}
+    here[extent.effect.name] = extent
+    there = tuple({**here, changed: other}.values())
+    with torch.no_grad():
+        base = trace(scene, stages_for(scene, tuple(here.values())), gray()[:1])
+        moved = stages_for(scene, there)
+        found = trace(scene, moved, gray()[:1], other.effect.stage, base)
+        whole = trace(scene, moved, gray()[:1])
+    torch.testing.assert_close(found.image, whole.image, rtol=1e-5, atol=1e-6 * float(whole.image.max()))
+    assert not torch.allclose(found.image, base.image, rtol=1e-3)

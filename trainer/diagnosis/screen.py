@@ -32,6 +32,7 @@ from trainer.prediction.predict import Trace
 # A candidate starts with values for each colour where these are expected to remove this share of what common ones
 # leave, and this share of what is there.
 OWN, LEAST_OWN = 0.7, 0.01
+MEASURED = 8  # predictions that it takes about as long to measure captures as
 WIDENED = 3  # how often the band is widened at most, each time as far as the best start opens the iris
 
 
@@ -150,9 +151,11 @@ def starts_from_one(effect: Effect) -> bool:
 def shares_of_work(effects: Sequence[Effect], model: Model, count: int) -> list[list[Effect]]:
     """Effects in at most so many shares whose screens take about as long.
 
-    The work is counted in predictions: one for each number of an effect and for each of its starting points.
+    The work is counted in predictions: one for each number of an effect and for each of its starting points, and more
+    for a start from which captures are measured.
     """
-    work = {e.name: len(start_points(e, model)) + len(_numbers(e, model)) for e in effects}
+    each = {e.name: MEASURED if e.measure is not None else 1 for e in effects}
+    work = {e.name: each[e.name] * len(start_points(e, model)) + len(_numbers(e, model)) for e in effects}
     shares: list[list[Effect]] = [[] for _ in range(min(count, len(effects)))]
     for effect in sorted(effects, key=lambda e: -work[e.name]):
         min(shares, key=lambda share: sum(work[e.name] for e in share)).append(effect)
@@ -204,19 +207,37 @@ def _start(effect: Effect, model: Model, predictors: list[Predictor], points: li
     if at_pupil:
         # What the panel sends to other wavelengths is the same for all starts, and nearly so is light from aside.
         there = [p.trace(model.having(starts[0]), "pupil", t) for p, t in zip(few, there, strict=True)]
-    costs = [start_cost(model, few, there, start, nearby=at_pupil) for start in starts]
-    if max(costs) - min(costs) < 1e-9 * max(costs) and not any(has_many(start) for start in starts):
+
+    def cost(start: EffectInstance) -> float:
+        return start_cost(model, few, there, start, nearby=at_pupil)
+
+    # Of a grid of starting values, three that have few in common show whether these change anything.
+    last = len(starts) - 1
+    tried = range(len(starts)) if effect.starts is not None else sorted({0, last // 2, last})
+    known = {k: cost(starts[k]) for k in tried}
+    most, least = max(known.values()), min(known.values())
+    if most - least < 1e-9 * most and not any(has_many(start) for start in starts):
         # A period or a place changes nothing while the amplitude is zero: compare one step ahead.
-        costs = [_one_step_ahead(model, few, there, start) for start in starts]
+        held = _unlike(starts)
+        costs = [_one_step_ahead(model, few, there, start, held) for start in starts]
+    else:
+        costs = [known[k] if k in known else cost(start) for k, start in enumerate(starts)]
     return starts[costs.index(min(costs))]
 
 
+def _unlike(starts: Sequence[EffectInstance]) -> set[str]:
+    """The parameters in which starting points differ."""
+    first = starts[0].values
+    return {name for name in first if any((s.values[name] != first[name]).any() for s in starts)}
+
+
 def _one_step_ahead(
-    model: Model, predictors: list[Predictor], points: list[Trace], start: EffectInstance
+    model: Model, predictors: list[Predictor], points: list[Trace], start: EffectInstance, held: set[str]
 ) -> float:
-    """Squared error that a straight-line step from a start would leave."""
+    """Squared error that a straight-line step from a start would leave, of all parameters but those held."""
     trial = model.having(start)
-    return remaining(*stacked(trial, keys_of(trial, [start.effect.name]), predictors, points))
+    keys = tuple(key for key in keys_of(trial, [start.effect.name]) if key[1] not in held)
+    return remaining(*stacked(trial, keys, predictors, points))
 
 
 def _remaining_of_many(

@@ -28,7 +28,7 @@ from trainer.prediction.stages import Sensor
             low=0,
             high=20,
             even=True,
-            starts=(0.3, 0.8),
+            starts=(0.8,),  # each capture shows its own
             about="of the motion during a usual exposure; each capture has its own",
             typical=(0, 3),
             example=1.2,

@@ -91,12 +91,7 @@ class Predictor:
             return trace(self.scene, stages, gray, start, one, earlier, nearby)
 
         parts = side_by_side(part, range(self.batch.gray.shape[0]), self.batch.gray[0].numel())
-        return Trace(
-            torch.cat([p.spectra for p in parts]),
-            torch.cat([p.image for p in parts]),
-            tuple(path for p in parts for path in p.paths),
-            tuple(aside for p in parts for aside in p.asides),
-        )
+        return Trace.joined(parts)
 
     def earlier(self, stages: Stages, k: int) -> Tensor | None:
         """Patterns shown before capture k [1, n, H, W], where the panel still shows something of them."""

@@ -15,6 +15,7 @@ from runtime.camera.sampling import (
     spline_filter,
 )
 from runtime.lightpath.fft import rfft2
+from runtime.lightpath.grid import image_frequencies
 from trainer.kept_results import kept_by_device, kept_for_same
 from trainer.prediction.capture_gain import own_gain
 from trainer.prediction.capture_motion import Motion, MotionNearby, measured_motion, motion_nearby
@@ -77,25 +78,48 @@ def motion_near(
 
 def _before_motion(scene: Scene, stages: Stages, image: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
     """Spectrum of the irradiance on the camera before the captures' motions, and how its pixels read it."""
-    grid, camera = scene.grid, scene.bench.camera
-    sensor = stages.sensor
-    if sensor.displacement is not None:
-        dy, dx = sensor.displacement
-        rows = torch.arange(dy.shape[-2], dtype=dy.dtype)[:, None]
-        places = camera.on_panel(rows + dy, torch.arange(dy.shape[-1], dtype=dy.dtype) + dx)
-    elif not camera.registered:
-        places = camera_positions(scene)
-    else:
-        places = None
+    grid, sensor = scene.grid, stages.sensor
+    places = _places(scene, sensor)
 
     def read(spectrum: Tensor) -> Tensor:
         if places is None:
             return registered_samples(grid, spectrum)
-        finer = spectrum / spline_filter(sensor.iy, sensor.ix, grid.fine * FINER)
-        fine = finer_picture(finer, grid.image_shape, FINER)
-        return samples_at(fine, *sample_places(grid, *places, FINER))
+        finer = finer_picture(spectrum * _spline_transfer(scene), grid.image_shape, FINER)
+        return samples_at(finer, *places)
 
     return rfft2(image) * _camera_transfer(scene, stages.pupil, sensor), read
+
+
+def _places(scene: Scene, sensor: Sensor) -> tuple[Tensor, Tensor] | None:
+    """Where each camera pixel's centre looks, samples of the finer picture; None: at the centres of panel pixels."""
+    displacement = sensor.displacement
+    if displacement is None and scene.bench.camera.registered:
+        return None
+    if displacement is not None and any(d.requires_grad for d in displacement):
+        return _looked_at(scene, displacement)
+    with torch.no_grad():
+        return _kept_looked_at(scene, displacement)
+
+
+def _looked_at(scene: Scene, displacement: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor]:
+    if displacement is None:
+        places = camera_positions(scene)
+    else:
+        dy, dx = displacement
+        rows = torch.arange(dy.shape[-2], dtype=dy.dtype)[:, None]
+        places = scene.bench.camera.on_panel(rows + dy, torch.arange(dy.shape[-1], dtype=dy.dtype) + dx)
+    return sample_places(scene.grid, *places, FINER)
+
+
+_kept_looked_at = kept_for_same(3)(_looked_at)
+
+
+@kept_by_device(8)
+def _spline_transfer(scene: Scene) -> Tensor:
+    """Transfer function that makes the splines' coefficients of the finer picture."""
+    fy, fx = image_frequencies(scene.grid, torch.zeros((), dtype=scene.dtype))
+    pitch = scene.grid.pitch
+    return 1 / spline_filter(fy[:, None] * pitch, fx[None, :] * pitch, scene.grid.fine * FINER)
 
 
 @kept_for_same(2)  # of a fit's model and of its trial

@@ -18,12 +18,13 @@ from trainer.prediction.stages import Sensor
 STEPS = 3  # of Gauss-Newton; displacements are a small part of a speckle
 MOST = 1.0  # panel pixels that one step may move
 # Widths of blurs, as shares of the usual one: the widest at first, and in the end, where the widest fits best.
-WIDEST_BLUR, LIMIT = 2.4, 9.6
-TRIED_BLURS = 6, 2.1  # how many: a few, and so many more a usual width
+WIDEST_BLUR, LIMIT = 2.4, 4.8
+NEARLY_WIDEST = 0.95
+TRIED_BLURS = 6, 2.1  # how many between two widths: a few, and so many more a usual width
 BLUR_STEP = 0.05  # for derivatives, share of the usual width
 RESPONSE = -0.1, 1.5, 2049  # shares of full scale between which a response is turned back, and how many
 FLAT = 0.05  # least slope that a response is turned back with
-RATIOS = np.linspace(0, 1, 161)  # of the widest, between which the best is looked for
+BETWEEN = np.linspace(0, 1, 161)  # two widths: where the best one is looked for
 
 
 @dataclass(frozen=True)
@@ -186,54 +187,60 @@ def _blur(
     weight: Tensor,
 ) -> Tensor:
     """Width of each capture's blur [B], share of the usual one."""
-    widest = WIDEST_BLUR
+    least, widest = 0.0, WIDEST_BLUR
+    best = torch.zeros(len(signal), dtype=torch.float64)
+    highest = torch.full_like(best, -1.0)
     while True:
-        amounts, interpolation = _blurs_tried(widest)
+        amounts, interpolation = _blurs_tried(least, widest)
         sums = []
         for amount in amounts:
             tried = blur(torch.tensor(amount, dtype=sensor.iy.dtype))
             picture = _on_sensor(sensor, read(spectrum * tried))
             weighted = weight * picture
             sums.append(torch.stack([_sum(weighted * signal), _sum(weighted * picture)]))
-        ratio = _best_ratio(torch.stack(sums, -1), interpolation) * widest
-        if widest >= LIMIT or bool((ratio < 0.95 * widest).all()):
-            return ratio.to(sensor.iy.dtype)
-        widest *= 2
+        place, score = _best_between(torch.stack(sums, -1), interpolation)
+        best = torch.where(score > highest, least + place * (widest - least), best)
+        highest = torch.maximum(score, highest)
+        if widest >= LIMIT or bool((best < NEARLY_WIDEST * widest).all()):
+            return best.to(sensor.iy.dtype)
+        least, widest = widest, 2 * widest
 
 
 @kept_by_device(3)
-def _blurs_tried(widest: float) -> tuple[tuple[float, ...], Tensor]:
-    """Squares of the widths that are tried, and the matrix that interpolates from these to RATIOS, float64.
+def _blurs_tried(least: float, widest: float) -> tuple[tuple[float, ...], Tensor]:
+    """Squares of the widths that are tried, and the matrix that interpolates from these to BETWEEN, float64.
 
-    What a picture's products with others are is smooth in the square of its blur's width, so a few Chebyshev points up
-    to the widest one tell all between.
+    What a picture's products with others are is smooth in the square of its blur's width, so a few Chebyshev points
+    tell all between two widths.
     """
-    tried = round(TRIED_BLURS[0] + TRIED_BLURS[1] * widest)
+    tried = round(TRIED_BLURS[0] + TRIED_BLURS[1] * (widest - least))
     nodes = chebyshev.chebpts1(tried)
     there = chebyshev.chebvander(nodes, tried - 1)
-    between = chebyshev.chebvander(2 * RATIOS**2 - 1, tried - 1)
-    return tuple(0.5 * (1 + nodes) * widest**2), torch.as_tensor(np.linalg.solve(there.T, between.T).T)
+    begin, reach = least**2, widest**2 - least**2
+    squares = (least + BETWEEN * (widest - least)) ** 2
+    between = chebyshev.chebvander(2 * (squares - begin) / reach - 1, tried - 1)
+    return tuple(begin + 0.5 * (1 + nodes) * reach), torch.as_tensor(np.linalg.solve(there.T, between.T).T)
 
 
-def _best_ratio(sums: Tensor, interpolation: Tensor) -> Tensor:
-    """The widths at which blurred pictures fit best, [B], shares of the widest one tried.
+def _best_between(sums: Tensor, interpolation: Tensor) -> tuple[Tensor, Tensor]:
+    """Where between two widths blurred pictures fit best, [B], 0 to 1, and by how much they then fit better, [B].
 
     Parameters
     ----------
     sums : Tensor [2, B, K], float64
         Products of the blurred pictures with the measured ones, and with themselves.
     interpolation : Tensor [N, K]
-        From the blurs tried to RATIOS.
+        From the blurs tried to BETWEEN.
     """
     product, power = sums @ interpolation.T
     power = torch.maximum(power, 0.5 * sums[1].amin(1, keepdim=True)).clamp(min=1e-30)
     score = product.clamp(min=0) ** 2 / power  # with the best brightness, the misfit falls by this
-    best = score.argmax(1).clamp(1, len(RATIOS) - 2)
+    best = score.argmax(1).clamp(1, len(BETWEEN) - 2)
     before, here, after = (score.gather(1, best[:, None] + k)[:, 0] for k in (-1, 0, 1))
     bend = before - 2 * here + after
     part = torch.where(bend < 0, 0.5 * (before - after) / torch.where(bend < 0, bend, -1.0), 0.0)
     part = torch.where(bend < 0, part, torch.sign(after - before))
-    return (best + part.clamp(-1, 1)) * RATIOS[1]
+    return (best + part.clamp(-1, 1)) * BETWEEN[1], score.amax(1)
 
 
 def straight_signal(sensor: Sensor, observed: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -175,17 +176,35 @@ class Trace:
         Of each capture.
     asides : tuple of tuple of Aside
         Of each capture: what light of the extent beside the axis does to the image.
+    of_point : Tensor or None
+        Irradiance before filters, of a source that is a point; None where the source is one.
     """
 
     spectra: Tensor
     image: Tensor
     paths: tuple[LightPath, ...]
     asides: tuple[tuple[Aside, ...], ...]
+    of_point: Tensor | None
 
     def of(self, k: int) -> Trace:
         """The results of capture k alone."""
         one = slice(k, k + 1)
-        return Trace(self.spectra[one], self.image[one], self.paths[one], self.asides[one])
+        of_point = None if self.of_point is None else self.of_point[one]
+        return Trace(self.spectra[one], self.image[one], self.paths[one], self.asides[one], of_point)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Trace]) -> Trace:
+        """The results of captures one after the other."""
+        of_point = None
+        if any(p.of_point is not None for p in parts):
+            of_point = torch.cat([p.image if p.of_point is None else p.of_point for p in parts])
+        return cls(
+            torch.cat([p.spectra for p in parts]),
+            torch.cat([p.image for p in parts]),
+            tuple(path for p in parts for path in p.paths),
+            tuple(aside for p in parts for aside in p.asides),
+            of_point,
+        )
 
 
 def trace(
@@ -235,15 +254,36 @@ def trace(
             known = torch.cat((known, panel_spectra(path, phase, BESIDE)), 2)
     spectra = known
     near: tuple[Aside, ...] = ()
-    if nearby and before is not None and same(before.paths[0].transfers, path.transfers):
-        near = before.asides[0]
-    lit = _lit(scene, stages, path, lambda p: irradiance_of(p, spectra, scales), near)
+    of_point = None
+    if before is not None and same(before.paths[0].transfers, path.transfers):
+        near = before.asides[0] if nearby else ()
+        if start == "pupil" and scales is None and not torch.is_grad_enabled():
+            of_point = _of_point(before, path)
+    lit = _lit(scene, stages, path, lambda p: irradiance_of(p, spectra, scales), near, of_point)
     return _traced(spectra, lit, path, len(gray))
 
 
-def _traced(spectra: Tensor, lit: tuple[Tensor, tuple[Aside, ...]], path: LightPath, count: int) -> Trace:
-    image, asides = lit
-    return Trace(spectra, image, (path,) * count, tuple(tuple(a.of(k) for a in asides) for k in range(count)))
+def _of_point(before: Trace, path: LightPath) -> Tensor | None:
+    """A point source's irradiance, from a path with the same spectra and transfers; None where it is another."""
+    old = before.paths[0]
+    if not same(old.weights, path.weights) or path.far_field is not None:
+        return None
+    return before.image if before.of_point is None else before.of_point
+
+
+class _Lit(NamedTuple):
+    """Irradiance of a source that has its extent and of one that is a point, and what light beside the axis does."""
+
+    image: Tensor
+    of_point: Tensor
+    asides: tuple[Aside, ...]
+
+
+def _traced(spectra: Tensor, lit: _Lit, path: LightPath, count: int) -> Trace:
+    asides = tuple(tuple(a.of(k) for a in lit.asides) for k in range(count))
+    return Trace(
+        spectra, lit.image, (path,) * count, asides, None if lit.of_point is lit.image else lit.of_point
+    )
 
 
 def _lit(
@@ -252,11 +292,20 @@ def _lit(
     path: LightPath,
     image: Callable[[LightPath], Tensor],
     near: Sequence[Aside] = (),
-) -> tuple[Tensor, tuple[Aside, ...]]:
-    """Irradiance with the source's extent, of a function that gives that of a light path of a point's light."""
+    of_point: Tensor | None = None,
+) -> _Lit:
+    """Irradiance with the source's extent, of a function that gives that of a light path of a point's light.
+
+    Parameters
+    ----------
+    of_point : Tensor, optional
+        What the function gives for `path`, where it is known.
+    """
+    on_axis = image(path) if of_point is None else of_point
 
     def image_of(pupil: Pupil) -> Tensor:
         own = pupil is stages.pupil
-        return image(path if own else light_path(scene, replace(stages, pupil=pupil)))
+        return on_axis if own else image(light_path(scene, replace(stages, pupil=pupil)))
 
-    return lit_by_extent(stages.pupil, image_of, near)
+    lit, asides = lit_by_extent(stages.pupil, image_of, near)
+    return _Lit(lit, on_axis, asides)

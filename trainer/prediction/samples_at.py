@@ -12,6 +12,7 @@ from torch import Tensor
 
 from runtime.camera.sampling import spline_matrix, spline_samples
 from trainer.device import array_of
+from trainer.kept_results import kept_for_same
 
 MOST_PLACES = 400_000  # whose weights are kept: 50 MB
 
@@ -31,9 +32,8 @@ def samples_at(coefficients: Tensor, y: Tensor, x: Tensor) -> Tensor:
     kept = coefficients.device.type == "cpu" and coefficients.dtype == torch.float32
     if y.requires_grad or x.requires_grad or not kept or y.numel() > MOST_PLACES:
         return spline_samples(coefficients, y, x)
-    height, width = coefficients.shape[-2:]
-    places = (array_of(t.double()).tobytes() for t in (y, x))
-    weights = _weights(*places, (y.shape[-2], y.shape[-1]), (height, width))
+    with torch.no_grad():
+        weights = _weights_at(y, x, *coefficients.shape[-2:])
     return _Weighted.apply(coefficients, weights, tuple(y.shape))
 
 
@@ -53,6 +53,12 @@ class _Weighted(torch.autograd.Function):
 def _each(weights: csr_matrix, pictures: Tensor, shape: tuple[int, int]) -> Tensor:
     summed = [weights @ one.ravel() for one in array_of(pictures)]
     return torch.from_numpy(np.stack(summed).reshape(-1, *shape))
+
+
+@kept_for_same(3)  # the same tensors are asked for again and again, and others with the same places
+def _weights_at(y: Tensor, x: Tensor, height: int, width: int) -> csr_matrix:
+    places = (array_of(t.double()).tobytes() for t in (y, x))
+    return _weights(*places, (y.shape[-2], y.shape[-1]), (height, width))
 
 
 @lru_cache(maxsize=3)
