@@ -37,6 +37,9 @@ ROUGH = 5e-3  # `tolerance` of fits that only compare, or that others follow
 # A fit is given up where a step is expected to leave more than so many times enough, and this share of what there is;
 # and where it would not come there if each step that it still has removed so many times what the last one did.
 FAR, SLOW, FASTER = 10.0, 0.5, 2.0
+PROMISING = (
+    0.8  # share of what there is that a step is expected to leave at most if it is expected to do much
+)
 BLOCK = 1 << 18  # pixels
 
 
@@ -78,7 +81,8 @@ def fit(
 ) -> FitResult:
     """Fit the named effects of a model, and the gains, to batches.
 
-    Stops after `iterations`, or when a step lowers the excess by less than `tolerance` of it and less than 2e-6.
+    Stops after `iterations`, or when a step lowers the excess by less than `tolerance` of it or less than 2e-6, unless
+    that step had to be shortened where a whole one was expected to do much.
     Errors of values are standard errors from the residuals themselves (a sandwich estimate), so misfit widens them; NaN
     where the captures do not determine a value: such a value stays as it is.
 
@@ -131,17 +135,16 @@ def _fit(
             progress(iteration / iterations)
         before = errors.excess
         normal, gradient = _normal(slopes), _gradient(slopes, residuals)
-        if fresh and before > FAR * enough:
-            left = before - float(gradient @ _solve(normal, gradient, 0.0)) / scale
-            if left > max(FAR * enough, SLOW * before):
-                settled = False
-                break
+        left = before - float(gradient @ _solve(normal, gradient, 0.0)) / scale
+        if fresh and before > FAR * enough and left > max(FAR * enough, SLOW * before):
+            settled = False
+            break
         pull = hold * max(before, 0.0)
         away = _away(model, keys, ranges)
         if pull:
             normal[range(len(keys)), range(len(keys))] += pull * scale / ranges**2
             gradient[: len(keys)] -= pull * scale * away / ranges
-        accepted = False
+        accepted, raised = False, False
         for _ in range(6 if fresh else 1):
             trial = _moved(model, keys, channels, _solve(normal, gradient, damping))
             trial_points = [p.trace(trial, first, t) for p, t in zip(predictors, points, strict=True)]
@@ -150,7 +153,7 @@ def _fit(
             if trial_errors.excess + paid < before:
                 accepted = True
                 break
-            damping = max(damping, 1e-4) * 8
+            damping, raised = max(damping, 1e-4) * 8, True
         if accepted:
             model, points = trial, trial_points
             residuals, errors = trial_residuals, trial_errors
@@ -158,7 +161,8 @@ def _fit(
         elif fresh:
             break
         removed_excess = before - errors.excess
-        if fresh and removed_excess < max(tolerance * abs(errors.excess), 2e-6):
+        promising = raised and left < PROMISING * before
+        if fresh and not promising and removed_excess < max(tolerance * abs(errors.excess), 2e-6):
             break
         if fresh and is_too_slow(removed_excess, iterations - iteration - 1, errors.excess, enough):
             settled = False

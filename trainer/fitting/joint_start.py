@@ -48,6 +48,8 @@ FINE = ("sensor_blur", "crosstalk", "vignetting")
 AT_LAST = ("laser_drift",)  # while pictures do not fit, a gain for each only takes up what is wrong
 SMOOTHING_PX = (8.0, 4.0, 2.0, 1.0)
 ITERATIONS, TOLERANCE = 6, 0.05
+# With less, magnification, distance and curvature run away together: pictures smoothed by 4 pixels hardly tell them.
+HOLD_SMOOTHED = 0.03
 # Excess below which it shows which effects do nothing of their own. Each time that these are left out, orders are
 # raised until less than the next of THEN is left: at 0 as far as that pays, and at last not at all.
 NEAR, THEN = 0.01, (0.002, 0.0, math.inf)
@@ -140,7 +142,7 @@ def _shifted_not_tilted(model: Model) -> Model:
 def _fitted_to_smoothed(model: Model, batches: Sequence[Batch], sigma_px: float) -> Model:
     """The model with all of its effects fitted to smoothed pictures."""
     coarse = _smoothed(model, batches, sigma_px)
-    return fit(model, model.names, coarse, ITERATIONS, TOLERANCE, None, HOLD, FIXED).model
+    return fit(model, model.names, coarse, ITERATIONS, TOLERANCE, None, HOLD_SMOOTHED, FIXED).model
 
 
 def _with_orders_raised(model: Model, batches: Sequence[Batch], enough: float = 0.0) -> FitResult:
