@@ -9,20 +9,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from runtime.lightpath.legendre import legendre_count
 from runtime.program.plain_values import plain
 from tests.trainer.hidden import bench_file
+from tests.trainer.made_sets import make_set
 from trainer.captures.acquire import acquire_from
 from trainer.captures.batches import Batch, load
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.effects import catalogue
+from trainer.effects.definition import Parameter, effect
 from trainer.effects.testing import captures_with
 from trainer.fitting import gauss_newton, jacobian
 from trainer.fitting.gauss_newton import fit, is_too_slow
 from trainer.fitting.refit import least_for_order, raise_orders
 from trainer.model.model import EffectInstance, Model, absent, instance_with
 from trainer.model.parameters import describe, json_values
+from trainer.prediction.stages import Sensor
 
 KNOWN = catalogue()
 LEAK = ("leak_real", "leak_imaginary")
@@ -224,3 +228,29 @@ def test_a_fit_that_is_too_slow_for_what_is_enough_is_given_up_on_the_way(
     steps.clear()
     given_up = fit(model, model.names, batches, enough=0.9 * patient.errors.excess)
     assert not given_up.settled and len(steps) < longest
+
+
+LAMP_COUNTS = 60
+
+
+@effect(
+    stage="sensor",
+    acts_on="camera",
+    parameters=[Parameter("cube_root", "1", scale=0.05, absent=0.2, low=0, high=10)],
+)
+def lamp(sensor: Sensor, cube_root: torch.Tensor) -> Sensor:
+    """A lamp lights the left half."""
+    return sensor.brightened(LAMP_COUNTS * cube_root**3 * (sensor.x < 0))
+
+
+def test_a_step_that_had_to_be_shortened_is_not_taken_for_the_end(tmp_path: Path) -> None:
+    """From 0.2 a whole step leads past 8, where the lamp is 600 times as bright; a short one removes little."""
+    captures = make_set(tmp_path / "captures", patterns=6)
+    for row in captures.captures:
+        counts = np.asarray(Image.open(row.image)).astype(int)
+        counts[:, : counts.shape[1] // 2] += LAMP_COUNTS
+        Image.fromarray(counts.astype(np.uint16)).save(row.image)
+    captures = read_captures(captures.folder)
+    model = Model(captures.bench).having(absent(lamp, captures.bench))
+    found = fit(model, ["lamp"], batches_of(captures), tolerance=0.2).model.instance("lamp")
+    assert float(found.values["cube_root"]) == pytest.approx(1, abs=0.01)
