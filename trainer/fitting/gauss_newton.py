@@ -82,7 +82,7 @@ def fit(
     """Fit the named effects of a model, and the gains, to batches.
 
     Stops after `iterations`, or when a step lowers the excess by less than `tolerance` of it or less than 2e-6, unless
-    that step had to be shortened where a whole one was expected to do much.
+    that step had to be shortened where a whole one was expected to do much, or far from the truth (`hold`).
     Errors of values are standard errors from the residuals themselves (a sandwich estimate), so misfit widens them; NaN
     where the captures do not determine a value: such a value stays as it is.
 
@@ -161,8 +161,12 @@ def _fit(
         elif fresh:
             break
         removed_excess = before - errors.excess
-        promising = raised and left < PROMISING * before
-        if fresh and not promising and removed_excess < max(tolerance * abs(errors.excess), 2e-6):
+        promising = hold > 0 or left < PROMISING * before
+        if (
+            fresh
+            and not (raised and promising)
+            and removed_excess < max(tolerance * abs(errors.excess), 2e-6)
+        ):
             break
         if fresh and is_too_slow(removed_excess, iterations - iteration - 1, errors.excess, enough):
             settled = False
