@@ -34,7 +34,7 @@ def speckle(seed: int) -> torch.Tensor:
     return torch.rand(1, SIDE, SIDE, generator=torch.Generator().manual_seed(seed))
 
 
-@pytest.mark.parametrize("share", [0.0, 0.7, 1.6, 2.4, 4.0])
+@pytest.mark.parametrize("share", [0.0, 0.7, 1.6, 2.4, 4.0, 7.0])
 def test_a_captures_blur_is_found_however_much_wider_than_the_usual_one(share: float) -> None:
     sharp = speckle(4)
     blurred = read(torch.fft.rfft2(sharp) * gaussian(torch.tensor(share**2)))

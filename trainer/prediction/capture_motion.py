@@ -18,7 +18,7 @@ from trainer.prediction.stages import Sensor
 STEPS = 3  # of Gauss-Newton; displacements are a small part of a speckle
 MOST = 1.0  # panel pixels that one step may move
 # Widths of blurs, as shares of the usual one: the widest at first, and in the end, where the widest fits best.
-WIDEST_BLUR, LIMIT = 2.4, 4.8
+WIDEST_BLUR, LIMIT = 2.4, 9.6
 NEARLY_WIDEST = 0.95
 TRIED_BLURS = 6, 2.1  # how many between two widths: a few, and so many more a usual width
 BLUR_STEP = 0.05  # for derivatives, share of the usual width
