@@ -138,6 +138,18 @@ def test_a_process_that_is_lost_is_one_sentence() -> None:
         running.map(os._exit, [(3,)])
 
 
+def test_nothing_of_it_runs_on_after_an_interruption() -> None:
+    before = set(threading.enumerate())
+    start = time.monotonic()
+    with pytest.raises(KeyboardInterrupt), open_pool(2) as two:
+        busy = [two.submit(time.sleep, (60,)) for _ in range(8)]
+        until(lambda: sum(future.running() for future in busy) >= 2, 30)
+        raise KeyboardInterrupt
+    assert time.monotonic() - start < 30
+    assert all(future.done() for future in busy)
+    assert set(threading.enumerate()) <= before
+
+
 # --- in processes of their own: what a signal does to workers that are in the middle of a task ---
 
 SCRIPT = """

@@ -147,10 +147,10 @@ def open_pool(workers: int | None = None, cluster: str | None = None) -> Iterato
     try:
         yield Pool(executor, count)
     except BaseException:
-        busy = list((executor._processes or {}).values())  # which `shutdown` forgets
-        executor.shutdown(wait=False, cancel_futures=True)
-        for process in busy:
+        for process in list((executor._processes or {}).values()):
             process.terminate()
+        # Waits for Python's own thread, which otherwise may close a pipe that the end of the program still writes to.
+        executor.shutdown(cancel_futures=True)
         raise
     executor.shutdown()
 
