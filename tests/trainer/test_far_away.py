@@ -217,8 +217,25 @@ def test_what_was_taken_for_a_moved_camera_is_given_back_to_the_wavefront(tmp_pa
         moved = fit(moved, ["panel_wavefront"], [b.smoothed(sigma) for b in batches]).model
     wrong = moved.without("misregistration")
     assert fit(wrong, wrong.names, batches).errors.excess > 10 * right.errors.excess
-    found = without_effect(moved, "misregistration", batches)
+    found = without_effect(moved, "misregistration", known(), batches)
     assert excess_on(found, batches) < 1.2 * right.errors.excess
+
+
+def test_what_was_taken_for_a_bent_panel_is_given_back_to_the_distance(tmp_path: Path) -> None:
+    """A curvature and another magnification do nearly what another distance does."""
+    captures = taken(tmp_path, OFF_PLANE, panel=(128, 160), camera=(167, 209))
+    batches = [b.only([0, 1]) for b in batches_of(captures)]
+    wrong = with_gains(captures, Model(captures.bench), capture_roles(captures).fitted)
+    for name in ("misregistration", "panel_wavefront"):
+        wrong = wrong.having(absent(catalogue()[name], captures.bench))
+    for sigma in (4.0, 2.0, 1.0):
+        wrong = fit(wrong, wrong.names, [b.smoothed(sigma) for b in batches]).model
+    wrong = fit(wrong, wrong.names, batches).model
+    found = without_effect(wrong, "panel_wavefront", catalogue(), batches)
+    assert set(found.names) == {"misregistration", "distance"}
+    assert float(found.instance("distance").values["offset"]) == pytest.approx(0.6, abs=0.01)
+    assert float(found.instance("misregistration").values["magnification"]) == pytest.approx(0, abs=0.1)
+    assert excess_on(found, batches) < 0.2 * excess_on(wrong, batches)
 
 
 @pytest.mark.slow

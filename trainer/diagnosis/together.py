@@ -111,10 +111,11 @@ def explain_together(
     def there() -> bool:
         return after.excess < NEARLY or thresholds.complete(after.excess, errors.excess)
 
-    if set(TAKEN_FOR_EACH_OTHER) <= set(found.names) and not there():
-        report(0.7, "looking whether a moved camera and a bent wavefront are taken for each other")
+    alike = [name for name in TAKEN_FOR_EACH_OTHER if name in found.names]
+    if len(alike) > 1 and not there():
+        report(0.7, f"looking whether {' and '.join(alike)} are taken for each other")
         ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
-        others = pool.map(_without, [(roles.folder, ids, held, found, name) for name in TAKEN_FOR_EACH_OTHER])
+        others = pool.map(_without, [(roles.folder, ids, held, found, name, known) for name in alike])
         still, left = min(others, key=lambda one: one[1].excess)
         if left.excess < before_maps.excess:
             joint, after = _with_maps(roles, still, left, thresholds)
@@ -133,11 +134,11 @@ def explain_together(
 
 
 def _without(
-    folder: Path, ids: tuple[str, ...], held_ids: tuple[str, ...], model: Model, name: str
+    folder: Path, ids: tuple[str, ...], held_ids: tuple[str, ...], model: Model, name: str, known: Catalogue
 ) -> tuple[Model, PredictionErrors]:
     """A joint model without one effect, the others fitted from smoothed pictures again, and its held-out errors."""
     captures = opened(folder)
-    rest = without_effect(model, name, load(captures, chosen(captures, ids)))
+    rest = without_effect(model, name, known, load(captures, chosen(captures, ids)))
     return rest, evaluate_captures(captures, chosen(captures, held_ids), rest)
 
 

@@ -11,8 +11,9 @@ from trainer.captures.capture_set import chosen, opened
 from trainer.captures.capture_table import ids_of
 from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.verdict import Thresholds
+from trainer.fitting.dependence import Dependence, dependence
 from trainer.fitting.gauss_newton import HOLD, FitResult, fit
-from trainer.fitting.idle_effects import changes_without, most_telling
+from trainer.fitting.idle_effects import most_telling
 from trainer.fitting.least_squares_gain import with_gain
 from trainer.fitting.pool import Pool
 from trainer.fitting.predictor import Predictor, evaluate_captures, excess_on, telling
@@ -54,12 +55,18 @@ def without_one(
     """
     ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
     least = thresholds.least(ideal_excess)
-    names = _in_doubt(roles, model, names, least) if names else []
+    if not names:
+        return None
+    numbers = dependence(model, most_telling(model, load(roles.captures, roles.fitted)))
+    names = _in_doubt(numbers, names, least)
     raising = thorough and not thresholds.complete(errors.excess, ideal_excess)
     for first in range(0, len(names), pool.workers):  # as many at a time as there are processes
         some = names[first : first + pool.workers]
         iterations = 12 if thorough else FEW_STEPS
-        tasks = [(roles.folder, ids, held, model, name, raising, iterations, least) for name in some]
+        tasks = [
+            (roles.folder, ids, held, model, name, numbers.without([name]), raising, iterations, least)
+            for name in some
+        ]
         for name, found in zip(some, pool.map_here_if_one(fitted_without, tasks), strict=True):
             if found is not None and not thresholds.worth_adding(
                 removed_excess(found[1], errors), ideal_excess, 1
@@ -68,12 +75,11 @@ def without_one(
     return None
 
 
-def _in_doubt(roles: CaptureRoles, model: Model, names: Sequence[str], least: float) -> list[str]:
+def _in_doubt(numbers: Dependence, names: Sequence[str], least: float) -> list[str]:
     """Those of the named effects that are not clearly needed."""
-    batches = most_telling(model, load(roles.captures, roles.fitted))
-    change_without = changes_without(model, batches)
-    clear = CHANGES * signal_variance(batches) * max(excess_on(model, batches), least)
-    return [name for name in names if change_without({name}) < clear]
+    left = max(excess_on(numbers.model, numbers.batches), least)
+    clear = CHANGES * signal_variance(numbers.batches) * left
+    return [name for name in names if numbers.change_without({name}) < clear]
 
 
 def fitted_without(
@@ -82,6 +88,7 @@ def fitted_without(
     held_ids: tuple[str, ...],
     model: Model,
     name: str,
+    rest: Model,
     raising: bool,
     iterations: int,
     least: float,
@@ -96,6 +103,8 @@ def fitted_without(
         Of the capture set.
     ids, held_ids : tuple of str
         Captures to fit, and captures to judge by.
+    rest : Model
+        Where the fit without the effect begins.
     raising : bool
         Raise orders as far as that helps.
     iterations : int
@@ -110,7 +119,6 @@ def fitted_without(
     """
     captures = opened(folder)
     batches = load(captures, chosen(captures, ids))
-    rest = model.without(name)
     rest = with_gain(rest, [Predictor(rest, b) for b in batches])  # it may have had the gains' work
     # what shows from capture to capture does not in one
     count = 2 if model.instance(name).effect.measure else 1

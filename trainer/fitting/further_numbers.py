@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 
 from trainer.captures.batches import Batch, signal_variance
-from trainer.fitting.jacobian import keys_of, outside_span, stacked
+from trainer.fitting.jacobian import Key, keys_of, outside_span, stacked
 from trainer.fitting.many_numbers import has_many
 from trainer.fitting.predictor import Predictor, telling
 from trainer.model.colours_apart import come_apart, may_come_apart
@@ -109,7 +109,7 @@ def _raised(present: EffectInstance, model: Model) -> EffectInstance:
     return present if order is None else raised(present, model.bench, order)
 
 
-def _meaning(key: tuple[str, str, int], every: Model, lower: Model) -> tuple[Further | None, int]:
+def _meaning(key: Key, every: Model, lower: Model) -> tuple[Further | None, int]:
     """What a number of the larger model is a part of, None for one that is there already.
 
     And the index of the first colour's number that stands for all colours' together: its own where colours have it for

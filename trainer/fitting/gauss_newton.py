@@ -25,7 +25,7 @@ from trainer.device import array_of
 from trainer.effects.definition import STAGES
 from trainer.effects.evidence import Evidence
 from trainer.effects.own_effect import measured_by
-from trainer.fitting.jacobian import away_from_absent, keys_of, slopes_of, stepped, weighted_residuals
+from trainer.fitting.jacobian import Key, away_from_absent, keys_of, moved, slopes_of, weighted_residuals
 from trainer.fitting.least_squares_gain import with_gain
 from trainer.fitting.many_numbers import ManySlopes, has_many
 from trainer.fitting.predictor import Predictor, lights_of
@@ -64,7 +64,7 @@ class FitResult:
     model: Model
     errors: PredictionErrors
     covariance: np.ndarray
-    keys: tuple[tuple[str, str, int], ...]
+    keys: tuple[Key, ...]
     settled: bool
 
 
@@ -146,7 +146,7 @@ def _fit(
             gradient[: len(keys)] -= pull * scale * away / ranges
         accepted, raised = False, False
         for _ in range(6 if fresh else 1):
-            trial = _moved(model, keys, channels, _solve(normal, gradient, damping))
+            trial = moved(model, keys, channels, _solve(normal, gradient, damping))
             trial_points = [p.trace(trial, first, t) for p, t in zip(predictors, points, strict=True)]
             trial_residuals, trial_errors = weighted_residuals(trial, predictors, trial_points)
             paid = pull * float((_away(trial, keys, ranges) ** 2 - away**2).sum()) if pull else 0.0
@@ -217,7 +217,7 @@ def _fit_many(
         rest = array_of(slopes.explained([r - s for r, s in zip(residuals, along, strict=True)]))
         accepted = False
         for share in (1.0, 0.5, 0.2, 0.05):
-            trial = _moved(slopes.moved(share * change), keys, channels, share * rest)
+            trial = moved(slopes.moved(share * change), keys, channels, share * rest)
             trial_points = [p.trace(trial, first, t) for p, t in zip(predictors, points, strict=True)]
             trial_residuals, trial_errors = weighted_residuals(trial, predictors, trial_points)
             if trial_errors.excess < before:
@@ -288,7 +288,7 @@ def with_measured_values(model: Model, free: Sequence[str], batches: Sequence[Ba
     return model
 
 
-def _typical_ranges(model: Model, keys: tuple[tuple[str, str, int], ...]) -> np.ndarray:
+def _typical_ranges(model: Model, keys: tuple[Key, ...]) -> np.ndarray:
     """How far from "absent" each number's typical range reaches."""
     found = []
     for name, parameter, _ in keys:
@@ -298,7 +298,7 @@ def _typical_ranges(model: Model, keys: tuple[tuple[str, str, int], ...]) -> np.
     return np.array(found)
 
 
-def _away(model: Model, keys: tuple[tuple[str, str, int], ...], ranges: np.ndarray) -> np.ndarray:
+def _away(model: Model, keys: tuple[Key, ...], ranges: np.ndarray) -> np.ndarray:
     """How far from "absent" each number is, in units of its typical range."""
     return np.array([away_from_absent(model, key) for key in keys]) / ranges
 
@@ -328,24 +328,14 @@ def _solve(normal: np.ndarray, gradient: np.ndarray, damping: float) -> np.ndarr
     return np.linalg.solve(scaled, gradient / diagonal) / diagonal
 
 
-def _moved(
-    model: Model, keys: tuple[tuple[str, str, int], ...], channels: list[str], step: np.ndarray
-) -> Model:
-    for key, change in zip(keys, step, strict=False):
-        model = stepped(model, key, float(change))
-    logs = dict(zip(channels, step[len(keys) :], strict=False))
-    gain = {c: g * float(np.exp(np.clip(logs.get(c, 0.0), -1, 1))) for c, g in model.gain.items()}
-    return replace(model, gain=gain)
-
-
-def _spread(keys: tuple[tuple[str, str, int], ...], covariance: np.ndarray, normal: np.ndarray) -> np.ndarray:
+def _spread(keys: tuple[Key, ...], covariance: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Standard errors of the numbers; NaN for one that the captures do not determine, as it changes nothing in them."""
     count = len(keys)
     spread = np.sqrt(np.maximum(np.diag(covariance)[:count], 0))
     return np.where(np.diag(normal)[:count] > 0, spread, np.nan)
 
 
-def _with_errors(model: Model, keys: tuple[tuple[str, str, int], ...], spread: np.ndarray) -> Model:
+def _with_errors(model: Model, keys: tuple[Key, ...], spread: np.ndarray) -> Model:
     for name in dict.fromkeys(k[0] for k in keys):
         present = model.instance(name)
         moved = [p.name for p in present.effect.parameters if not p.per_pixel]

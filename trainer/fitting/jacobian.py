@@ -27,6 +27,8 @@ STEP = 0.1  # of a parameter's scale: large against single precision's rounding,
 LOUDER = 0.01  # change of the light's logarithm: its secant is the derivative by a gain
 TABLE_PIXELS = 1 << 19  # most pixels of a capture in a table of derivatives
 
+Key = tuple[str, str, int]  # of a number: effect, parameter, index into its values
+
 
 def weighted(batch: Batch, counts: Tensor) -> Tensor:
     """Counts [B, h, w] of a batch as rows of tables have them: [pixels].
@@ -56,7 +58,7 @@ def _every(batch: Batch) -> int:
     return every
 
 
-def keys_of(model: Model, free: Sequence[str]) -> tuple[tuple[str, str, int], ...]:
+def keys_of(model: Model, free: Sequence[str]) -> tuple[Key, ...]:
     """Keys (effect, parameter, index into its values) of every number of the named effects."""
     keys = []
     for name in free:
@@ -68,7 +70,7 @@ def keys_of(model: Model, free: Sequence[str]) -> tuple[tuple[str, str, int], ..
     return tuple(keys)
 
 
-def stepped(model: Model, key: tuple[str, str, int], change: float) -> Model:
+def stepped(model: Model, key: Key, change: float) -> Model:
     """The model with one number of one effect changed, held within its physical range."""
     name, parameter, index = key
     present = model.instance(name)
@@ -79,7 +81,16 @@ def stepped(model: Model, key: tuple[str, str, int], change: float) -> Model:
     return model.having(replace(present, values={**present.values, parameter: values}))
 
 
-def colour_of(model: Model, key: tuple[str, str, int]) -> str | None:
+def moved(model: Model, keys: Sequence[Key], channels: Sequence[str], step: np.ndarray) -> Model:
+    """The model after a step of numbers, in their physical units, and then of the logarithms of the colours' gains."""
+    for key, change in zip(keys, step, strict=False):
+        model = stepped(model, key, float(change))
+    logs = dict(zip(channels, step[len(keys) :], strict=False))
+    gain = {c: g * float(np.exp(np.clip(logs.get(c, 0.0), -1, 1))) for c, g in model.gain.items()}
+    return replace(model, gain=gain)
+
+
+def colour_of(model: Model, key: Key) -> str | None:
     """The colour whose own a number is; None where colours have it in common."""
     name, parameter, index = key
     present = model.instance(name)
@@ -89,7 +100,7 @@ def colour_of(model: Model, key: tuple[str, str, int]) -> str | None:
     return model.bench.channels[index // (present.values[parameter].size // rows)].name
 
 
-def away_from_absent(model: Model, key: tuple[str, str, int]) -> float:
+def away_from_absent(model: Model, key: Key) -> float:
     """How far one number of one effect is from its value where the effect is not there; physical units."""
     name, parameter, index = key
     present = model.instance(name)
@@ -97,7 +108,7 @@ def away_from_absent(model: Model, key: tuple[str, str, int]) -> float:
     return float(present.values[parameter].reshape(-1)[index]) - absent
 
 
-def column_step(model: Model, key: tuple[str, str, int]) -> float:
+def column_step(model: Model, key: Key) -> float:
     """Step of the secant for one number, towards the inside of its range; physical units."""
     present = model.instance(key[0])
     p = present.effect.parameter(key[1])
@@ -108,7 +119,7 @@ def column_step(model: Model, key: tuple[str, str, int]) -> float:
 
 def columns(
     model: Model,
-    keys: Sequence[tuple[str, str, int]],
+    keys: Sequence[Key],
     predictor: Predictor,
     point: Trace,
     kept: Callable[[Tensor], Tensor] = lambda slope: slope,
@@ -148,7 +159,7 @@ def columns(
         shows = scale * float(torch.linalg.vector_norm(found)) > least
         return kept(found if shows else torch.zeros_like(found))
 
-    def of_number(key: tuple[str, str, int]) -> Tensor:
+    def of_number(key: Key) -> Tensor:
         if colour_of(model, key) not in (None, predictor.batch.channel):
             return kept(torch.zeros_like(base))
         step, effect = column_step(model, key), model.instance(key[0]).effect
@@ -173,7 +184,7 @@ def _without(change: Tensor, other: Tensor, weight: Tensor) -> Tensor:
 
 def slopes_of(
     model: Model,
-    keys: tuple[tuple[str, str, int], ...],
+    keys: tuple[Key, ...],
     channels: list[str],
     predictors: Sequence[Predictor],
     points: Sequence[Trace],
@@ -204,7 +215,7 @@ def weighted_residuals(
 
 
 def stacked(
-    model: Model, keys: tuple[tuple[str, str, int], ...], predictors: list[Predictor], points: list[Trace]
+    model: Model, keys: tuple[Key, ...], predictors: list[Predictor], points: list[Trace]
 ) -> tuple[Tensor, Tensor]:
     """Weighted residual [pixels] and derivatives [keys + colours, pixels] over all batches."""
     channels = list(dict.fromkeys(p.batch.channel for p in predictors))

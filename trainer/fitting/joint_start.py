@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 
@@ -18,8 +17,10 @@ from trainer.captures.batches import Batch
 from trainer.effects.effect_catalogue import Catalogue
 from trainer.effects.evidence import Evidence
 from trainer.effects.own_effect import starts_of
+from trainer.fitting.dependence import dependence
 from trainer.fitting.gauss_newton import HOLD, ROUGH, FitResult, fit, with_measured_values
-from trainer.fitting.idle_effects import without_idle
+from trainer.fitting.idle_effects import most_telling, without_idle
+from trainer.fitting.jacobian import away_from_absent
 from trainer.fitting.least_squares_gain import with_gain
 from trainer.fitting.predictor import Predictor, lights_of, telling
 from trainer.fitting.refit import least_for_order, raise_orders
@@ -39,14 +40,18 @@ TOGETHER = (
 # take up what the panel's own shape still lacks.
 # A response costs little to be bent as it may be, and what it lacks others take up.
 ORDERS = {"zero_order": 2, "sensor_response": 6}
-# To smoothed pictures a moved camera does what tilt, curvature and distance do.
-TAKEN_FOR_EACH_OTHER = ("misregistration", "panel_wavefront")
+# A moved camera does what a tilt does, and with another magnification a curvature does what a distance does.
+TAKEN_FOR_EACH_OTHER = ("misregistration", "panel_wavefront", "distance")
 TILTS = 2  # the first two terms of a wavefront
 FIXED = (("zero_order", "leak_wavefront"),)
 # smoothed pictures say nothing of them; next to them, pictures as they are hardly fit
 FINE = ("sensor_blur", "crosstalk", "vignetting")
 AT_LAST = ("laser_drift",)  # while pictures do not fit, a gain for each only takes up what is wrong
 SMOOTHING_PX = (8.0, 4.0, 2.0, 1.0)
+# Pictures that are smoothed by so much tell no tilt from a shift, and say little of higher orders. Finer ones do not
+# fit without these.
+COARSE_PX = 4.0
+RAISED = 0.3  # share of the excess that higher orders must remove from smoothed pictures
 ITERATIONS, TOLERANCE = 6, 0.05
 # With less, magnification, distance and curvature run away together: pictures smoothed by 4 pixels hardly tell them.
 HOLD_SMOOTHED = 0.03
@@ -95,7 +100,7 @@ def joint_start(
             k / (len(SMOOTHING_PX) + 1),
             f"fitting {len(names)} effects together, smoothed by {sigma:g} pixels",
         )
-        model = _fitted_to_smoothed(_shifted_not_tilted(model), batches, sigma)
+        model = _fitted_to_smoothed(model, batches, sigma)
     report(len(SMOOTHING_PX) / (len(SMOOTHING_PX) + 1), f"fitting {len(names + fine)} effects together")
     for name in fine:
         model = model.having(absent(known[name], model.bench))
@@ -113,41 +118,56 @@ def joint_start(
     return model
 
 
-def without_effect(model: Model, name: str, batches: Sequence[Batch]) -> Model:
-    """The model without an effect, the others fitted together once more from smoothed pictures.
+def without_effect(model: Model, name: str, known: Catalogue, batches: Sequence[Batch]) -> Model:
+    """The model without an effect of TAKEN_FOR_EACH_OTHER, and with the others of these, which do its work.
 
-    What it did may be another one's: a camera that is moved does to smoothed pictures what a tilt of the wavefront
-    does, and a joint start may end with some of both. Fitted to pictures as they are, the others do not find back.
+    What it did may be another one's, and a joint start may end with some of both. Those take over what a straight line
+    says, and are fitted to smoothed pictures again: fitted to pictures as they are, they do not find back.
+
+    Parameters
+    ----------
+    known : Catalogue
+        Has the effects that the model lacks.
     """
-    model = model.without(name)
-    for sigma in SMOOTHING_PX[1:]:
-        model = _fitted_to_smoothed(model, batches, sigma)
+    for other in TAKEN_FOR_EACH_OTHER:
+        if other not in model.names and other in known:
+            model = model.having(absent(known[other], model.bench))
+    model = dependence(model, most_telling(model, batches)).without([name])
+    for sigma in SMOOTHING_PX:
+        if sigma < COARSE_PX:
+            model = _fitted_to_smoothed(model, batches, sigma)
     model = _with_orders_raised(model, batches).model
     return fit(model, model.names, batches, tolerance=ROUGH).model
 
 
-def _shifted_not_tilted(model: Model) -> Model:
-    """The model without a tilt of its wavefront, where a moved camera can do its work.
+def _shifted_not_tilted(model: Model, batches: Sequence[Batch]) -> Model:
+    """The model without a tilt of its wavefront, whose work a moved camera does.
 
-    Smoothed pictures cannot tell the two apart, and fitted to pictures as they are, some of each does not become one.
+    Smoothed pictures hardly tell the two apart, and fitted to pictures as they are, some of each does not become one.
     """
-    if not set(TAKEN_FOR_EACH_OTHER) <= set(model.names):
+    tilts = [("panel_wavefront", "wavefront", k) for k in range(TILTS)]
+    both = {"misregistration", "panel_wavefront"} <= set(model.names)
+    if not both or not any(away_from_absent(model, tilt) for tilt in tilts):
         return model
-    bent = model.instance("panel_wavefront")
-    wavefront = bent.values["wavefront"].copy()
-    wavefront[..., :TILTS] = 0.0
-    return model.having(replace(bent, values={**bent.values, "wavefront": wavefront}))
+    return dependence(model, batches).without_numbers(tilts)
 
 
 def _fitted_to_smoothed(model: Model, batches: Sequence[Batch], sigma_px: float) -> Model:
-    """The model with all of its effects fitted to smoothed pictures."""
-    coarse = _smoothed(model, batches, sigma_px)
-    return fit(model, model.names, coarse, ITERATIONS, TOLERANCE, None, HOLD_SMOOTHED, FIXED).model
+    """The model with all of its effects fitted to smoothed pictures, their orders raised where these need it."""
+    smoothed = _smoothed(model, batches, sigma_px)
+    model = _shifted_not_tilted(model, smoothed)
+    fitted = fit(model, model.names, smoothed, ITERATIONS, TOLERANCE, None, HOLD_SMOOTHED, FIXED)
+
+    def needed(excess: float) -> float:
+        return math.inf if sigma_px >= COARSE_PX or excess < NEAR else RAISED * excess
+
+    return raise_orders(fitted, model.names, smoothed, needed, HOLD_SMOOTHED, FIXED).model
 
 
 def _with_orders_raised(model: Model, batches: Sequence[Batch], enough: float = 0.0) -> FitResult:
     """The model with all of its effects fitted to a few pictures as they are, orders raised until that is enough."""
     few = [_some(model, b, 0.0) for b in batches]
+    model = _shifted_not_tilted(model, few)
     fitted = fit(model, model.names, few, ITERATIONS, TOLERANCE, None, HOLD, FIXED)
 
     def needed(excess: float) -> float:
