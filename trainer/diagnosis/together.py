@@ -7,9 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import torch
+
 from runtime.excess import PredictionErrors
 from runtime.program.progress import Progress, no_progress, part_of
-from trainer.captures.batches import load
+from trainer.captures.batches import Batch, load
 from trainer.captures.capture_set import chosen, opened
 from trainer.captures.capture_table import ids_of
 from trainer.captures.held_out import CaptureRoles
@@ -22,8 +24,9 @@ from trainer.effects.effect_catalogue import Catalogue
 from trainer.fitting.gains import with_gains
 from trainer.fitting.gauss_newton import fit
 from trainer.fitting.joint_start import TAKEN_FOR_EACH_OTHER, joint_start, without_effect
+from trainer.fitting.least_squares_gain import with_gain
 from trainer.fitting.pool import Pool
-from trainer.fitting.predictor import evaluate_captures
+from trainer.fitting.predictor import Predictor, evaluate_captures, excess_on, telling
 from trainer.model.model import Model
 
 FAR = 0.3  # held-out excess from which several strong effects may hide one another
@@ -36,6 +39,7 @@ HELPS_ELSEWHERE = 0.1
 OTHERS = 0.1
 # `tolerance` of the fit to all captures: what numbers take up slowly is for a map, which they would hide then.
 LOOSE = 0.02
+MISSED_IN = 2  # captures of a colour and plane that say which effect is missed least
 NEARLY = 0.002  # excess below which effects are where they belong: what is left is for the ladder to explain
 
 
@@ -160,16 +164,23 @@ def _maps_to_go_on(model: Model) -> list[str]:
     return [name for name, form in forms if form is not None and not form.curve]
 
 
+@torch.no_grad()
 def _ladder(
     roles: CaptureRoles, model: Model, errors: PredictionErrors
 ) -> tuple[tuple[str, PredictionErrors], ...]:
-    """From the whole model down, each time without the effect that is missed least."""
+    """From the whole model down, each time without the effect that is missed least in a few of the captures."""
+    few = [telling(model, b, MISSED_IN) for b in load(roles.captures, roles.fitted)]
     steps = []
     while model.names:
-        bare = replace(model, gain={})
-        rest = [with_gains(roles.captures, bare.without(name), roles.fitted) for name in model.names]
-        without = [evaluate_captures(roles.captures, roles.held_out, one) for one in rest]
-        least = min(range(len(rest)), key=lambda k: without[k].excess)
-        steps.append((model.names[least], errors))
-        model, errors = rest[least], without[least]
+        rest = [_with_own_gains(model.without(name), few) for name in model.names]
+        missed = [excess_on(one, few) for one in rest]
+        name = model.names[missed.index(min(missed))]
+        steps.append((name, errors))
+        model = with_gains(roles.captures, replace(model.without(name), gain={}), roles.fitted)
+        errors = evaluate_captures(roles.captures, roles.held_out, model)
     return tuple(reversed(steps))
+
+
+def _with_own_gains(model: Model, batches: Sequence[Batch]) -> Model:
+    """The model with the gains that suit these captures best."""
+    return with_gain(model, [Predictor(model, b) for b in batches])

@@ -51,7 +51,8 @@ SMOOTHING_PX = (8.0, 4.0, 2.0, 1.0)
 # Pictures that are smoothed by so much tell no tilt from a shift, and say little of higher orders. Finer ones do not
 # fit without these.
 COARSE_PX = 4.0
-RAISED = 0.3  # share of the excess that higher orders must remove from smoothed pictures
+# Excess from which smoothed pictures may lack orders, and the share of it that these must remove.
+LACKING, RAISED = 0.05, 0.3
 ITERATIONS, TOLERANCE = 6, 0.05
 # With less, magnification, distance and curvature run away together: pictures smoothed by 4 pixels hardly tell them.
 HOLD_SMOOTHED = 0.03
@@ -159,7 +160,7 @@ def _fitted_to_smoothed(model: Model, batches: Sequence[Batch], sigma_px: float)
     fitted = fit(model, model.names, smoothed, ITERATIONS, TOLERANCE, None, HOLD_SMOOTHED, FIXED)
 
     def needed(excess: float) -> float:
-        return math.inf if sigma_px >= COARSE_PX or excess < NEAR else RAISED * excess
+        return math.inf if sigma_px >= COARSE_PX or excess < LACKING else RAISED * excess
 
     return raise_orders(fitted, model.names, smoothed, needed, HOLD_SMOOTHED, FIXED).model
 
