@@ -64,7 +64,7 @@ def without_one(
         some = names[first : first + pool.workers]
         iterations = 12 if thorough else FEW_STEPS
         tasks = [
-            (roles.folder, ids, held, model, name, numbers.without([name]), raising, iterations, least)
+            (roles.folder, ids, held, model, name, _begun_without(numbers, name), raising, iterations, least)
             for name in some
         ]
         for name, found in zip(some, pool.map_here_if_one(fitted_without, tasks), strict=True):
@@ -80,6 +80,12 @@ def _in_doubt(numbers: Dependence, names: Sequence[str], least: float) -> list[s
     left = max(excess_on(numbers.model, numbers.batches), least)
     clear = CHANGES * signal_variance(numbers.batches) * left
     return [name for name in names if numbers.change_without({name}) < clear]
+
+
+def _begun_without(numbers: Dependence, name: str) -> Model:
+    """The model without an effect, the others with its work, unless that differs from capture to capture."""
+    model = numbers.model
+    return model.without(name) if model.instance(name).effect.measure else numbers.without([name])
 
 
 def fitted_without(
