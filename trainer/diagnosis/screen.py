@@ -20,7 +20,7 @@ from trainer.captures.capture_set import chosen, opened
 from trainer.effects.definition import Effect
 from trainer.effects.evidence import Evidence
 from trainer.effects.own_effect import starts_of
-from trainer.fitting.jacobian import keys_of, remaining, stacked, weighted_residuals
+from trainer.fitting.jacobian import Key, keys_of, remaining, stacked, weighted_residuals
 from trainer.fitting.least_squares_gain import with_gain
 from trainer.fitting.many_numbers import ManySlopes, has_many
 from trainer.fitting.predictor import Predictor, lights_of
@@ -162,7 +162,7 @@ def shares_of_work(effects: Sequence[Effect], model: Model, count: int) -> list[
     return shares
 
 
-def _numbers(effect: Effect, model: Model) -> tuple[tuple[str, str, int], ...]:
+def _numbers(effect: Effect, model: Model) -> tuple[Key, ...]:
     return keys_of(model.having(absent(effect, model.bench)), [effect.name])
 
 

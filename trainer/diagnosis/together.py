@@ -11,7 +11,7 @@ import torch
 
 from runtime.excess import PredictionErrors
 from runtime.program.progress import Progress, no_progress, part_of
-from trainer.captures.batches import Batch, load
+from trainer.captures.batches import load
 from trainer.captures.capture_set import chosen, opened
 from trainer.captures.capture_table import ids_of
 from trainer.captures.held_out import CaptureRoles
@@ -172,15 +172,10 @@ def _ladder(
     few = [telling(model, b, MISSED_IN) for b in load(roles.captures, roles.fitted)]
     steps = []
     while model.names:
-        rest = [_with_own_gains(model.without(name), few) for name in model.names]
-        missed = [excess_on(one, few) for one in rest]
+        rest = [model.without(name) for name in model.names]
+        missed = [excess_on(with_gain(one, [Predictor(one, b) for b in few]), few) for one in rest]
         name = model.names[missed.index(min(missed))]
         steps.append((name, errors))
         model = with_gains(roles.captures, replace(model.without(name), gain={}), roles.fitted)
         errors = evaluate_captures(roles.captures, roles.held_out, model)
     return tuple(reversed(steps))
-
-
-def _with_own_gains(model: Model, batches: Sequence[Batch]) -> Model:
-    """The model with the gains that suit these captures best."""
-    return with_gain(model, [Predictor(model, b) for b in batches])

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from trainer.captures.batches import Batch
-from trainer.fitting.jacobian import Key, away_from_absent, keys_of, moved, outside_span, stacked
+from trainer.fitting.jacobian import Key, away_from_absent, damped_step, keys_of, moved, outside_span, stacked
 from trainer.fitting.many_numbers import has_many
 from trainer.fitting.predictor import Predictor, excess_on
 from trainer.model.model import Model
@@ -68,13 +68,10 @@ class Dependence:
         gone, along = self._lack(lost)
         if not bool(self.away[gone].any()):
             return self.model
-        normal = self._others(gone)
-        norms = normal.diagonal().sqrt().clamp(min=1e-30)
-        normal = normal / torch.outer(norms, norms) + SLACK * torch.eye(len(norms), dtype=torch.float64)
-        step = -self.away.clone()
-        step[~gone] = torch.linalg.solve(normal, along[~gone] / norms) / norms
-        shares = (torch.where(gone, step, share * step).numpy() for share in SHARES)
-        tried = [moved(self.model, self.keys, self.channels, share) for share in shares]
+        step = -self.away.numpy()
+        step[~gone.numpy()] = damped_step(self._others(gone).numpy(), along[~gone].numpy(), SLACK)
+        steps = (np.where(gone.numpy(), step, share * step) for share in SHARES)
+        tried = [moved(self.model, self.keys, self.channels, one) for one in steps]
         return min(tried, key=lambda one: excess_on(one, self.batches))
 
     def _of(self, names: Collection[str]) -> list[Key]:

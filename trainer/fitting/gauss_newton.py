@@ -25,7 +25,15 @@ from trainer.device import array_of
 from trainer.effects.definition import STAGES
 from trainer.effects.evidence import Evidence
 from trainer.effects.own_effect import measured_by
-from trainer.fitting.jacobian import Key, away_from_absent, keys_of, moved, slopes_of, weighted_residuals
+from trainer.fitting.jacobian import (
+    Key,
+    away_from_absent,
+    damped_step,
+    keys_of,
+    moved,
+    slopes_of,
+    weighted_residuals,
+)
 from trainer.fitting.least_squares_gain import with_gain
 from trainer.fitting.many_numbers import ManySlopes, has_many
 from trainer.fitting.predictor import Predictor, lights_of
@@ -135,7 +143,7 @@ def _fit(
             progress(iteration / iterations)
         before = errors.excess
         normal, gradient = _normal(slopes), _gradient(slopes, residuals)
-        left = before - float(gradient @ _solve(normal, gradient, 0.0)) / scale
+        left = before - float(gradient @ damped_step(normal, gradient, 0.0)) / scale
         if fresh and before > FAR * enough and left > max(FAR * enough, SLOW * before):
             settled = False
             break
@@ -146,7 +154,7 @@ def _fit(
             gradient[: len(keys)] -= pull * scale * away / ranges
         accepted, raised = False, False
         for _ in range(6 if fresh else 1):
-            trial = moved(model, keys, channels, _solve(normal, gradient, damping))
+            trial = moved(model, keys, channels, damped_step(normal, gradient, damping))
             trial_points = [p.trace(trial, first, t) for p, t in zip(predictors, points, strict=True)]
             trial_residuals, trial_errors = weighted_residuals(trial, predictors, trial_points)
             paid = pull * float((_away(trial, keys, ranges) ** 2 - away**2).sum()) if pull else 0.0
@@ -319,13 +327,6 @@ def _scatter(slopes: list[Tensor], residuals: list[Tensor]) -> np.ndarray:
         for s, r in zip(table.split(BLOCK, dim=1), own.split(BLOCK), strict=True)
     )
     return sum(array_of((b @ b.T).double()) for b in blocks)  # type: ignore[return-value]
-
-
-def _solve(normal: np.ndarray, gradient: np.ndarray, damping: float) -> np.ndarray:
-    diagonal = np.sqrt(np.maximum(np.diag(normal), 1e-30))
-    scaled = normal / np.outer(diagonal, diagonal)
-    scaled[np.diag_indices_from(scaled)] += damping + 1e-9
-    return np.linalg.solve(scaled, gradient / diagonal) / diagonal
 
 
 def _spread(keys: tuple[Key, ...], covariance: np.ndarray, normal: np.ndarray) -> np.ndarray:

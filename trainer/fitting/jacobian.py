@@ -248,3 +248,11 @@ def outside_span(total: float, along: Tensor, normal: Tensor) -> float:
         len(norms), dtype=torch.float64
     )
     return total - float(along @ torch.linalg.solve(normal, along))
+
+
+def damped_step(normal: np.ndarray, gradient: np.ndarray, damping: float) -> np.ndarray:
+    """Step of a least-squares problem, damped as Levenberg and Marquardt do: `damping` of each number's own square."""
+    diagonal = np.sqrt(np.maximum(np.diag(normal), 1e-30))
+    scaled = normal / np.outer(diagonal, diagonal)
+    scaled[np.diag_indices_from(scaled)] += damping + 1e-9
+    return np.linalg.solve(scaled, gradient / diagonal) / diagonal
