@@ -254,3 +254,59 @@ def test_a_step_that_had_to_be_shortened_is_not_taken_for_the_end(tmp_path: Path
     model = Model(captures.bench).having(absent(lamp, captures.bench))
     found = fit(model, ["lamp"], batches_of(captures), tolerance=0.2).model.instance("lamp")
     assert float(found.values["cube_root"]) == pytest.approx(1, abs=0.01)
+
+
+def test_a_step_within_ranges_is_the_best_one_there() -> None:
+    rng = np.random.default_rng(3)
+    held = 0
+    for _ in range(20):
+        table = rng.normal(size=(40, 6)) @ np.diag([1, 10, 0.1, 1, 1, 5])
+        table[:, 1] += 3 * table[:, 0]  # two that do each other's work
+        normal, gradient = table.T @ table, table.T @ rng.normal(size=40) * 3
+        reach = -rng.uniform(0, 0.3, 6), rng.uniform(0, 0.3, 6)
+        step = jacobian.step_within(normal, gradient, 0.0, reach)
+        assert np.all((step >= reach[0] - 1e-12) & (step <= reach[1] + 1e-12))
+        # Karush, Kuhn and Tucker: at an end, what is left pulls outwards; inside, nothing pulls.
+        pull = (gradient - normal @ step) / np.sqrt(np.diag(normal))
+        inside = (step > reach[0] + 1e-12) & (step < reach[1] - 1e-12)
+        assert np.abs(pull[inside]).max(initial=0) < 1e-5 * np.abs(gradient).max()
+        assert np.all(pull[step >= reach[1] - 1e-12] >= 0) and np.all(pull[step <= reach[0] + 1e-12] <= 0)
+        held += int((~inside).sum())
+    assert held > 20
+    free = np.full(6, np.inf)
+    unbounded = jacobian.step_within(normal, gradient, 0.1, (-free, free))
+    np.testing.assert_array_equal(unbounded, jacobian.damped_step(normal, gradient, 0.1))
+
+
+def test_where_a_number_is_at_its_end_the_others_do_what_is_best_without_it(tmp_path: Path) -> None:
+    @effect(stage="sensor", acts_on="camera", parameters=[Parameter("share", "1", scale=0.01, low=0, high=1)])
+    def fog(sensor: Sensor, share: torch.Tensor) -> Sensor:
+        """A share of full scale is added everywhere."""
+        return sensor.brightened(share * sensor.full_scale)
+
+    @effect(
+        stage="sensor", acts_on="camera", parameters=[Parameter("share", "1", scale=0.01, low=0, high=0.02)]
+    )
+    def haze(sensor: Sensor, share: torch.Tensor) -> Sensor:
+        """The same, of little at most."""
+        return sensor.brightened(share * sensor.full_scale)
+
+    @effect(
+        stage="sensor", acts_on="camera", parameters=[Parameter("share", "1", scale=0.01, low=-1, high=1)]
+    )
+    def glow(sensor: Sensor, share: torch.Tensor) -> Sensor:
+        """More is added from left to right."""
+        return sensor.brightened(share * sensor.full_scale * (1.5 + sensor.x))
+
+    captures = captures_with(tmp_path, fog, {"share": 0.06}, patterns=3)
+    batches = batches_of(captures)
+    bench = captures.bench
+    both = Model(bench).having(absent(haze, bench)).having(absent(glow, bench))
+    together = fit(both, ["haze", "glow"], batches)
+    at_end = both.having(instance_with(haze, bench, {"share": 0.02}))
+    alone = fit(at_end, ["glow"], batches)
+    assert together.model.instance("haze").values["share"] == pytest.approx(0.02, abs=1e-9)
+    found, best = (f.model.instance("glow").values["share"] for f in (together, alone))
+    assert found == pytest.approx(best, rel=1e-3)
+    assert found > 0.01
+    assert together.errors.excess == pytest.approx(alone.errors.excess, rel=1e-3)

@@ -28,10 +28,11 @@ from trainer.effects.own_effect import measured_by
 from trainer.fitting.jacobian import (
     Key,
     away_from_absent,
-    damped_step,
     keys_of,
     moved,
+    reach_of,
     slopes_of,
+    step_within,
     weighted_residuals,
 )
 from trainer.fitting.least_squares_gain import with_gain
@@ -45,9 +46,9 @@ ROUGH = 5e-3  # `tolerance` of fits that only compare, or that others follow
 # A fit is given up where a step is expected to leave more than so many times enough, and this share of what there is;
 # and where it would not come there if each step that it still has removed so many times what the last one did.
 FAR, SLOW, FASTER = 10.0, 0.5, 2.0
-PROMISING = (
-    0.8  # share of what there is that a step is expected to leave at most if it is expected to do much
-)
+# A step that lowers the excess by less than LITTLE is the last one. It is expected to do much where it may leave
+# PROMISING of the excess at most, and lower it by MUCH.
+LITTLE, PROMISING, MUCH = 2e-6, 0.8, 2e-5
 BLOCK = 1 << 18  # pixels
 
 
@@ -89,8 +90,9 @@ def fit(
 ) -> FitResult:
     """Fit the named effects of a model, and the gains, to batches.
 
-    Stops after `iterations`, or when a step lowers the excess by less than `tolerance` of it or less than 2e-6, unless
-    that step had to be shortened where a whole one was expected to do much, or far from the truth (`hold`).
+    Stops after `iterations`, or when a step lowers the excess by less than `tolerance` of it or less than LITTLE,
+    unless that step had to be shortened where a whole one was expected to do much, or far from the truth (`hold`).
+    No step leaves the numbers' physical ranges.
     Errors of values are standard errors from the residuals themselves (a sandwich estimate), so misfit widens them; NaN
     where the captures do not determine a value: such a value stays as it is.
 
@@ -143,7 +145,9 @@ def _fit(
             progress(iteration / iterations)
         before = errors.excess
         normal, gradient = _normal(slopes), _gradient(slopes, residuals)
-        left = before - float(gradient @ damped_step(normal, gradient, 0.0)) / scale
+        reach = reach_of(model, keys, channels)
+        whole = step_within(normal, gradient, 0.0, reach)
+        left = before - float(2 * gradient @ whole - whole @ normal @ whole) / scale
         if fresh and before > FAR * enough and left > max(FAR * enough, SLOW * before):
             settled = False
             break
@@ -154,7 +158,7 @@ def _fit(
             gradient[: len(keys)] -= pull * scale * away / ranges
         accepted, raised = False, False
         for _ in range(6 if fresh else 1):
-            trial = moved(model, keys, channels, damped_step(normal, gradient, damping))
+            trial = moved(model, keys, channels, step_within(normal, gradient, damping, reach))
             trial_points = [p.trace(trial, first, t) for p, t in zip(predictors, points, strict=True)]
             trial_residuals, trial_errors = weighted_residuals(trial, predictors, trial_points)
             paid = pull * float((_away(trial, keys, ranges) ** 2 - away**2).sum()) if pull else 0.0
@@ -169,11 +173,11 @@ def _fit(
         elif fresh:
             break
         removed_excess = before - errors.excess
-        promising = hold > 0 or left < PROMISING * before
+        promising = hold > 0 or before - left > max((1 - PROMISING) * before, MUCH)
         if (
             fresh
             and not (raised and promising)
-            and removed_excess < max(tolerance * abs(errors.excess), 2e-6)
+            and removed_excess < max(tolerance * abs(errors.excess), LITTLE)
         ):
             break
         if fresh and is_too_slow(removed_excess, iterations - iteration - 1, errors.excess, enough):
@@ -235,7 +239,7 @@ def _fit_many(
             break
         model, points, residuals, errors = trial, trial_points, trial_residuals, trial_errors
         removed_excess = before - errors.excess
-        if removed_excess < max(tolerance * abs(errors.excess), 2e-6):
+        if removed_excess < max(tolerance * abs(errors.excess), LITTLE):
             break
         if is_too_slow(removed_excess, iterations - iteration - 1, errors.excess, enough):
             settled = False

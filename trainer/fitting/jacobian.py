@@ -13,6 +13,7 @@ from functools import partial
 
 import numpy as np
 import torch
+from scipy.optimize import lsq_linear
 from torch import Tensor
 
 from runtime.excess import PredictionErrors, joined
@@ -24,7 +25,9 @@ from trainer.prediction.predict import Trace
 
 NO_CHANGE = 1e-5  # of the prediction: what a number's scale must change for captures to determine it
 STEP = 0.1  # of a parameter's scale: large against single precision's rounding, small against curvature
+GAIN_REACH = 1.0  # largest step of a gain's logarithm
 LOUDER = 0.01  # change of the light's logarithm: its secant is the derivative by a gain
+ROUNDING = 1e-7  # of the largest eigenvalue of a normal matrix, whose sums are of single precision
 TABLE_PIXELS = 1 << 19  # most pixels of a capture in a table of derivatives
 
 Key = tuple[str, str, int]  # of a number: effect, parameter, index into its values
@@ -86,7 +89,10 @@ def moved(model: Model, keys: Sequence[Key], channels: Sequence[str], step: np.n
     for key, change in zip(keys, step, strict=False):
         model = stepped(model, key, float(change))
     logs = dict(zip(channels, step[len(keys) :], strict=False))
-    gain = {c: g * float(np.exp(np.clip(logs.get(c, 0.0), -1, 1))) for c, g in model.gain.items()}
+    gain = {
+        c: g * float(np.exp(np.clip(logs.get(c, 0.0), -GAIN_REACH, GAIN_REACH)))
+        for c, g in model.gain.items()
+    }
     return replace(model, gain=gain)
 
 
@@ -252,7 +258,47 @@ def outside_span(total: float, along: Tensor, normal: Tensor) -> float:
 
 def damped_step(normal: np.ndarray, gradient: np.ndarray, damping: float) -> np.ndarray:
     """Step of a least-squares problem, damped as Levenberg and Marquardt do: `damping` of each number's own square."""
+    diagonal, scaled = _scaled(normal, damping)
+    return np.linalg.solve(scaled, gradient / diagonal) / diagonal
+
+
+def _scaled(normal: np.ndarray, damping: float) -> tuple[np.ndarray, np.ndarray]:
+    """Roots of a normal matrix's diagonal, and the matrix over them with damping on its diagonal."""
     diagonal = np.sqrt(np.maximum(np.diag(normal), 1e-30))
     scaled = normal / np.outer(diagonal, diagonal)
     scaled[np.diag_indices_from(scaled)] += damping + 1e-9
-    return np.linalg.solve(scaled, gradient / diagonal) / diagonal
+    return diagonal, scaled
+
+
+def step_within(
+    normal: np.ndarray, gradient: np.ndarray, damping: float, reach: tuple[np.ndarray, np.ndarray]
+) -> np.ndarray:
+    """`damped_step` within each number's reach: where one cannot go on, the others do what is best without it.
+
+    By the bounded-variable least squares of Stark and Parker (1995).
+
+    Parameters
+    ----------
+    reach : (array, array)
+        How far down and up each number may move, as `reach_of` gives it.
+    """
+    step = damped_step(normal, gradient, damping)
+    if np.all((reach[0] <= step) & (step <= reach[1])):
+        return step
+    shows = np.diag(normal) > 0
+    diagonal, scaled = _scaled(normal[np.ix_(shows, shows)], damping)
+    squares, directions = np.linalg.eigh(scaled)
+    roots = np.sqrt(np.maximum(squares, ROUNDING * squares.max(initial=0)))
+    along = directions.T @ (gradient[shows] / diagonal) / roots
+    within = tuple(end[shows] * diagonal for end in reach)
+    step[shows] = lsq_linear(roots[:, None] * directions.T, along, within, method="bvls").x / diagonal
+    return step
+
+
+def reach_of(model: Model, keys: Sequence[Key], channels: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """How far down and up `moved` may take each number within its physical range, and each gain's logarithm."""
+    values = np.array([model.instance(n).values[p].reshape(-1)[k] for n, p, k in keys])
+    parameters = [model.instance(n).effect.parameter(p) for n, p, _ in keys]
+    gains = np.full(len(channels), GAIN_REACH)
+    low, high = (np.array([getattr(p, end) for p in parameters]) - values for end in ("low", "high"))
+    return np.concatenate((np.minimum(low, 0), -gains)), np.concatenate((np.maximum(high, 0), gains))
