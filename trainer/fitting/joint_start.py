@@ -56,9 +56,9 @@ LACKING, RAISED = 0.05, 0.3
 ITERATIONS, TOLERANCE = 6, 0.05
 # With less, magnification, distance and curvature run away together: pictures smoothed by 4 pixels hardly tell them.
 HOLD_SMOOTHED = 0.03
-# Excess below which it shows which effects do nothing of their own. Each time that these are left out, orders are
-# raised until less than the next of THEN is left: at 0 as far as that pays, and at last not at all.
-NEAR, THEN = 0.01, (0.002, 0.0, math.inf)
+# Excess below which it shows which effects do nothing of their own. When these are first left out, orders are raised
+# until less than NEARER is left, and then each time as far as that pays: the others may need them now.
+NEAR, NEARER = 0.01, 0.002
 NUMBERS = 1000  # independent ones that the pictures should hold, smoothed as they are
 
 
@@ -106,12 +106,14 @@ def joint_start(
     for name in fine:
         model = model.having(absent(known[name], model.bench))
     fitted = _with_orders_raised(model, batches, NEAR)
-    for enough in THEN:
-        if fitted.errors.excess > NEAR:  # what is idle yet may do something when the others are right
-            break
+    enough, next_one = math.inf, NEARER
+    while (
+        fitted.errors.excess < NEAR
+    ):  # farther away, what is idle may do something when the others are right
         smaller = without_idle(fitted.model, batches, least)
-        if smaller is fitted.model and enough == THEN[-1]:
+        if smaller is fitted.model and enough == 0:
             break
+        enough, next_one = next_one, 0.0
         fitted = _with_orders_raised(smaller, batches, enough)
     model = fitted.model
     for name in late:
