@@ -17,7 +17,7 @@ from trainer.model.model import EffectInstance, Model, absent
 # An effect that starts anew is back where it was where it leaves the excess that there was, up to the first of these
 # factors, and nowhere near where it leaves more than the second times as much.
 BACK, NOWHERE = 1.1, 10.0
-THERE = 0.1  # of what there is: what a fit to few captures leaves of all where a fit to all may begin at once
+THERE = 0.5  # of what there is: what a fit to few captures leaves of all at most where a fit to all may begin at once
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ def try_with_present(
     ----------
     on_few : Model, optional
         The same, all fitted to a few of the captures: where to begin, if that leaves less than the effect alone, which
-        is not fitted where it leaves less than a tenth of what there is.
+        is not fitted where it leaves less than half of what there is.
     """
     captures = opened(folder)
     batches = load(captures, chosen(captures, ids))

@@ -26,6 +26,9 @@ FEW_STEPS = 3
 # the others, fitted to that capture alone, leave NEEDED times as much there. All captures leave no less. Fitted to the
 # end there, they may as well be compared with what is left, where they leave NEEDED times what makes a difference.
 CHANGES, NEEDED, NEEDED_AT_LAST = 30.0, 10.0, 1.5
+# Of what makes a difference: where no more is left without an effect that is read off the captures, and has no numbers
+# whose work others could do, these need no fit.
+NOTHING = 0.1
 
 
 def without_one(
@@ -60,11 +63,12 @@ def without_one(
     numbers = dependence(model, most_telling(model, load(roles.captures, roles.fitted)))
     names = _in_doubt(numbers, names, least)
     raising = thorough and not thresholds.complete(errors.excess, ideal_excess)
+    where = roles.folder, ids, held, model
     for first in range(0, len(names), pool.workers):  # as many at a time as there are processes
         some = names[first : first + pool.workers]
         iterations = 12 if thorough else FEW_STEPS
         tasks = [
-            (roles.folder, ids, held, model, name, _begun_without(numbers, name), raising, iterations, least)
+            (*where, name, _begun_without(numbers, name), errors.excess, raising, iterations, least)
             for name in some
         ]
         for name, found in zip(some, pool.map_here_if_one(fitted_without, tasks), strict=True):
@@ -95,6 +99,7 @@ def fitted_without(
     model: Model,
     name: str,
     rest: Model,
+    with_it: float,
     raising: bool,
     iterations: int,
     least: float,
@@ -111,6 +116,8 @@ def fitted_without(
         Captures to fit, and captures to judge by.
     rest : Model
         Where the fit without the effect begins.
+    with_it : float
+        Excess of the model on the held-out captures.
     raising : bool
         Raise orders as far as that helps.
     iterations : int
@@ -127,9 +134,13 @@ def fitted_without(
     batches = load(captures, chosen(captures, ids))
     rest = with_gain(rest, [Predictor(rest, b) for b in batches])  # it may have had the gains' work
     # what shows from capture to capture does not in one
-    count = 2 if model.instance(name).effect.measure else 1
-    few = [telling(rest, b, count) for b in batches]
+    measured = model.instance(name).effect.measure is not None
+    few = [telling(rest, b, 2 if measured else 1) for b in batches]
     left = excess_on(model, few)
+    if measured and excess_on(rest, few) < left + NOTHING * least:
+        errors = evaluate_captures(captures, chosen(captures, held_ids), rest)
+        if errors.excess < with_it + NOTHING * least:
+            return rest, errors
     near = fit(rest, rest.names, few, FEW_STEPS, hold=HOLD)
     if near.errors.excess > NEEDED * max(left, least):
         return None

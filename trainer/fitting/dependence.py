@@ -10,7 +10,16 @@ import torch
 from torch import Tensor
 
 from trainer.captures.batches import Batch
-from trainer.fitting.jacobian import Key, away_from_absent, damped_step, keys_of, moved, outside_span, stacked
+from trainer.fitting.jacobian import (
+    Key,
+    away_from_absent,
+    keys_of,
+    moved,
+    outside_span,
+    reach_of,
+    stacked,
+    step_within,
+)
 from trainer.fitting.many_numbers import has_many
 from trainer.fitting.predictor import Predictor, excess_on
 from trainer.model.model import Model
@@ -68,9 +77,11 @@ class Dependence:
         gone, along = self._lack(lost)
         if not bool(self.away[gone].any()):
             return self.model
-        step = -self.away.numpy()
-        step[~gone.numpy()] = damped_step(self._others(gone).numpy(), along[~gone].numpy(), SLACK)
-        steps = (np.where(gone.numpy(), step, share * step) for share in SHARES)
+        step, stays = -self.away.numpy(), ~gone.numpy()
+        low, high = reach_of(self.model, self.keys, self.channels)
+        within = low[stays], high[stays]
+        step[stays] = step_within(self._others(gone).numpy(), along[~gone].numpy(), SLACK, within)
+        steps = (np.where(stays, share * step, step) for share in SHARES)
         tried = [moved(self.model, self.keys, self.channels, one) for one in steps]
         return min(tried, key=lambda one: excess_on(one, self.batches))
 
