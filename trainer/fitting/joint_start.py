@@ -107,9 +107,8 @@ def joint_start(
         model = model.having(absent(known[name], model.bench))
     fitted = _with_orders_raised(model, batches, NEAR)
     enough, next_one = math.inf, NEARER
-    while (
-        fitted.errors.excess < NEAR
-    ):  # farther away, what is idle may do something when the others are right
+    # Farther away, what is idle may do something when the others are right.
+    while fitted.errors.excess < NEAR:
         smaller = without_idle(fitted.model, batches, least)
         if smaller is fitted.model and enough == 0:
             break
