@@ -129,17 +129,26 @@ def _most_probable(
 
 
 def _own(numbers: np.ndarray) -> np.ndarray:
-    """Each pixel's number less the best prediction from its neighbours: linear, with the same weights everywhere."""
+    """Each pixel's number less the best prediction from its neighbours: linear, with the same weights everywhere.
+
+    Neighbours on opposite sides tell as much of it, and have one weight.
+    """
     height, width = numbers.shape
     padded = np.pad(numbers, REACH, mode="reflect", reflect_type="odd")
-    span = range(2 * REACH + 1)
-    places = [(i, j) for i in span for j in span if (i, j) != (REACH, REACH)]
+    span = 2 * REACH + 1
+    places = [(n // span, n % span) for n in range(span**2 // 2)]
+
+    def pairs(i: int, j: int, apart: int = 1) -> np.ndarray:
+        near = padded[i : i + height : apart, j : j + width : apart]
+        i, j = 2 * REACH - i, 2 * REACH - j
+        return near + padded[i : i + height : apart, j : j + width : apart]
+
     apart = math.ceil(math.sqrt(numbers.size / WEIGHT_PIXELS))
-    near = np.stack([padded[i : i + height : apart, j : j + width : apart].ravel() for i, j in places])
+    near = np.stack([pairs(i, j, apart).ravel() for i, j in places])
     normal = near @ near.T
     normal += (1e-9 * np.trace(normal) / len(normal) + 1e-30) * np.eye(len(normal))
     weights = np.linalg.solve(normal, near @ numbers[::apart, ::apart].ravel())
     own = numbers.copy()
     for (i, j), share in zip(places, weights, strict=True):
-        own -= share * padded[i : i + height, j : j + width]
+        own -= share * pairs(i, j)
     return own
