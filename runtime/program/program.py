@@ -24,7 +24,7 @@ from runtime.program.log_file import Log, open_log
 from runtime.program.outputs import check_outputs, files_written
 from runtime.program.parser import ProgramParser
 from runtime.program.screen import Screen, one_line
-from runtime.program.threads import wait_asleep
+from runtime.program.threads import share_cores
 from runtime.program.version import installed_version
 
 DONE, PROBLEMS, BAD_INPUT, INTERRUPTED, NO_READER = 0, 1, 2, 130, 141
@@ -69,7 +69,7 @@ class Program:
         int
             The exit code.
         """
-        wait_asleep()
+        share_cores()
         keep_large_blocks()
         try:
             return self._main(list(sys.argv[1:] if arguments is None else arguments))

@@ -40,7 +40,7 @@ from runtime.calibration.summary import numbers
 from runtime.headset.open_devices import Devices
 from runtime.lightpath.ideal_path import ideal_path, single
 from runtime.program.large_blocks import keep_large_blocks
-from runtime.program.threads import wait_asleep
+from runtime.program.threads import share_cores
 from tests.runtime.calibration.drifting import without_tilt
 
 COLOURS = {"green": 520.0, "red": 638.0, "blue": 450.0}
@@ -180,7 +180,7 @@ def measured(shape: tuple[int, int], distance_mm: float, colours: list[str], alo
 
 def main() -> None:
     """Calibrate once, and print what it took."""
-    wait_asleep()
+    share_cores()
     keep_large_blocks()
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter

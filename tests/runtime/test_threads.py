@@ -19,8 +19,8 @@ BUSY = "while True: pass"
 STEPS = """
 import os, sys, time
 if sys.argv[1] == "asleep":
-    from runtime.program.threads import wait_asleep
-    wait_asleep()
+    from runtime.program.threads import share_cores
+    share_cores()
 import torch
 torch.set_num_threads(2)
 a = torch.ones(300_000)
@@ -42,6 +42,36 @@ fft.fft(np.ones((1024, 1024), np.complex64), 0)
 Backend().over_rows(1024, 64, lambda worker, rows: None)
 print(len(os.listdir("/proc/self/task")))
 """
+# The same after a product of matrices in a program that shares the cores.
+PRODUCT = """
+import os
+from runtime.program.threads import share_cores
+share_cores()
+import numpy as np
+import scipy.linalg
+table = np.ones((48, 100_000))
+scipy.linalg.solve(table @ table.T + np.eye(48), table[:, 0])
+print(len(os.listdir("/proc/self/task")))
+"""
+OF_THREADS = ("OMP_", "GOMP_", "KMP_", "MKL_", "OPENBLAS_")
+
+
+def environment_without_threads() -> dict[str, str]:
+    """This process's environment without what it says of threads."""
+    return {k: v for k, v in os.environ.items() if not k.startswith(OF_THREADS)}
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="threads cannot be counted here")
+def test_products_of_a_program_take_one_thread() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", PRODUCT],
+        cwd=ROOT,
+        env=environment_without_threads(),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert int(done.stdout) == 1
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="threads cannot be counted here")
@@ -61,13 +91,12 @@ def test_the_solver_uses_no_more_threads_than_the_process_was_given() -> None:
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes cannot be put on two cores here")
 def test_on_busy_cores_waiting_threads_leave_the_time_to_those_that_work() -> None:
     cores = sorted(os.sched_getaffinity(0))[:CORES]
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(("OMP_", "GOMP_", "KMP_", "MKL_"))}
 
     def begun(*arguments: str) -> subprocess.Popen[str]:
         return subprocess.Popen(
             [sys.executable, "-c", *arguments],
             cwd=ROOT,
-            env=environment,
+            env=environment_without_threads(),
             stdout=subprocess.PIPE,
             text=True,
             preexec_fn=lambda: os.sched_setaffinity(0, cores),

@@ -121,6 +121,28 @@ def numbers(found: Any, where: str = "") -> dict[str, float]:
     return {place: value for part in parts for place, value in part.items()}
 
 
+# How many threads products of matrices have in workers, where the environment says two.
+PRODUCTS = """
+from threadpoolctl import threadpool_info
+from trainer.fitting.pool import open_pool
+with open_pool(2) as pool:
+    for library in sum(pool.map(threadpool_info, [(), ()]), []):
+        if library["user_api"] == "blas":
+            print(library["num_threads"])
+"""
+
+
+def test_workers_multiply_on_one_thread() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", PRODUCTS],
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "2"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert set(done.stdout.split()) == {"1"}
+
+
 def test_results_come_in_the_order_of_the_tasks_and_errors_come_out() -> None:
     counts: list[int] = []
     with open_pool(1) as running:

@@ -28,6 +28,8 @@ from multiprocessing import forkserver, resource_tracker
 from multiprocessing.context import BaseContext
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from threadpoolctl import threadpool_limits
+
 from firmware_iface.errors import InputError
 from runtime.program.large_blocks import keep_large_blocks
 from runtime.program.threads import cores
@@ -285,6 +287,7 @@ def _packed(task: bytes) -> bytes:
     keep_large_blocks()
     keep_pictures()  # tasks carry paths, and the next one is often of the same captures
     function, arguments = pickle.loads(task)
+    threadpool_limits(1, user_api="blas")  # what the task needs is loaded now
     return pickle.dumps(function(*arguments))
 
 
