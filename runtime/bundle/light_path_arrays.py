@@ -27,7 +27,7 @@ import numpy as np
 from firmware_iface.errors import InputError, nearest
 from runtime.bundle.bundle_folder import ARRAYS, MANIFEST, Bundle
 from runtime.lightpath.gray_levels import checked_gray_levels, shown_as
-from runtime.lightpath.grid import FINE, FINEST, Grid
+from runtime.lightpath.grid import COARSE, FINE, FINEST, Grid
 from runtime.lightpath.light_path import LightPath
 
 COMPLEX, REAL = np.dtype(np.complex64), np.dtype(np.float32)
@@ -280,7 +280,7 @@ def _grid(given: Any, where: str) -> Grid:
     pitch: Any = given.get("pitch_m")
     if type(margin) is not int or margin < 0 or not _is_number(pitch) or not 0 < pitch < 1:
         raise wrong
-    if type(fine) is not int or fine not in (FINE, FINEST):
+    if type(fine) is not int or fine not in (COARSE, FINE, FINEST):
         raise wrong
     for n, room, edge in zip(shape, padded, band, strict=True):
         if not (n >= 1 and n + 2 * margin <= room <= LARGEST and 0 <= edge < room):

@@ -14,7 +14,7 @@ import numpy as np
 from runtime.calibration.drift import LASER_ORDERS, LOWEST_AMPLITUDE, LOWEST_WAVEFRONT, axial_phase
 from runtime.calibration.estimate import ColourLightPath, Estimate, Shot
 from runtime.calibration.parameter_layout import ParameterLayout
-from runtime.calibration.prediction import Predictor
+from runtime.calibration.prediction import Predictor, enough_for_direction
 from runtime.camera.view import SENSITIVITY_ORDER, TERMS
 from runtime.lightpath.legendre import legendre_map_by_map
 from runtime.solver.in_place_path import Optics
@@ -40,7 +40,7 @@ class Columns:
         self, bases: Mapping[str, ColourLightPath], estimate: Estimate, layout: ParameterLayout
     ) -> None:
         self.bases, self.estimate, self.layout = bases, estimate, layout
-        self.predictor = Predictor(bases, 1)  # that fine is enough for the direction of a step
+        self.predictor = Predictor(bases, enough_for_direction(bases))
         self.predictor.take(estimate)
         panel = next(iter(bases.values())).path.grid.shape
         self.levers = layout.levers(estimate.view, panel)
@@ -67,7 +67,7 @@ class Columns:
 
         if channel not in self.moved:
             self.moved.clear()  # a colour's buffers at a time
-            self.moved[channel] = Optics(path, path.grid.fine, True, predictor.backend)
+            self.moved[channel] = Optics(path, path.grid.fine, True, predictor.backend, apart=True)
         moved = self.moved[channel]
         moved.take(path)
         turned = moved.in_band_order(1j * axial_phase(path, wavelength)[None], path.grid)[0]

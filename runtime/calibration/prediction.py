@@ -24,6 +24,11 @@ from runtime.solver.in_place_path import Optics
 SMALL = 200_000  # panel pixels up to which threads wait for each other longer than they work
 
 
+def enough_for_direction(bases: Mapping[str, ColourLightPath]) -> int:
+    """`finer` of a predictor that gives the direction of a step: the camera reads two samples a panel pixel."""
+    return max(1, *(2 // b.path.grid.fine for b in bases.values()))
+
+
 class Predictor:
     """Predicts captures of several colours.
 
@@ -52,7 +57,8 @@ class Predictor:
         self.backend = Backend(fft.THREADS if size > SMALL else 1)
         room = Room(self.backend)
         self.optics = {
-            c: Optics(b.path, b.path.grid.fine, True, self.backend, room) for c, b in bases.items()
+            c: Optics(b.path, b.path.grid.fine, True, self.backend, room, apart=True)
+            for c, b in bases.items()
         }
         self.paths: dict[str, LightPath] = {}
         self.readings: dict[str, Reading] = {}

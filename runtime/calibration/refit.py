@@ -22,7 +22,7 @@ from runtime.calibration.estimate import ColourLightPath, Estimate, Shot
 from runtime.calibration.free_form_fit import ITERATIONS, fit_freeform, iterations_over, spacings
 from runtime.calibration.held_out_errors import held_out_errors
 from runtime.calibration.information import measured_information
-from runtime.calibration.prediction import Predictor
+from runtime.calibration.prediction import Predictor, enough_for_direction
 from runtime.calibration.replacement_rule import LEAST_EXCESS, is_certain
 from runtime.calibration.response import Sweep, fitted_response, measured_sweep
 from runtime.calibration.shown_patterns import GRAINS
@@ -146,7 +146,7 @@ def _nearest_distance(
     bases: Mapping[str, ColourLightPath], shots: Sequence[Shot], estimate: Estimate
 ) -> Estimate:
     """The estimate with that distance of `SCAN_MM` which explains the shots best."""
-    predictor, costs = Predictor(bases, 1), {}
+    predictor, costs = Predictor(bases, enough_for_direction(bases)), {}
     for mm in SCAN_MM:
         predictor.take(replace(estimate, drift=Drift(distance_mm=mm)))
         costs[mm] = predicted_chi_squared(predictor, shots)

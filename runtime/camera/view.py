@@ -179,8 +179,7 @@ def sampler(view: View, grid: Grid, finer: int = 2) -> Sampler:
     grid : Grid
         Of the light path.
     finer : int
-        How many times as fine as the light path's fine grid the splines' samples are: 2 to predict; 1 is enough for
-        the direction of a step.
+        How many times as fine as the light path's fine grid the splines' samples are: 2 to predict.
     """
     return sampler_and_adjoint(view, grid, finer)[0]
 

@@ -50,6 +50,9 @@ class Optics:
     backend : Backend
     room : Room, optional
         Where the fields are, for paths that are used one after the other; None: room of its own.
+    apart : bool
+        Whether the panel's spectrum is kept apart from the image's, as `factor_adjoint` and whoever changes
+        `transfers` need.
 
     Raises
     ------
@@ -58,7 +61,13 @@ class Optics:
     """
 
     def __init__(
-        self, path: LightPath, fine: int, integrate: bool, backend: Backend, room: Room | None = None
+        self,
+        path: LightPath,
+        fine: int,
+        integrate: bool,
+        backend: Backend,
+        room: Room | None = None,
+        apart: bool = False,
     ) -> None:
         xp, grid = backend.xp, path.grid
         if path.far_field is not None:
@@ -73,7 +82,7 @@ class Optics:
         room = room or Room(backend)
         self.panel = Panel(path, self.rows, self.columns, backend, room)
         # Where one buffer can be both, the pupil multiplies in place.
-        self.in_place = fine == 1 and len(path.transfers) == 1 and path.crosstalk is None
+        self.in_place = fine == 1 and len(path.transfers) == 1 and path.crosstalk is None and not apart
         self._take_pupil(path)
         self.strongest = int(np.argmax(path.weights))
         self.spectrum = self.panel.spectrum
@@ -149,7 +158,7 @@ class Optics:
                 self.image_plane.forward(state * self.modes + mode, image)
 
     def factor_adjoint(self, phase: Array, slope: Array, factor: Array, axial: Array) -> float:
-        """Add to `factor` the gradient of a loss over a factor on the field that leaves the panel; not where in place.
+        """Add to `factor` the gradient of a loss over a factor on the field that leaves the panel; spectra are `apart`.
 
         Parameters
         ----------

@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from firmware_iface.virtual import VirtualHeadset, load_bench
 from firmware_iface.virtual.bench_description import IrisDescription
+from runtime.camera.sampling import finer_picture
 from runtime.lightpath.crosstalk import mix_neighbours
 from runtime.lightpath.grid import FINE, at_pixels, grid_for
 from runtime.lightpath.light_path import (
@@ -302,3 +303,16 @@ def test_grids_have_room_for_the_light_and_for_what_follows() -> None:
     assert all(p % 2 == 0 for p in (*grid.padded, *near.padded, *closed.padded))
     widest = grid_for((10, 10), PITCH, 520e-9, 1e-3, 1.95)
     assert all(2 * b + 1 <= FINE * p for b, p in zip(widest.band, widest.padded, strict=True))
+
+
+def test_behind_half_of_the_band_a_sample_a_pixel_tells_all() -> None:
+    """Irradiance has twice the band of the field: what lies between a pixel's samples follows from them."""
+    path = ideal_path((96, 120), half_width=0.5)
+    assert path.grid.fine == 1
+    assert ideal_path((96, 120), half_width=0.51).grid.fine == FINE
+    phase = phases(path)
+    coarse, finer = (irradiance(p, phase) for p in (path, replace(path, grid=replace(path.grid, fine=FINE))))
+    assert relative(coarse, finer[::FINE, ::FINE]) < 1e-12
+    between = finer_picture(np.fft.rfft2(coarse), coarse.shape, FINE)
+    inside = np.s_[24:-24, 24:-24]  # a spectrum takes a picture for periodic
+    assert relative(between[inside], finer[inside]) < 1e-2

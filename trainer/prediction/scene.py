@@ -7,13 +7,13 @@ receive them. `trainer.model.model_stages` applies the effects of a model to the
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import torch
 from torch import Tensor
 
-from runtime.lightpath.grid import Grid, band_frequencies, grid_for, image_frequencies
+from runtime.lightpath.grid import FINE, Grid, band_frequencies, grid_for, image_frequencies
 from runtime.lightpath.propagation import Aperture, check_sampling
 from trainer.captures.bench_file import Bench
 from trainer.kept_results import kept_by_device
@@ -97,6 +97,8 @@ def scene_at(
         narrowest=narrowest,
         stated=bench.iris.half_width,
     )
+    if method == "fraunhofer":  # the panel's extent is the band there, and not the iris
+        grid = replace(grid, fine=max(grid.fine, FINE))
     check_sampling(
         method,
         Aperture(panel.shape, grid.padded, panel.pitch),

@@ -28,6 +28,11 @@ from tests.runtime.benches import ideal_path, random_path
 from tests.runtime.calibration.drifting import WAVELENGTH_NM, blank, without_tilt
 
 SMALL = (40, 52)
+BUNDLES = {
+    "ideal": ideal_path(SMALL, 8e-3),
+    "half open": ideal_path(SMALL, 8e-3, 0.5),
+    "everything": random_path(SMALL),
+}
 
 
 def moved_at_random(layout: ParameterLayout, shape: tuple[int, int], size: float = 0.02) -> Estimate:
@@ -49,9 +54,8 @@ def shots_of(path: LightPath, truth: Estimate, count: int, noise: float = 0.01) 
     return shots
 
 
-@pytest.mark.parametrize("make", [ideal_path, random_path])
-def test_a_prediction_in_place_is_the_prediction(make: object) -> None:
-    path = ideal_path(SMALL, 8e-3) if make is ideal_path else random_path(SMALL)
+@pytest.mark.parametrize("path", BUNDLES.values(), ids=BUNDLES)
+def test_a_prediction_in_place_is_the_prediction(path: LightPath) -> None:
     base = ColourLightPath(path, WAVELENGTH_NM)
     estimate = moved_at_random(layout_of({"green": base}, (3, 2), True), SMALL)
     shot = blank(grains(SMALL, 3, 0))
@@ -62,10 +66,9 @@ def test_a_prediction_in_place_is_the_prediction(make: object) -> None:
 
 
 @pytest.mark.parametrize("new_view", [False, True])
-@pytest.mark.parametrize("make", [ideal_path, random_path])
-def test_slopes_are_what_differences_of_chi_squared_say(make: object, new_view: bool) -> None:
+@pytest.mark.parametrize("path", BUNDLES.values(), ids=BUNDLES)
+def test_slopes_are_what_differences_of_chi_squared_say(path: LightPath, new_view: bool) -> None:
     """Along random directions of each group of numbers, with modes, states, leak and crosstalk at once."""
-    path = ideal_path(SMALL, 8e-3) if make is ideal_path else random_path(SMALL)
     bases = {"green": ColourLightPath(path, WAVELENGTH_NM)}
     layout = layout_of(bases, (4, 3), new_view)
     start = moved_at_random(layout, SMALL)

@@ -115,10 +115,11 @@ def test_a_view_is_what_it_was_after_a_bundle() -> None:
     assert View.from_json(view.as_json()) == view
 
 
+@pytest.mark.parametrize("half_width", [0.8, 0.5])
 @pytest.mark.parametrize("channels", [("green",), ("red", "green")])
-def test_derivatives_are_what_differences_say(channels: tuple[str, ...]) -> None:
+def test_derivatives_are_what_differences_say(channels: tuple[str, ...], half_width: float) -> None:
     """Every column of the fit against a central difference of the prediction, with modes, leak and crosstalk."""
-    full = random_path(SMALL)
+    full = random_path(SMALL, half_width)
     one = ColourLightPath(full, WAVELENGTH_NM)
     rng = np.random.default_rng(2)
     gray = rng.integers(0, 256, SMALL, dtype=np.uint8)
