@@ -215,6 +215,7 @@ def test_diagnose_ends_with_it_wherever_it_happens(
         (effect_text(before="class Stop(BaseException): ...\nraise Stop('here')\n"), 7, "Stop: here"),
         (effect_text(before="def broken(:\n"), 6, "SyntaxError: "),
         (effect_text(stage="screen"), 7, "stage 'screen' is not one of"),
+        (effect_text().replace("low=-1", "low=1"), 7, "Parameter 'size': make low 1 less than high 1"),
     ],
 )
 def test_a_file_that_cannot_be_run_is_said_with_its_line(

@@ -223,7 +223,8 @@ def effect(
     Raises
     ------
     InputError
-        Where `stage`, `acts_on` or `colours` is unknown, or the parameters do not fit the function.
+        Where `stage`, `acts_on` or `colours` is unknown, a parameter has no range, or the parameters do not fit the
+        function.
     """
     acted_on = acts_on or told_to
 
@@ -237,6 +238,11 @@ def effect(
             raise InputError(f"effect '{name}': colours '{colours}' is not one of {', '.join(COLOURS)}")
         if not parameters:
             raise InputError(f"effect '{name}': give it at least one Parameter")
+        for p in parameters:
+            if not p.low < p.high:
+                raise InputError(
+                    f"effect '{name}': Parameter '{p.name}': make low {p.low:g} less than high {p.high:g}"
+                )
         arguments = list(inspect.signature(function).parameters.values())[1:]
         given = {a.name for a in arguments if a.kind is a.KEYWORD_ONLY} & {"order", "moment"}
         taken = [a.name for a in arguments if a.name not in given]
