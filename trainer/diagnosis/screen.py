@@ -33,7 +33,6 @@ from trainer.prediction.predict import Trace
 # leave, and this share of what is there.
 OWN, LEAST_OWN = 0.7, 0.01
 MEASURED = 8  # predictions that it takes about as long to measure captures as
-WIDENED = 3  # how often the band is widened at most, each time as far as the best start opens the iris
 
 
 @dataclass(frozen=True)
@@ -100,10 +99,11 @@ def screen_batches(batches: list[Batch], model: Model, effects: tuple[Effect, ..
             wide = wide or _with_band_for(model, absent(effect, model.bench), batches)
             predictors, points = wide
         starts = _starts(effect, model, predictors, points)
-        for _ in range(WIDENED):
-            if not effect.touches_iris or not _needs_wider_band(model, starts[0], predictors):
-                break
-            predictors, points = _with_band_for(model, starts[0], batches)
+        # Starts that open the iris farther than there is room looked alike.
+        if effect.touches_iris and _band(model, starts[0], batches[0]) > max(predictors[0].scene.grid.band):
+            every = [*start_points(effect, model), *starts]
+            widest = max(every, key=lambda start: _band(model, start, batches[0]))
+            predictors, points = _with_band_for(model, widest, batches)
             starts = _starts(effect, model, predictors, points)
         expected = [
             (start, (_left(model, start, predictors, points, present) - noise) / scale) for start in starts
@@ -136,10 +136,9 @@ def _with_band_for(
     return predictors, [p.trace(model) for p in predictors]
 
 
-def _needs_wider_band(model: Model, start: EffectInstance, predictors: Sequence[Predictor]) -> bool:
-    """Whether an effect opens the iris farther than there is room: then wider starts looked like this one."""
-    needed = Predictor(model.having(start), predictors[0].batch).scene.grid.band
-    return max(needed) > max(predictors[0].scene.grid.band)
+def _band(model: Model, start: EffectInstance, batch: Batch) -> int:
+    """The highest frequency index that there is room for where an effect starts there."""
+    return max(Predictor(model.having(start), batch).scene.grid.band)
 
 
 def starts_from_one(effect: Effect) -> bool:
