@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from firmware_iface.errors import InputError
+from firmware_iface.errors import DeviceError, InputError
 from firmware_iface.virtual import load_bench, open_headset
 from runtime.solver import quality
 from trainer.captures.capture_set import read_captures
 from trainer.captures.open_bench import nominal_bench
 from trainer.commands.demo import first_free
+from trainer.cycle import demo_run
 from trainer.cycle.demo_pictures import target_of
 from trainer.cycle.demo_run import (
     COLOUR,
@@ -126,6 +127,25 @@ def test_the_camera_sees_each_colour_alone_in_the_frame_that_it_is_shown_in(tmp_
         assert light.mean() == pytest.approx(wanted.mean(), rel=0.02)
         assert np.corrcoef(light.ravel(), wanted.ravel())[0, 1] > 0.98
     assert set(seen.channels["after"]) == set(channels)
+
+
+def test_a_machine_that_is_too_busy_is_said_with_what_there_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried = []
+
+    def dark(*_: object, **__: object) -> None:
+        tried.append(1)
+        raise DeviceError("the lasers are off.")
+
+    monkeypatch.setattr(demo_run, "emulated", dark)
+    bench = nominal_bench(open_headset("virtual:small_demo"))
+    solved = {"after": Solved(np.zeros((1, 8, 8), np.uint8), np.ones(1))}
+    with pytest.raises(DeviceError, match="the lasers are off. So ended .* 'astronaut'.* too busy") as said:
+        on_hardware(
+            "virtual:small_demo", bench, [("astronaut", np.ones((1, 8, 8)), solved)], tmp_path / "patterns"
+        )
+    assert len(tried) == demo_run.TRIES and str(tmp_path) in str(said.value)
 
 
 @pytest.mark.slow

@@ -36,7 +36,7 @@ from trainer.report.display_section import DisplayedPicture, with_display
 
 PICTURES = ("astronaut", "coffee")  # not among those that are captured
 ITERATIONS, ORACLE_ITERATIONS = 100, 60
-TRIES = 5  # to show a pattern
+TRIES = 12  # to show a pattern
 
 
 @dataclass(frozen=True)
@@ -261,10 +261,13 @@ def on_hardware(
                     seen[name][which] = seen_by_camera(devices, bench, one.gray, one.given, target)
                     del waiting[0]
                     failed = 0
-        except DeviceError:
+        except DeviceError as error:
             failed += 1
             if failed == TRIES:
-                raise
+                raise DeviceError(
+                    f"{error} So ended {TRIES} attempts to show '{waiting[0][0]}': this machine is too busy for the "
+                    f"emulated hardware. Run the demo again with less beside it; what there is is in {folder.parent}"
+                ) from error
     for name, pictures in seen.items():
         for which, picture in pictures.items():
             write_picture(folder / f"{name}-{which}-seen.png", picture.light)
