@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 
 # Read by the OpenMP libraries when torch or another library loads them; worker processes inherit these.
 # GNU's spins for milliseconds at every barrier, which takes the cores from whoever would do the work.
@@ -20,8 +21,7 @@ def wait_asleep() -> None:
     ----------
     OpenMP 5.2, section 21.7 (OMP_WAIT_POLICY); GCC's libgomp manual (GOMP_SPINCOUNT).
     """
-    for name, value in WAITING.items():
-        os.environ.setdefault(name, value)
+    _say(WAITING)
 
 
 def share_cores() -> None:
@@ -29,8 +29,12 @@ def share_cores() -> None:
 
     What the environment says already stands.
     """
-    wait_asleep()
-    for name, value in IN_PRODUCTS.items():
+    _say(WAITING | IN_PRODUCTS)
+
+
+def _say(settings: Mapping[str, str]) -> None:
+    """Put settings into the environment, those that it lacks."""
+    for name, value in settings.items():
         os.environ.setdefault(name, value)
 
 

@@ -266,7 +266,7 @@ def on_hardware(
             if failed == TRIES:
                 raise DeviceError(
                     f"{error} So ended {TRIES} attempts to show '{waiting[0][0]}': this machine is too busy for the "
-                    f"emulated hardware. Run the demo again with less beside it; what there is is in {folder.parent}"
+                    f"emulated hardware. Run the demo again with less beside it; its files are in {folder.parent}"
                 ) from error
     for name, pictures in seen.items():
         for which, picture in pictures.items():
