@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +84,14 @@ def captured(
     where = folder / "captures"
     ran(capsys, "capture", "--bench", bench_file(folder, *defects, **sizes), "--out", where, *options)
     return where
+
+
+def state(captures: Path, key: str, value: float) -> None:
+    """Make bench.toml state another value of a key."""
+    path = captures / "bench.toml"
+    text, count = re.subn(rf"(?m)^{key} = .*$", f"{key} = {value}", path.read_text())
+    assert count == 1
+    path.write_text(text)
 
 
 def with_few_effects(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from tests.trainer.hidden import LARGER, bench_file, captured, ran, with_few_effects, without_probes
+from tests.trainer.hidden import LARGER, bench_file, captured, ran, state, with_few_effects, without_probes
 from trainer.cli import main
 
 RIVALS = (
@@ -22,14 +21,6 @@ RIVALS = (
     "laser_drift",
 )
 TWO_PLANES = ("--planes", "10,18", "--patterns", 6)
-
-
-def state(captures: Path, key: str, value: float) -> None:
-    """Make bench.toml state another value of a key."""
-    path = captures / "bench.toml"
-    text, count = re.subn(rf"(?m)^{key} = .*$", f"{key} = {value}", path.read_text())
-    assert count == 1
-    path.write_text(text)
 
 
 def explained(capsys, captures: Path, folder: Path) -> dict:

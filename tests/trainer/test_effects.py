@@ -151,7 +151,8 @@ def test_every_number_of_every_effect_has_a_derivative(name: str) -> None:
     differences.
 
     laser_drift has none: it is a switch that lets each capture have its own gain, which is then measured. How much of
-    added light follows that gain shows only then (`test_capture_gain`).
+    added light follows that gain shows only then (`test_capture_gain`), and how much the exposure only where that
+    differs (`test_added_light`).
     """
     weight = torch.as_tensor(np.random.default_rng(1).normal(size=(2, HEIGHT, WIDTH)))
     for order in {KNOWN[name].orders[0], KNOWN[name].orders[-1]}:
@@ -160,7 +161,7 @@ def test_every_number_of_every_effect_has_a_derivative(name: str) -> None:
         tensors = {k: torch.tensor(v, dtype=torch.float64, requires_grad=True) for k, v in one.values.items()}
         value = (predicted(scene, stages_for(scene, (one,), {name: tensors})) * weight).sum()
         value.backward()
-        told = [p for p in one.effect.parameters if p.name != "laser_share"]
+        told = [p for p in one.effect.parameters if p.name not in {"laser_share", "constant"}]
         for p in told:
             if tensors[p.name].numel() == 0:  # a map that has no terms at the lowest order
                 continue

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from trainer.captures.capture_table import Capture
@@ -16,6 +17,16 @@ def test_of_a_repeated_pattern_the_last_capture_is_taken() -> None:
     """What a slow panel showed before the first capture of a set, nobody knows; a repeat follows its own pattern."""
     rows = [row(0, "a"), row(1, "a"), row(2, "b"), row(3, "c"), row(4, "b")]
     assert sorted(c.capture for c in sample(rows, 1, 8)) == ["1", "3", "4"]
+
+
+def test_patterns_take_turns_with_their_exposures() -> None:
+    """One exposure does not tell added light from a wrong black level."""
+    exposures = (5.0, 20.0, 80.0)
+    rows = [
+        replace(row(3 * k + n, f"p{k}"), exposure_ms=ms) for k in range(6) for n, ms in enumerate(exposures)
+    ]
+    taken = sample(rows, 1, 4)
+    assert len({c.pattern for c in taken}) == 4 and {c.exposure_ms for c in taken} == set(exposures)
 
 
 def test_a_sets_first_capture_is_taken_last() -> None:

@@ -100,6 +100,7 @@ def noisy(rng: np.random.Generator, prediction: np.ndarray) -> Batch:
         gray,
         *kinds,
         torch.ones(len(prediction)),
+        1.0,
         lambda: gray[:, None],
     )
 

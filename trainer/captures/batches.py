@@ -44,6 +44,8 @@ class Batch:
     noise : Tensor [B, h, w], counts^2
         Expected variance of the camera's noise.
     exposure : Tensor [B], ms
+    usual_exposure : float, ms
+        The usual one of the colour, of which added light is counted.
     shown_before : callable
         Gives the patterns shown before each capture, the last one first: int Tensor [B, EARLIER, H, W]. They are read
         when first asked for.
@@ -63,6 +65,7 @@ class Batch:
     mask: Tensor
     noise: Tensor
     exposure: Tensor
+    usual_exposure: float
     shown_before: Callable[[], Tensor]
     smoothing_px: float = 0.0
     seen: Tensor | None = None
@@ -183,6 +186,7 @@ def load_batch(captures: CaptureSet, chosen: list[Capture], dtype: torch.dtype =
         torch.as_tensor(np.stack(weights), dtype=dtype),
         torch.as_tensor(np.stack(variances), dtype=dtype),
         torch.tensor([c.exposure_ms for c in chosen], dtype=dtype),
+        captures.usual_exposure_ms(chosen[0].channel),
         cache(lambda: _shown_before(captures, chosen)),
         moments=moments_of(captures, chosen),
     )

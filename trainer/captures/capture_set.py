@@ -58,6 +58,11 @@ class CaptureSet:
         """Distances that have captures, mm, ascending."""
         return tuple(sorted({c.plane_mm for c in self.captures}))
 
+    def usual_exposure_ms(self, channel: str) -> float:
+        """Median exposure of a colour's captures, or of all where there are none of this colour."""
+        own = [c.exposure_ms for c in self.captures if c.channel == channel]
+        return float(np.median(own or [c.exposure_ms for c in self.captures]))
+
     def gray(self, capture: Capture) -> np.ndarray:
         """Gray levels sent to the panel.
 

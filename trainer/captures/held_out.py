@@ -103,8 +103,9 @@ def sample(
 ) -> list[Capture]:
     """Different patterns for a fit, spread over colours and planes, each as it was captured last.
 
-    A repeat follows its own pattern. What a slow panel showed before the first capture of a set, nobody knows: that one
-    is the last to be chosen.
+    Patterns that were captured at several exposures take turns with these: what is added to pictures grows with the
+    exposure or does not, and one exposure tells neither. A repeat follows its own pattern. What a slow panel showed
+    before the first capture of a set, nobody knows: that one is the last to be chosen.
 
     Parameters
     ----------
@@ -120,12 +121,13 @@ def sample(
     -------
     list of Capture
     """
-    by_scene: dict[tuple[str, float], dict[str, Capture]] = {}
+    by_scene: dict[tuple[str, float], dict[str, dict[float, Capture]]] = {}
     for c in captures:
-        by_scene.setdefault((c.channel, c.plane_mm), {})[c.pattern] = c
-    columns = [list(patterns.values()) for patterns in by_scene.values()]
+        patterns = by_scene.setdefault((c.channel, c.plane_mm), {})
+        patterns.setdefault(c.pattern, {})[c.exposure_ms] = c
     # Patterns of one kind often follow each other: spread the choice over the whole list.
-    columns = [[column[i] for i in _spread(len(column))] for column in columns]
+    spread = [[list(each.values())[i] for i in _spread(len(each))] for each in by_scene.values()]
+    columns = [[list(own.values())[k % len(own)] for k, own in enumerate(column)] for column in spread]
     columns = [sorted(column, key=lambda c: c is first) for column in columns]
     needed = max(len(columns), min(most, FIT_PIXELS * max(1, len(columns)) // max(1, pixels)))
     chosen: list[Capture] = []

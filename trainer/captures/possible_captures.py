@@ -87,7 +87,7 @@ def possible_captures(
     for channel, plane in scenes:
         if not _in_reach(bench, channel, plane):
             continue
-        usual = usual_exposure_ms(captures, channel)
+        usual = captures.usual_exposure_ms(channel)
         exposures = tuple(float(f"{usual * f:.4g}") for f in EXPOSURES)
         exposures = tuple(e for e in exposures if limits_ms[0] <= e <= limits_ms[1]) or (usual,)
         place = int(np.argmin([abs(e - usual) for e in exposures]))
@@ -113,12 +113,6 @@ def _in_reach(bench: Bench, channel: str, plane_mm: float) -> bool:
     except InputError:
         return False
     return True
-
-
-def usual_exposure_ms(captures: CaptureSet, channel: str) -> float:
-    """Median exposure of a colour's captures, or of all where there are none of this colour."""
-    own = [c.exposure_ms for c in captures.captures if c.channel == channel]
-    return float(np.median(own or [c.exposure_ms for c in captures.captures]))
 
 
 def _turns_taken(captures: Sequence[Capture]) -> Counter[str]:

@@ -3,7 +3,7 @@
 Near the axis, light from a panel of pixels arrives by wavelength x distance / pitch^2 alone. So at one plane a wrong
 distance, wavelength or pixel pitch is one number. Another plane tells a distance that is off by the same length
 everywhere from the other two; a second colour tells one wrong wavelength from a wrong pitch. Stray light that is the
-same everywhere adds counts as a wrong black level does.
+same everywhere adds counts as a wrong black level does; captures at several exposures tell the two apart.
 """
 
 from __future__ import annotations
@@ -89,7 +89,10 @@ class EqualFacts:
     def deciding_captures(self) -> list[str]:
         """Captures that would tell which fact it is, as sentences."""
         if self.effect == "stray_light":
-            return ["one capture with the laser off: what it shows is the black level, not stray light"]
+            return [
+                "one capture with the laser off: what it shows is the black level, not stray light",
+                "the same pattern at another exposure: light grows with it, and a black level does not",
+            ]
         if not self.facts or len(self.planes_mm) > 1:
             return []
         near, far = (f"{self.planes_mm[0] * share:.3g}" for share in PLANES)
@@ -132,7 +135,10 @@ def _black_level(model: Model, planes: tuple[float, ...]) -> EqualFacts:
         return EqualFacts()
     counts = np.atleast_1d(present.values["counts"])
     same, error = float(counts[0]), 0.0 if present.errors is None else float(present.errors["counts"][0])
-    if same**2 < FLAT * float((counts**2).sum()) or abs(same) <= ALIKE * error:
+    flat = same**2 >= FLAT * float((counts**2).sum())
+    if present.errors is not None and np.isfinite(present.errors["constant"]):  # told by several exposures
+        same, error, flat = float(present.values["constant"]), float(present.errors["constant"]), True
+    if not flat or abs(same) <= ALIKE * error:
         return EqualFacts()
     stated = float(camera.black_level)
     return EqualFacts("stray_light", (EqualFact("camera.black_level", stated, stated + same, error),), planes)

@@ -26,9 +26,8 @@ from torch import Tensor
 
 from firmware_iface.errors import InputError
 from trainer.captures.batches import EARLIER, Batch, in_view, load_batch
-from trainer.captures.bench_file import Camera
 from trainer.captures.camera_noise import noise_variance
-from trainer.captures.capture_set import chosen, opened
+from trainer.captures.capture_set import CaptureSet, chosen, opened
 from trainer.captures.possible_captures import PossibleCapture
 from trainer.device import array_of
 from trainer.diagnosis.separate import with_all_gains
@@ -113,7 +112,7 @@ def information_of_possible(
     earlier = np.stack([last[min(k, len(last) - 1)] for k in range(EARLIER)]).astype(np.int32)
     with torch.no_grad():
         try:
-            batch = _imagined(one, model, captures.noise_camera(), torch.as_tensor(earlier))
+            batch = _imagined(one, model, captures, torch.as_tensor(earlier))
             return _information(batch, model, rivals, unexplained)
         except OwnEffectError:
             raise
@@ -121,9 +120,9 @@ def information_of_possible(
             return []
 
 
-def _imagined(one: PossibleCapture, model: Model, camera: Camera, earlier: Tensor) -> Batch:
+def _imagined(one: PossibleCapture, model: Model, captures: CaptureSet, earlier: Tensor) -> Batch:
     """The captures of one pattern at several exposures as the model predicts them: [1, H, W] gray, [B, h, w] counts."""
-    model = with_all_gains(model, one.channel)
+    model, camera = with_all_gains(model, one.channel), captures.noise_camera()
     exposure = torch.tensor(one.exposures_ms, dtype=torch.float32)
     nothing = torch.zeros((len(exposure), *camera.shape))
     batch = Batch(
@@ -135,12 +134,12 @@ def _imagined(one: PossibleCapture, model: Model, camera: Camera, earlier: Tenso
         nothing,
         nothing,
         exposure,
+        captures.usual_exposure_ms(one.channel),
         functools.cache(lambda: earlier[None]),
     )
     predictor = Predictor(model, batch)
     light = predictor.light(model, predictor.trace(model))
-    gain = model.gain[one.channel] * exposure[:, None, None]
-    signal = counts(predictor.scene, predictor.stages(model), light, gain, None)
+    signal = counts(predictor.scene, predictor.stages(model), light, predictor.gain(model), None)
     noise = torch.as_tensor(noise_variance(array_of(signal), camera), dtype=torch.float32)
     mask = (signal + CLEAR * noise.sqrt() < camera.full_scale).to(torch.float32)
     view = in_view(model.bench)

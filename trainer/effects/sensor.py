@@ -207,22 +207,31 @@ def vignetting(sensor: Sensor, log_gain: Tensor) -> Sensor:
             about="of the added light: what follows the laser's power from capture to capture",
             typical=(0, 1),
         ),
+        Parameter(
+            "constant",
+            "counts",
+            scale=3.0,
+            low=-4000,
+            high=60000,
+            about="of the added counts: what does not grow with the exposure, as of a wrong black level",
+            typical=(-400, 400),
+        ),
     ],
-    formula=r"N'_k = N_k + [1 + s\,(g_k - 1)]\,\sum_{i,j}\,b_{ij}\,P_i(y)\,P_j(x)",
+    formula=r"N'_k = N_k + (1 - t_k)\,c + t_k\,[1 + s\,(g_k - 1)]\,\sum_{i,j}\,b_{ij}\,P_i(y)\,P_j(x)",
 )
-def stray_light(sensor: Sensor, counts: Tensor, laser_share: Tensor) -> Sensor:
+def stray_light(sensor: Sensor, counts: Tensor, laser_share: Tensor, constant: Tensor) -> Sensor:
     """Light is simply added, smooth over the picture.
 
     Room light, glare in the camera's lens or a black level that is wrong add counts that no pattern controls. Dark
     places show it first. Glare is the laser's own light: where the laser's power varies (`laser_drift`), so does the
-    glare.
+    glare. Counts are those at the usual exposure t_k = 1: light grows with the exposure, and a black level does not.
 
     References
     ----------
     Talvala et al. 2007, Veiling glare in high dynamic range imaging, ACM Trans. Graph. 26, 37.
     """
     added = sensor.brightened(legendre_surface(counts, sensor.y, sensor.x, lowest=0))
-    return replace(added, laser_share=laser_share)
+    return replace(added, laser_share=laser_share, constant=constant)
 
 
 def _bent(sensor: Sensor, deviation: Tensor) -> Sensor:

@@ -22,6 +22,7 @@ from trainer.model.model import Model
 from trainer.prediction.camera_light import counts, light_on_camera, motion_on_camera
 from trainer.prediction.free_stages import FreeFormStage, Tensors
 from trainer.prediction.predict import trace
+from trainer.prediction.scene import Stages
 
 HISTORY = 10  # steps that L-BFGS keeps
 PATIENCE = 3  # rounds without progress on the captures that say when to stop
@@ -40,11 +41,15 @@ class FreeFormBatch:
         self.predictor = Predictor(model, batch)
         self.batch = batch
         self.weight = batch.mask if inverse_variance is None else batch.mask * inverse_variance
-        shared = [stages for _, stages in self.predictor.parts(model)]
-        self.stages = shared if model.in_time else shared * len(batch.ids)
+        parts = [stages for _, stages in self.predictor.parts(model)]
+        self.stages = parts if model.in_time else self._at_exposures(parts[0])
         self.gain = self.predictor.gain(model)
         with torch.no_grad():
             self.base = self.predictor.trace(model)
+
+    def _at_exposures(self, stages: Stages) -> list[Stages]:
+        """The stages that all captures share, for each of them."""
+        return [self.predictor.exposed(stages, slice(k, k + 1)) for k in range(len(self.batch.ids))]
 
     def predict(self, free: FreeFormStage, tensors: Tensors, k: int) -> Tensor:
         """Counts [1, h, w] of capture k."""

@@ -38,7 +38,7 @@ def with_gain(model: Model, predictors: Sequence[Predictor], lights: Sequence[Te
             linear = replace(stages.sensor, offset=None, response=None, free_capture_gain=False)
             plain = replace(stages, sensor=linear)
             ones.append(counts(predictor.scene, plain, light[part], exposed[part], None))
-            signal, added = batch.signal[part], stages.sensor.offset
+            signal, added = batch.signal[part], stages.sensor.added
             signals.append(signal if added is None else signal - added)
         one, light_counts = batch.as_compared(torch.cat(ones)), torch.cat(signals)
         total = sums.setdefault(batch.channel, [0.0, 0.0])

@@ -21,7 +21,6 @@ from trainer.effects.definition import STAGES
 from trainer.fitting.jacobian import STEP, unweighted, weighted
 from trainer.fitting.predictor import Predictor
 from trainer.model.model import EffectInstance, Model
-from trainer.model.model_stages import stages_of
 from trainer.prediction.camera_light import counts, light_on_camera, motion_on_camera
 from trainer.prediction.predict import Trace, trace
 
@@ -179,8 +178,7 @@ class ManySlopes:
             tensors.setdefault(name, {})[parameter] = value
         batch, before = q.batch, point.of(k)
         with torch.enable_grad():
-            moment = batch.moments[k] if batch.moments else None
-            stages = stages_of(q.scene, self.model, tensors, moment)
+            stages = q.stages(self.model, k, tensors)
             earlier = q.earlier(stages, k)
             image = trace(q.scene, stages, batch.gray[k : k + 1], self.first, before, earlier).image
             gain = self.model.gain[batch.channel] * batch.exposure[k : k + 1, None, None]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import weakref
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,6 +16,7 @@ from trainer.captures.batches import Batch, load_batch
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.capture_table import Capture
 from trainer.fitting.side_by_side import side_by_side
+from trainer.kept_results import kept_for_same
 from trainer.model.model import Model
 from trainer.model.model_stages import scene_for, stages_of
 from trainer.prediction.camera_light import (
@@ -28,6 +30,13 @@ from trainer.prediction.capture_gain import own_gain
 from trainer.prediction.capture_motion import Motion, MotionNearby
 from trainer.prediction.predict import Trace, trace
 from trainer.prediction.scene import Scene, Stages
+from trainer.prediction.stages import Sensor
+
+
+@kept_for_same(2)  # what is kept for a sensor is found again where all captures share it
+def _exposed(sensor: Sensor, exposure: Tensor) -> Sensor:
+    return replace(sensor, exposure=exposure)
+
 
 NearMotions = list[MotionNearby | None]  # of each part of a batch
 
@@ -49,12 +58,29 @@ class Predictor:
     def __init__(self, model: Model, batch: Batch) -> None:
         self.scene: Scene = scene_for(model, batch.channel, batch.plane_mm, batch.signal.dtype)
         self.batch = batch
+        exposure = batch.exposure / batch.usual_exposure
+        self._exposure = None if bool((exposure == 1).all()) else exposure[:, None, None]
         self._kept: deque[_Moving] = deque(maxlen=2)
 
-    def stages(self, model: Model, k: int = 0) -> Stages:
-        """The scene's stages under a model, at the moment of capture k."""
+    def stages(self, model: Model, k: int | None = None, tensors: Any = None) -> Stages:
+        """The scene's stages under a model for capture k, or for all: at the moment of the first, where that matters.
+
+        Parameters
+        ----------
+        tensors : mapping, optional
+            As in `trainer.model.model_stages.stages_for`.
+        """
         moments = self.batch.moments
-        return stages_of(self.scene, model, moment=moments[k] if moments else None)
+        stages = stages_of(self.scene, model, tensors, moments[k or 0] if moments else None)
+        return self.exposed(stages, slice(None) if k is None else slice(k, k + 1))
+
+    def exposed(self, stages: Stages, part: slice) -> Stages:
+        """The stages with a sensor that knows the exposures of some captures, where these change what light it adds."""
+        exposure = self._exposure
+        if exposure is None or stages.sensor.constant is None:
+            return stages
+        own = exposure if part == slice(None) else exposure[part]
+        return replace(stages, sensor=_exposed(stages.sensor, own))
 
     def has_own_gains(self, model: Model) -> bool:
         """Whether each capture has its own gain; the colour's then only says what light of the laser is counted in."""

@@ -254,7 +254,7 @@ def straight_signal(sensor: Sensor, observed: Tensor, weight: Tensor) -> tuple[T
         slope = ((curve[k] - curve[k - 1]) / step).clamp(min=FLAT)
         observed = (shares[k - 1] + (seen - curve[k - 1]) / slope) * sensor.full_scale
         weight = weight * slope**2
-    return (observed if sensor.offset is None else observed - sensor.offset), weight
+    return (observed if (added := sensor.added) is None else observed - added), weight
 
 
 def _sum(pictures: Tensor) -> Tensor:

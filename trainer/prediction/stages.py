@@ -274,6 +274,10 @@ class Sensor:
     offset : Tensor [h, w] or None, counts
     laser_share : Tensor or None
         Of `offset`: what follows each capture's own gain, as light of the laser does.
+    constant : Tensor or None, counts
+        Of `offset`: what does not grow with the exposure; None where nothing does.
+    exposure : Tensor [B, 1, 1] or None
+        Each capture's exposure over the usual one; None where all have that.
     response : callable or None
         A function of the signal as a share of full scale.
     free_capture_gain : bool
@@ -297,29 +301,40 @@ class Sensor:
     gain: Tensor | None = None
     offset: Tensor | None = None
     laser_share: Tensor | None = None
+    constant: Tensor | None = None
+    exposure: Tensor | None = None
     response: Callable[[Tensor], Tensor] | None = None
     free_capture_gain: bool = False
     free_capture_shift: bool = False
     capture_blur: Callable[[Tensor], Tensor] | None = None
 
     @property
+    def added(self) -> Tensor | None:
+        """`offset` at each capture's exposure, counts [h, w] or [B, h, w]."""
+        if self.offset is None or self.constant is None or self.exposure is None:
+            return self.offset
+        return (1 - self.exposure) * self.constant + self.exposure * self.offset
+
+    @property
     def added_by_laser(self) -> Tensor | None:
-        """The part of `offset` that follows each capture's own gain, counts."""
-        share = self.laser_share
-        return None if share is None or self.offset is None else self.offset * share
+        """The part of `added` that follows each capture's own gain, counts."""
+        if self.laser_share is None or self.offset is None:
+            return None
+        usual = self.offset * self.laser_share
+        return usual if self.exposure is None else usual * self.exposure
 
     @property
     def added_always(self) -> Tensor | None:
-        """The part of `offset` that is the same in every capture, counts."""
-        laser = self.added_by_laser
-        return self.offset if laser is None or self.offset is None else self.offset - laser
+        """The part of `added` that does not follow the captures' own gains, counts."""
+        laser, added = self.added_by_laser, self.added
+        return added if laser is None or added is None else added - laser
 
     def as_bright(self, own: Tensor) -> Sensor:
         """The sensor of captures whose own gain is known: the light that it adds to them."""
         laser, always = self.added_by_laser, self.added_always
         if laser is None or always is None:
             return self
-        return replace(self, offset=own * laser + always, laser_share=None)
+        return replace(self, offset=own * laser + always, laser_share=None, constant=None)
 
     @property
     def moves(self) -> bool:
