@@ -91,5 +91,7 @@ def test_a_wrong_black_level_is_the_same_at_every_exposure(tmp_path: Path) -> No
     stray = found.model.instance("stray_light")
     assert float(stray.values["counts"][0]) == pytest.approx(50, abs=2)
     assert float(stray.values["constant"]) == pytest.approx(50, abs=2)
-    (fact,) = equal_facts(found.model, read_captures(folder)).facts
+    same = equal_facts(found.model, read_captures(folder))
+    (fact,) = same.facts
+    assert same.told and not same.deciding_captures
     assert fact.fact == "camera.black_level" and fact.value == pytest.approx(64, abs=2)

@@ -68,11 +68,14 @@ class EqualFacts:
         Empty for none.
     planes_mm : tuple of float, mm
         Of the captures.
+    told : bool
+        The captures tell that it is the fact.
     """
 
     effect: str = ""
     facts: tuple[EqualFact, ...] = ()
     planes_mm: tuple[float, ...] = ()
+    told: bool = False
 
     @property
     def sentence(self) -> str:
@@ -80,6 +83,8 @@ class EqualFacts:
         if not self.facts:
             return ""
         facts = " or ".join(map(str, self.facts))
+        if self.told:
+            return f"By what is the same at every exposure, bench.toml errs: {facts}."
         if self.effect == "distance":
             return f"At one plane this distance cannot be told from {facts} in bench.toml."
         words = "stray light" if self.effect == "stray_light" else "the wavelength"
@@ -88,6 +93,8 @@ class EqualFacts:
     @property
     def deciding_captures(self) -> list[str]:
         """Captures that would tell which fact it is, as sentences."""
+        if self.told:
+            return []
         if self.effect == "stray_light":
             return [
                 "one capture with the laser off: what it shows is the black level, not stray light",
@@ -129,19 +136,24 @@ def equal_facts(model: Model, captures: CaptureSet) -> EqualFacts:
 
 
 def _black_level(model: Model, planes: tuple[float, ...]) -> EqualFacts:
-    """The black level that would explain stray light which is nearly the same everywhere."""
+    """The black level that would explain stray light which is nearly the same everywhere, or at every exposure."""
     present, camera = model.instance("stray_light"), model.bench.camera
     if present.effect.in_common is not None:  # one camera has one black level for all colours
         return EqualFacts()
     counts = np.atleast_1d(present.values["counts"])
-    same, error = float(counts[0]), 0.0 if present.errors is None else float(present.errors["counts"][0])
-    flat = same**2 >= FLAT * float((counts**2).sum())
-    if present.errors is not None and np.isfinite(present.errors["constant"]):  # told by several exposures
-        same, error, flat = float(present.values["constant"]), float(present.errors["constant"]), True
-    if not flat or abs(same) <= ALIKE * error:
+    told = present.errors is not None and bool(
+        np.isfinite(present.errors["constant"])
+    )  # by several exposures
+    flat = float(counts[0]) ** 2 >= FLAT * float((counts**2).sum())
+    name = "constant" if told else "counts"
+    same, error = (
+        0.0 if v is None else float(np.atleast_1d(v[name])[0]) for v in (present.values, present.errors)
+    )
+    if not (told or flat) or abs(same) <= ALIKE * error:
         return EqualFacts()
     stated = float(camera.black_level)
-    return EqualFacts("stray_light", (EqualFact("camera.black_level", stated, stated + same, error),), planes)
+    fact = EqualFact("camera.black_level", stated, stated + same, error)
+    return EqualFacts("stray_light", (fact,), planes, told)
 
 
 def _relative_error(model: Model, name: str, stated: float) -> float:
