@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
-from scipy.ndimage import gaussian_filter, shift
+from scipy.ndimage import fourier_shift, gaussian_filter, shift
 
 from trainer.prediction.capture_motion import measured_motion, motion_nearby
 from trainer.prediction.stages import Sensor
@@ -42,6 +43,18 @@ def test_a_captures_blur_is_found_however_much_wider_than_the_usual_one(share: f
     motion = measured_motion(sensor_that(blurs=True), torch.fft.rfft2(sharp), read, measured)
     assert motion.blur is not None
     assert motion.blur.item() == pytest.approx(share, rel=0.015, abs=0.01)
+
+
+@pytest.mark.parametrize("moved", [(0.1, -0.2), (0.8, 0.9), (-2.3, 5.6)])
+def test_a_displacement_is_found_however_many_speckles_it_is(moved: tuple[float, float]) -> None:
+    """Speckle of a pixel's size says nothing of where it is when it is a pixel off."""
+    fine = gaussian_filter(speckle(4)[0].numpy(), 0.6, mode="wrap")
+    seen = torch.as_tensor(fourier_shift(np.fft.fft2(fine), moved))
+    measured = (3 * torch.fft.ifft2(seen).real.float()[None], torch.ones(1, SIDE, SIDE))
+    spectrum = torch.fft.rfft2(torch.as_tensor(fine)[None])
+    motion = measured_motion(sensor_that(moves=True), spectrum, read, measured)
+    assert motion.shift is not None
+    assert motion.shift[0].tolist() == pytest.approx([-moved[0], -moved[1]], abs=0.01)
 
 
 @pytest.mark.parametrize("share", [0.5, 1.6])
@@ -90,3 +103,15 @@ def test_near_a_model_a_captures_motion_takes_up_what_looks_like_more_of_it(
     exactly = read(changed * again.filter(sensor))
     error = (near.light_of(sensor, changed, read) - exactly).norm()
     assert error < 0.1 * (held - exactly).norm()
+
+
+def test_a_change_that_is_one_of_the_captures_motions_is_none() -> None:
+    """What rounding leaves of it would let a fit walk far with a number that captures say nothing of."""
+    sensor, spectrum = sensor_that(moves=True), torch.fft.rfft2(speckle(4))
+    seen = torch.polar(torch.ones(SIDE, SIDE // 2 + 1), 2 * math.pi * (0.3 * IY - 0.2 * IX))
+    measured = (3 * read(spectrum * seen), torch.ones(1, SIDE, SIDE))
+    motion = measured_motion(sensor, spectrum, read, measured)
+    near = motion_nearby(sensor, spectrum, read, measured, motion)
+    farther = torch.polar(torch.ones(SIDE, SIDE // 2 + 1), 2 * math.pi * (0.005 * IY - 0.003 * IX))
+    before, after = (near.light_of(sensor, s, read) for s in (spectrum, spectrum * farther))
+    assert (after - before).norm() < 1e-6 * before.norm()

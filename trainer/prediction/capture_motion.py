@@ -15,12 +15,19 @@ from torch import Tensor
 from trainer.kept_results import kept_by_device
 from trainer.prediction.stages import Sensor
 
-STEPS = 3  # of Gauss-Newton; displacements are a small part of a speckle
+STEPS = 6  # of Gauss-Newton, from where a displacement is off by a part of a speckle at most
 MOST = 1.0  # panel pixels that one step may move
+ARRIVED = 0.01  # panel pixels: the next step would be the square of this
+# Displacements along rows and columns at which pictures are correlated to find such a place, panel pixels.
+TRIED_SHIFTS = np.linspace(-8, 8, 65)
+BLIND = 0.8  # share of the highest correlation from which Gauss-Newton finds there by itself
 # Widths of blurs, as shares of the usual one: the widest at first, and in the end, where the widest fits best.
 WIDEST_BLUR, LIMIT = 2.4, 9.6
 NEARLY_WIDEST = 0.95
 TRIED_BLURS = 6, 2.1  # how many between two widths: a few, and so many more a usual width
+# Where the captures' motions leave less than this share of a change, it is one of theirs, and what is left is rounding,
+# with which fits would walk far.
+MOTION_ALONE = 0.02
 BLUR_STEP = 0.05  # for derivatives, share of the usual width
 RESPONSE = -0.1, 1.5, 2049  # shares of full scale between which a response is turned back, and how many
 FLAT = 0.05  # least slope that a response is turned back with
@@ -74,9 +81,12 @@ def measured_motion(
         spectrum, shift, blur = spectrum.detach(), None, None
         signal = straight_signal(sensor, *measured)
         if sensor.free_capture_shift:
-            shift = torch.zeros((*spectrum.shape[:-2], 2), dtype=sensor.iy.dtype)
+            shift = _far_shift(sensor, spectrum, read, *signal)
             for _ in range(STEPS):
-                shift = shift + _step(sensor, spectrum * _ramp(sensor, shift), read, *signal)
+                step = _step(sensor, spectrum * _ramp(sensor, shift), read, *signal)
+                shift = shift + step
+                if float(step.abs().max()) < ARRIVED:
+                    break
             spectrum = spectrum * _ramp(sensor, shift)
         if sensor.capture_blur is not None:
             blur = _blur(sensor, sensor.capture_blur, spectrum, read, *signal)
@@ -138,7 +148,11 @@ class MotionNearby:
         signal, _ = straight_signal(sensor, *self.measured)
         change = _on_sensor(sensor, light) - signal / self.counts - self.beyond
         taken_up = self.inverse @ (self.weighted @ change.flatten(1)[:, :, None]).double()
-        return light - (taken_up[:, :-1].to(light.dtype).mT @ self.slopes).reshape(light.shape)
+        followed = (taken_up[:, :-1].to(light.dtype).mT @ self.slopes).reshape(light.shape)
+        left = torch.linalg.vector_norm(change - _on_sensor(sensor, followed))
+        if left < MOTION_ALONE * torch.linalg.vector_norm(change):
+            followed = change if sensor.gain is None else change / sensor.gain
+        return light - followed
 
 
 def motion_nearby(
@@ -269,6 +283,32 @@ def _ramp(sensor: Sensor, shift: Tensor) -> Tensor:
     """Transfer functions of displacements [B, 2], panel pixels: light of a place that much farther on."""
     angle = 2 * math.pi * (sensor.iy * shift[..., :1, None] + sensor.ix * shift[..., 1:, None])
     return torch.polar(torch.ones_like(angle), angle)
+
+
+def _far_shift(
+    sensor: Sensor, spectrum: Tensor, read: Callable[[Tensor], Tensor], signal: Tensor, weight: Tensor
+) -> Tensor:
+    """Displacements [B, 2] with which pictures correlate best with what is measured; 0 where that is as good."""
+    mean = _sum(weight * signal) / _sum(weight).clamp(min=1e-30)
+    contrast = weight * (signal - mean[:, None, None].to(signal.dtype))
+    with torch.enable_grad():
+        # Reading is linear, so its derivative brings what is measured to where the spectrum is.
+        at_rest = spectrum.detach().requires_grad_()
+        (brought,) = torch.autograd.grad((contrast * _on_sensor(sensor, read(at_rest))).sum(), at_rest)
+    tried = torch.as_tensor(TRIED_SHIFTS, dtype=sensor.iy.dtype)
+    down, across = (
+        torch.polar(torch.ones_like(a), a) for a in (_angle(sensor.iy.mT, tried), _angle(sensor.ix, tried))
+    )
+    correlation = (down @ (brought.conj() * spectrum) @ across.mT).real.flatten(1)
+    highest, place = correlation.max(1)
+    best = torch.stack([tried[place // len(tried)], tried[place % len(tried)]], 1)
+    at_zero = correlation[:, correlation.shape[1] // 2]
+    return torch.where((at_zero >= BLIND * highest)[:, None], torch.zeros_like(best), best)
+
+
+def _angle(frequencies: Tensor, shifts: Tensor) -> Tensor:
+    """Phase [K, n] of displacements [K] at frequencies [1, n]."""
+    return 2 * math.pi * shifts[:, None] * frequencies
 
 
 def _step(
