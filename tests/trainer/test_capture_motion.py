@@ -57,6 +57,16 @@ def test_a_displacement_is_found_however_many_speckles_it_is(moved: tuple[float,
     assert motion.shift[0].tolist() == pytest.approx([-moved[0], -moved[1]], abs=0.01)
 
 
+def test_of_the_places_where_a_grating_looks_alike_the_nearest_is_found() -> None:
+    lines = (0.5 + 0.5 * torch.cos(2 * math.pi * torch.arange(SIDE) / 4)).expand(1, SIDE, SIDE)
+    spectrum = torch.fft.rfft2(lines)
+    moved = torch.polar(torch.ones(SIDE, SIDE // 2 + 1), 2 * math.pi * (1.2 * IX + 0 * IY))
+    measured = (2 * read(spectrum * moved), torch.ones(1, SIDE, SIDE))
+    motion = measured_motion(sensor_that(moves=True), spectrum, read, measured)
+    assert motion.shift is not None
+    assert motion.shift[0].tolist() == pytest.approx([0, 1.2], abs=0.01)
+
+
 @pytest.mark.parametrize("share", [0.5, 1.6])
 def test_a_blur_is_found_through_a_bent_response_and_added_light(share: float) -> None:
     """Counts of bright places that are too low look like a wider blur."""

@@ -103,8 +103,8 @@ def vibration(sensor: Sensor, rms: Tensor, direction: Tensor, kurtosis: Tensor) 
 def frame_motion(sensor: Sensor, spread: Tensor) -> Sensor:
     """The camera moves from capture to capture: each capture has its own displacement, measured from it.
 
-    The mount creeps, or somebody touches the table between captures. Each picture as a whole lies a fraction of a
-    pixel elsewhere.
+    The mount creeps, or somebody touches the table between captures. Each picture as a whole lies elsewhere, by a
+    fraction of a pixel or by some; up to 8 panel pixels are found.
     """
     return replace(sensor, free_capture_shift=sensor.free_capture_shift or bool(spread != 0))
 

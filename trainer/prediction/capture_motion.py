@@ -21,6 +21,7 @@ ARRIVED = 0.01  # panel pixels: the next step would be the square of this
 # Displacements along rows and columns at which pictures are correlated to find such a place, panel pixels.
 TRIED_SHIFTS = np.linspace(-8, 8, 65)
 BLIND = 0.8  # share of the highest correlation from which Gauss-Newton finds there by itself
+NEARER = 0.05  # of the correlation that the farthest place loses: gratings repeat, and of two alike the nearer is meant
 # Widths of blurs, as shares of the usual one: the widest at first, and in the end, where the widest fits best.
 WIDEST_BLUR, LIMIT = 2.4, 9.6
 NEARLY_WIDEST = 0.95
@@ -299,7 +300,9 @@ def _far_shift(
     down, across = (
         torch.polar(torch.ones_like(a), a) for a in (_angle(sensor.iy.mT, tried), _angle(sensor.ix, tried))
     )
-    correlation = (down @ (brought.conj() * spectrum) @ across.mT).real.flatten(1)
+    loss = NEARER * (tried / tried[-1]) ** 2 / 2
+    correlation = (down @ (brought.conj() * spectrum) @ across.mT).real
+    correlation = (correlation * (1 - loss[:, None] - loss)).flatten(1)
     highest, place = correlation.max(1)
     best = torch.stack([tried[place // len(tried)], tried[place % len(tried)]], 1)
     at_zero = correlation[:, correlation.shape[1] // 2]
