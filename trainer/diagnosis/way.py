@@ -366,16 +366,17 @@ class Way:
             old, new, model, errors = better
             del alike[old]
             self._become(model, errors, added=new, removed=old)
-        simpler = one_for_two(self._roles, self.model, self.errors, self._rivals, *judged)
-        if simpler is not None:
-            new, old, other, model, errors = simpler
-            self._become(model, errors, added=new, removed=old)
-            self._become(self.model, errors, removed=other)
         # A last pass: of every effect but the newest it is known already that the rest cannot do without it.
         newest = self.steps[-1].added
         if len(self.model.names) > 1:
             progress(0.9, "looking which effects are needed no longer")
             self._leave_out([newest] if newest else [])
+        # After that pass: one that is needed and one that is not are no reason to put a third in the place of both.
+        simpler = one_for_two(self._roles, self.model, self.errors, self._rivals, *judged)
+        if simpler is not None:
+            new, old, other, model, errors = simpler
+            self._become(model, errors, added=new, removed=old)
+            self._become(self.model, errors, removed=other)
         while common := one_in_common(self._roles, self.model, self.errors, *judged):
             name, model, errors = common
             self._become(model, errors, refined=name, form=IN_COMMON)
