@@ -115,13 +115,18 @@ def test_near_a_model_a_captures_motion_takes_up_what_looks_like_more_of_it(
     assert error < 0.1 * (held - exactly).norm()
 
 
-def test_a_change_that_is_one_of_the_captures_motions_is_none() -> None:
+@pytest.mark.parametrize("dead_pixel", [False, True])
+def test_a_change_that_is_one_of_the_captures_motions_is_none(dead_pixel: bool) -> None:
     """What rounding leaves of it would let a fit walk far with a number that captures say nothing of."""
     sensor, spectrum = sensor_that(moves=True), torch.fft.rfft2(speckle(4))
+    gain = torch.ones(SIDE, SIDE)
+    if dead_pixel:
+        gain[3, 5] = 0
+        sensor = sensor.multiplied(gain)
     seen = torch.polar(torch.ones(SIDE, SIDE // 2 + 1), 2 * math.pi * (0.3 * IY - 0.2 * IX))
-    measured = (3 * read(spectrum * seen), torch.ones(1, SIDE, SIDE))
+    measured = (3 * gain * read(spectrum * seen), torch.ones(1, SIDE, SIDE))
     motion = measured_motion(sensor, spectrum, read, measured)
     near = motion_nearby(sensor, spectrum, read, measured, motion)
     farther = torch.polar(torch.ones(SIDE, SIDE // 2 + 1), 2 * math.pi * (0.005 * IY - 0.003 * IX))
-    before, after = (near.light_of(sensor, s, read) for s in (spectrum, spectrum * farther))
+    before, after = (gain * near.light_of(sensor, s, read) for s in (spectrum, spectrum * farther))
     assert (after - before).norm() < 1e-6 * before.norm()

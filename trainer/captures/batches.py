@@ -45,7 +45,7 @@ class Batch:
         Expected variance of the camera's noise.
     exposure : Tensor [B], ms
     usual_exposure : float, ms
-        The usual one of the colour, of which added light is counted.
+        The usual one of the colour, at which added light is counted.
     shown_before : callable
         Gives the patterns shown before each capture, the last one first: int Tensor [B, EARLIER, H, W]. They are read
         when first asked for.

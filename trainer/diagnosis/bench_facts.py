@@ -84,7 +84,7 @@ class EqualFacts:
             return ""
         facts = " or ".join(map(str, self.facts))
         if self.told:
-            return f"By what is the same at every exposure, bench.toml errs: {facts}."
+            return f"The same counts are added at every exposure: bench.toml should have {facts}."
         if self.effect == "distance":
             return f"At one plane this distance cannot be told from {facts} in bench.toml."
         words = "stray light" if self.effect == "stray_light" else "the wavelength"

@@ -22,7 +22,6 @@ from trainer.model.model import Model
 from trainer.prediction.camera_light import counts, light_on_camera, motion_on_camera
 from trainer.prediction.free_stages import FreeFormStage, Tensors
 from trainer.prediction.predict import trace
-from trainer.prediction.scene import Stages
 
 HISTORY = 10  # steps that L-BFGS keeps
 PATIENCE = 3  # rounds without progress on the captures that say when to stop
@@ -41,15 +40,14 @@ class FreeFormBatch:
         self.predictor = Predictor(model, batch)
         self.batch = batch
         self.weight = batch.mask if inverse_variance is None else batch.mask * inverse_variance
-        parts = [stages for _, stages in self.predictor.parts(model)]
-        self.stages = parts if model.in_time else self._at_exposures(parts[0])
+        self.stages = [stages for _, stages in self.predictor.parts(model)]
+        if not model.in_time:  # all share what `exposed` then tells apart
+            self.stages = [
+                self.predictor.exposed(self.stages[0], slice(k, k + 1)) for k in range(len(batch.ids))
+            ]
         self.gain = self.predictor.gain(model)
         with torch.no_grad():
             self.base = self.predictor.trace(model)
-
-    def _at_exposures(self, stages: Stages) -> list[Stages]:
-        """The stages that all captures share, for each of them."""
-        return [self.predictor.exposed(stages, slice(k, k + 1)) for k in range(len(self.batch.ids))]
 
     def predict(self, free: FreeFormStage, tensors: Tensors, k: int) -> Tensor:
         """Counts [1, h, w] of capture k."""

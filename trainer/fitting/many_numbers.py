@@ -181,7 +181,7 @@ class ManySlopes:
             stages = q.stages(self.model, k, tensors)
             earlier = q.earlier(stages, k)
             image = trace(q.scene, stages, batch.gray[k : k + 1], self.first, before, earlier).image
-            gain = self.model.gain[batch.channel] * batch.exposure[k : k + 1, None, None]
+            gain = q.gain(self.model)[k : k + 1]
             measured = (batch.signal[k : k + 1], batch.mask[k : k + 1])
             motion = motion_on_camera(q.scene, stages, image, measured)
             light = light_on_camera(q.scene, stages, image, motion)

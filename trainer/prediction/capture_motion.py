@@ -29,6 +29,7 @@ TRIED_BLURS = 6, 2.1  # how many between two widths: a few, and so many more a u
 # Where the captures' motions leave less than this share of a change, it is one of theirs, and what is left is rounding,
 # with which fits would walk far.
 MOTION_ALONE = 0.02
+DEAD = 1e-3  # sensitivity of a pixel below which it shows no change
 BLUR_STEP = 0.05  # for derivatives, share of the usual width
 RESPONSE = -0.1, 1.5, 2049  # shares of full scale between which a response is turned back, and how many
 FLAT = 0.05  # least slope that a response is turned back with
@@ -152,7 +153,7 @@ class MotionNearby:
         followed = (taken_up[:, :-1].to(light.dtype).mT @ self.slopes).reshape(light.shape)
         left = torch.linalg.vector_norm(change - _on_sensor(sensor, followed))
         if left < MOTION_ALONE * torch.linalg.vector_norm(change):
-            followed = change if sensor.gain is None else change / sensor.gain
+            followed = change if sensor.gain is None else change / sensor.gain.clamp(min=DEAD)
         return light - followed
 
 
@@ -282,7 +283,11 @@ def _on_sensor(sensor: Sensor, light: Tensor) -> Tensor:
 
 def _ramp(sensor: Sensor, shift: Tensor) -> Tensor:
     """Transfer functions of displacements [B, 2], panel pixels: light of a place that much farther on."""
-    angle = 2 * math.pi * (sensor.iy * shift[..., :1, None] + sensor.ix * shift[..., 1:, None])
+    return _phasors(sensor.iy * shift[..., :1, None] + sensor.ix * shift[..., 1:, None])
+
+
+def _phasors(cycles: Tensor) -> Tensor:
+    angle = 2 * math.pi * cycles
     return torch.polar(torch.ones_like(angle), angle)
 
 
@@ -297,9 +302,7 @@ def _far_shift(
         at_rest = spectrum.detach().requires_grad_()
         (brought,) = torch.autograd.grad((contrast * _on_sensor(sensor, read(at_rest))).sum(), at_rest)
     tried = torch.as_tensor(TRIED_SHIFTS, dtype=sensor.iy.dtype)
-    down, across = (
-        torch.polar(torch.ones_like(a), a) for a in (_angle(sensor.iy.mT, tried), _angle(sensor.ix, tried))
-    )
+    down, across = (_phasors(tried[:, None] * f) for f in (sensor.iy.mT, sensor.ix))
     loss = NEARER * (tried / tried[-1]) ** 2 / 2
     correlation = (down @ (brought.conj() * spectrum) @ across.mT).real
     correlation = (correlation * (1 - loss[:, None] - loss)).flatten(1)
@@ -307,11 +310,6 @@ def _far_shift(
     best = torch.stack([tried[place // len(tried)], tried[place % len(tried)]], 1)
     at_zero = correlation[:, correlation.shape[1] // 2]
     return torch.where((at_zero >= BLIND * highest)[:, None], torch.zeros_like(best), best)
-
-
-def _angle(frequencies: Tensor, shifts: Tensor) -> Tensor:
-    """Phase [K, n] of displacements [K] at frequencies [1, n]."""
-    return 2 * math.pi * shifts[:, None] * frequencies
 
 
 def _step(
