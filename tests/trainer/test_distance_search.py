@@ -30,13 +30,17 @@ UNIT_MM = 1e3 * 8e-6**2 / 520e-9
 WEAK_RESPONSE = 'kind = "phase_response"\ngain = 0.6'
 
 
-def captured(folder: Path, *defects: str) -> CaptureSet:
-    acquire_from(str(bench_file(folder, *defects, **LARGER)), folder / "captures", patterns=4, seed=1)
+def captured(folder: Path, *defects: str, **sizes: Any) -> CaptureSet:
+    bench = bench_file(folder, *defects, **{**LARGER, **sizes})
+    acquire_from(str(bench), folder / "captures", patterns=4, seed=1)
     return read_captures(folder / "captures")
 
 
 def searched(captures: CaptureSet) -> tuple[float, float, list[float]]:
-    """The distance found, the correlation there, and every distance at which a prediction was made."""
+    """The distance found, the correlation there, and every distance at which a prediction was made.
+
+    No prediction takes a grid of more than three times the panel's sides.
+    """
     (batch,) = load(captures, captures.captures[:2])
     samples = [
         Sample(i, g.numpy().astype(np.uint8), s.numpy(), m.numpy() > 0, batch.channel, batch.plane_mm)
@@ -46,9 +50,9 @@ def searched(captures: CaptureSet) -> tuple[float, float, list[float]]:
 
     def predict(bench: Bench, gray: np.ndarray, channel: str, plane_mm: float) -> np.ndarray:
         asked.append(plane_mm)
-        return bare_irradiance(
-            scene_at(bench, channel, plane_mm, "angular_spectrum", 1.0, torch.float32), gray
-        )
+        scene = scene_at(bench, channel, plane_mm, "angular_spectrum", 1.0, torch.float32)
+        assert max(scene.grid.padded) < 3 * max(scene.grid.shape)
+        return bare_irradiance(scene, gray)
 
     found = best_distance(captures.bench, samples, predict)
     assert found is not None
@@ -60,6 +64,16 @@ def test_the_distance_is_found_within_the_depth_of_focus(tmp_path: Path, offset_
     distance_mm, correlation, _ = searched(captured(tmp_path, f'kind = "distance"\noffset_mm = {offset_mm}'))
     assert distance_mm == pytest.approx(15 + offset_mm, abs=2 * UNIT_MM)
     assert correlation > 0.8
+
+
+def test_far_away_coarse_pictures_are_searched_near_the_stated_distance_first(tmp_path: Path) -> None:
+    far = 'kind = "distance"\noffset_mm = 7.0'
+    shown = {"width": 256, "height": 192, "distance_mm": 60}
+    distance_mm, correlation, asked = searched(captured(tmp_path, far, WEAK_RESPONSE, **shown))
+    assert distance_mm == pytest.approx(67, abs=4 * UNIT_MM)
+    assert correlation < 0.5
+    assert len(asked) < 70  # a search of fine pictures takes 80 to 146
+    assert max(asked) < 2.5 * 60
 
 
 def test_where_strong_faults_hide_the_picture_the_search_stays_near_the_right_distance(

@@ -309,6 +309,14 @@ def tile_correlations(
     return np.asarray(values), shift
 
 
+def beyond_chance(pixels: float) -> float:
+    """The correlation that a picture of so many pixels does not have by chance, at the best of many shifts.
+
+    About one pixel in four is an independent sample.
+    """
+    return max(R_LEAST, 5 * math.sqrt(4 / max(pixels, 1)))
+
+
 def paired_t(values: np.ndarray, reference: np.ndarray) -> float:
     """t-statistic of the mean difference of Fisher's z over tiles; 0 with fewer than four tiles."""
     if len(values) != len(reference) or len(values) < 4:

@@ -2,28 +2,46 @@
 
 A fit of the distance reaches as far as the pictures' depth of focus, a few pitch^2 / wavelength. Beyond it, the error
 has many local minima. The correlation of the ideal prediction with the measured pictures is wider: it shows the right
-distance from about 20 pitch^2 / wavelength away (2.5 mm for 8 um and 520 nm).
+distance from about 20 pitch^2 / wavelength away (2.5 mm for 8 um and 520 nm). Of pictures whose pixels are joined it is
+wider by as much as the pixels are: light that is defocused moves details of a picture, and large ones show it later. So
+far away, where depths of focus are many, coarse pictures are searched, and ever finer ones about the best place.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from firmware_iface.errors import InputError
 from trainer.captures.bench_file import Bench
-from trainer.captures.conventions import Predict, Sample, central_part, flattened, tile_correlations
+from trainer.captures.block_means import blocks
+from trainer.captures.conventions import (
+    R_RATIO,
+    Predict,
+    Sample,
+    beyond_chance,
+    central_part,
+    flattened,
+    tile_correlations,
+)
 from trainer.kept_results import forgotten_afterwards
 
 NEAREST, FARTHEST = 0.2, 5.0  # distances that are searched, as shares of the stated one
-MOST_STEPS = 120
+RINGS = (1.25, 2.0, FARTHEST)  # so far at a time, until one distance stands out
+SHOULDER = 3.0  # steps from the best one within which others fit in part
+MOST_STEPS = 64  # of the search, where pictures can be made as coarse as that takes
+SMALLEST = 64  # pixels a side that coarse pictures keep
 # Correlation from which the right distance is uphill. More than 70 pitch^2 / wavelength from it, 0.23 was the most in
 # 48 sets of 128 x 96 pixels, where chance does most; at it, strong faults leave 0.45.
 GOOD = 0.35
-NEAR = (-24.0, -8.0, 8.0, 24.0)  # tried after the stated one, pitch^2 / wavelength from it
-STEP, FINEST = 16.0, 0.5  # of the search and of its refinement, pitch^2 / wavelength
+NEAR = (-24.0, -8.0, 8.0, 24.0)  # tried after the stated one, depths of focus from it
+STEP, FINEST = 16.0, 0.5  # of the search of whole pixels and of its refinement, depths of focus
+ACROSS = 1.1  # panels that light may move aside and still reach a picture
 
 
 @dataclass(frozen=True)
@@ -42,6 +60,10 @@ class DistanceFit:
     correlation: float
 
 
+# Correlations of a sample's tiles at a distance, mm, of pictures with so many pixels joined along each axis.
+Tiles = Callable[[float, int], NDArray]
+
+
 def best_distance(
     bench: Bench, samples: Sequence[Sample], predict: Predict, finest: float = FINEST
 ) -> DistanceFit | None:
@@ -54,7 +76,7 @@ def best_distance(
         Of one colour and one stated plane. The whole range is searched on the first that has structure.
     predict : callable
         The ideal model: (bench, gray, channel, plane_mm) -> irradiance [h, w] on any scale.
-    finest : float, pitch^2 / wavelength
+    finest : float, depths of focus
         How finely the best place is searched.
 
     Returns
@@ -63,59 +85,159 @@ def best_distance(
         None where no sample has structure.
     """
     stated = samples[0].plane_mm
-    pitch, wave = bench.panel.pitch, bench.channel(samples[0].channel).wavelength
-    unit = 1e3 * pitch**2 / (wave * min(1.0, bench.iris.half_width) ** 2)
-    scores = [s for s in (_score(bench, sample, stated, predict) for sample in samples) if s is not None]
-    if not scores:
+    several = [
+        one for one in (_tiles(bench, sample, stated, predict) for sample in samples) if one is not None
+    ]
+    if not several:
         return None
+    steps = _Steps(bench, samples[0].channel, stated, min(samples[0].signal.shape) // SMALLEST)
 
-    def score(distance: float, among: int = len(scores)) -> DistanceFit:
+    def score(distance: float, joined: int = 1) -> DistanceFit:
         with forgotten_afterwards():
-            return DistanceFit(distance, float(np.mean([one(distance) for one in scores[:among]])))
+            found = [float(tiles(distance, joined).mean()) for tiles in several]
+        return DistanceFit(distance, float(np.mean(found)))
 
-    best = score(stated)
+    best, step = score(stated), STEP
     if best.correlation < GOOD:
-        best = max((best, *(score(stated + step * unit) for step in NEAR)), key=_correlation)
+        beside = (score(stated + depths * steps.depth_of_focus(stated)) for depths in NEAR)
+        best = max((best, *beside), key=_correlation)
     if best.correlation < GOOD:
-        low, high = NEAREST * abs(stated), FARTHEST * abs(stated)
-        count = int(min(MOST_STEPS, np.ceil((high - low) / (STEP * unit)))) + 1
-        # The farthest, which need most memory, first: what they leave has room for the others.
-        far = sorted(
-            (score(d, 1) for d in np.copysign(np.linspace(high, low, count), stated)), key=_correlation
-        )
-        best = max((best, *(score(one.distance_mm) for one in far[-2:])), key=_correlation)
-    step = STEP / 2
+        step = steps.coarse
+        likely = (best.distance_mm, *_likely(several[0], steps))
+        best = max((score(distance, steps.joined(step)) for distance in likely), key=_correlation)
+    step /= 2
     while step >= finest:
-        beside = max((score(best.distance_mm + sign * step * unit) for sign in (-1, 1)), key=_correlation)
-        if beside.correlation > best.correlation:
-            best = beside
+        joined, aside = steps.joined(2 * step), step * steps.depth_of_focus(best.distance_mm)
+        best = score(best.distance_mm, joined)
+        beside = (score(best.distance_mm + sign * aside, joined) for sign in (-1, 1))
+        better = max(beside, key=_correlation)
+        if better.correlation > best.correlation:
+            best = better
         else:
             step /= 2
-    return best
+    return score(best.distance_mm)
 
 
 def _correlation(one: DistanceFit) -> float:
     return one.correlation
 
 
-def _score(bench: Bench, sample: Sample, stated: float, predict: Predict) -> Callable[[float], float] | None:
-    """The mean correlation of a sample's tiles by distance, mm; None for a pattern that makes no structure."""
-    near, gray, image, valid, core = central_part(bench, replace(sample, plane_mm=FARTHEST * stated))
-    measured = flattened(image, valid)
+@dataclass(frozen=True)
+class _Steps:
+    """How far apart distances are tried, in depths of focus: the farther, the more pixels of pictures are joined.
 
-    def predicted(distance: float) -> np.ndarray:
-        made = np.asarray(predict(near, gray, sample.channel, distance), dtype=np.float32)[core]
+    Attributes
+    ----------
+    bench : Bench
+    channel : str
+    stated : float, mm
+    most : int
+        Pixels of the camera that may be joined along each axis.
+    """
+
+    bench: Bench
+    channel: str
+    stated: float
+    most: int
+
+    def depth_of_focus(self, distance: float) -> float:
+        """pitch^2 / wavelength of the light that reaches the picture, mm."""
+        panel, wave = self.bench.panel, self.bench.channel(self.channel).wavelength
+        share = min(1.0, self.bench.iris.half_width, _arriving(self.bench, self.channel, distance))
+        return 1e3 * panel.pitch**2 / (wave * share**2)
+
+    def joined(self, step: float) -> int:
+        """Pixels to join along each axis."""
+        return max(1, min(round(step / STEP / self._pixel), self.most))
+
+    @cached_property
+    def coarse(self) -> float:
+        """The step with which the whole range is searched."""
+        low, high = (share * abs(self.stated) for share in (NEAREST, FARTHEST))
+        between = np.linspace(low, high, 257)
+        whole = float(np.trapezoid([1 / self.depth_of_focus(d) for d in between], between)) / STEP
+        return STEP * max(1.0, min(whole / MOST_STEPS, self.most * self._pixel))
+
+    def beyond_chance(self, joined: int) -> float:
+        """The correlation that a picture of joined pixels does not have by chance."""
+        height, width = self.bench.camera.shape
+        return beyond_chance(height * width / joined**2)
+
+    def rings(self) -> list[list[float]]:
+        """The distances of the whole range, mm, the nearest to the stated one first."""
+        low, high = (share * abs(self.stated) for share in (NEAREST, FARTHEST))
+        found = [low]
+        while found[-1] < high:
+            found.append(found[-1] + self.coarse * self.depth_of_focus(found[-1]))
+        shares = [max(d / abs(self.stated), abs(self.stated) / d) for d in found]
+        signed = [float(np.copysign(d, self.stated)) for d in found]
+        ends = (0.0, *RINGS, np.inf)
+        return [
+            [d for d, share in zip(signed, shares, strict=True) if inner < share <= outer]
+            for inner, outer in pairwise(ends)
+        ]
+
+    @cached_property
+    def _pixel(self) -> float:
+        """Side of the camera's pixels at the picture's centre, panel pixels."""
+        y, x = ((n - 1) / 2 for n in self.bench.camera.shape)
+        there, next_one = (np.array(self.bench.camera.on_panel(y, x + k)) for k in (0.0, 1.0))
+        return float(np.linalg.norm(next_one - there))
+
+
+def _likely(tiles: Tiles, steps: _Steps) -> list[float]:
+    """The two distances, mm, at which a sample fits best, of all or of the nearer ones, where one stands out there."""
+    joined, tried = steps.joined(steps.coarse), dict[float, float]()
+    best: list[float] = []
+    for ring in steps.rings():
+        for distance in ring:
+            with forgotten_afterwards():
+                tried[distance] = float(tiles(distance, joined).mean())
+        best = sorted(tried, key=lambda d: -tried[d])[:2]
+        if best:
+            near = SHOULDER * steps.coarse * steps.depth_of_focus(best[0])
+            others = [tried[d] for d in tried if abs(d - best[0]) > near]
+            if others and tried[best[0]] > max(R_RATIO * max(others), steps.beyond_chance(joined)):
+                break
+    return best
+
+
+def _arriving(bench: Bench, channel: str, distance: float) -> float:
+    """Share of the panel's band whose light reaches a picture of the panel's size at a distance, mm."""
+    panel, wave = bench.panel, bench.channel(channel).wavelength
+    return ACROSS * max(panel.shape) * 2 * panel.pitch**2 / (wave * max(abs(distance), 1e-9) * 1e-3)
+
+
+def _tiles(bench: Bench, sample: Sample, stated: float, predict: Predict) -> Tiles | None:
+    """The correlations of a sample's tiles by distance; None for a pattern that makes no structure."""
+    near, gray, image, valid, core = central_part(bench, replace(sample, plane_mm=FARTHEST * stated))
+
+    @lru_cache(maxsize=4)  # a step asks for the best distance and the one before it again
+    def predicted(distance: float) -> NDArray:
+        # Light at higher frequencies passes by the picture, and room for it would take many times the memory.
+        half_width = min(near.iris.half_width, _arriving(near, sample.channel, distance))
+        narrowed = replace(near, iris=replace(near.iris, half_width=half_width))
+        return np.asarray(predict(narrowed, gray, sample.channel, distance), dtype=np.float32)[core]
+
+    @lru_cache(maxsize=2)
+    def measured(joined: int) -> tuple[NDArray, NDArray]:
+        good = blocks(valid.astype(float), joined) > 0.5
+        return flattened(np.nan_to_num(blocks(np.where(valid, image, np.nan), joined)), good), good
+
+    def flat(distance: float, joined: int) -> NDArray:
+        made = blocks(predicted(distance), joined)
         return flattened(made, np.ones(made.shape, bool))
 
-    if not predicted(stated).any():
+    if not flat(stated, 1).any():
         return None
 
-    def score(distance: float) -> float:
+    def tiles(distance: float, joined: int) -> NDArray:
+        picture, good = measured(joined)
         if distance * stated <= 0:
-            return -1.0
+            return np.full(1, -1.0)
         try:
-            return float(np.mean(tile_correlations(measured, valid, predicted(distance))[0]))
+            return tile_correlations(picture, good, flat(distance, joined))[0]
         except InputError:  # the sampling does not reach this plane
-            return -1.0
+            return np.full(1, -1.0)
 
-    return score
+    return tiles

@@ -6,6 +6,7 @@ is low beside the best of the set, it is correlated with the predictions of the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -13,11 +14,11 @@ from scipy import fft as spfft
 
 from trainer.captures.bench_file import Bench
 from trainer.captures.conventions import (
-    R_LEAST,
     R_RATIO,
     T_LEVEL,
     Predict,
     Sample,
+    beyond_chance,
     central_part,
     flattened,
     paired_t,
@@ -67,8 +68,7 @@ def mismatched(bench: Bench, samples: Iterable[Sample], predict: Predict) -> lis
     own = [tile_correlations(*images[k], predictions[k])[0] for k in range(count)]
     means = [float(np.mean(values)) for values in own]
     best = max(means, default=0.0)
-    # A few pixels correlate by chance, at the best of many shifts: with about one independent sample in four pixels.
-    least = max(R_LEAST, 5 * float(np.sqrt(4 / max(predictions[0].size, 1)))) if predictions else R_LEAST
+    least = beyond_chance(predictions[0].size if predictions else math.inf)
     suspects = [k for k in range(count) if means[k] < max(SUSPECT * best, least)][:MOST_SUSPECTS]
     found, fits_some = [], best >= least
     for k in suspects:
