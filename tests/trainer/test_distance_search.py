@@ -39,7 +39,7 @@ def captured(folder: Path, *defects: str, **sizes: Any) -> CaptureSet:
 def searched(captures: CaptureSet) -> tuple[float, float, list[float]]:
     """The distance found, the correlation there, and every distance at which a prediction was made.
 
-    No prediction takes a grid of more than three times the panel's sides.
+    No prediction takes a grid of more than four times the panel's sides.
     """
     (batch,) = load(captures, captures.captures[:2])
     samples = [
@@ -51,7 +51,7 @@ def searched(captures: CaptureSet) -> tuple[float, float, list[float]]:
     def predict(bench: Bench, gray: np.ndarray, channel: str, plane_mm: float) -> np.ndarray:
         asked.append(plane_mm)
         scene = scene_at(bench, channel, plane_mm, "angular_spectrum", 1.0, torch.float32)
-        assert max(scene.grid.padded) < 3 * max(scene.grid.shape)
+        assert max(scene.grid.padded) < 4 * max(scene.grid.shape)
         return bare_irradiance(scene, gray)
 
     found = best_distance(captures.bench, samples, predict)
