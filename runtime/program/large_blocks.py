@@ -7,11 +7,15 @@ by page, which can cost as much time as the arithmetic on it.
 from __future__ import annotations
 
 import ctypes
+import resource
 import sys
+from pathlib import Path
 
 # From glibc's malloc.h: mallopt's numbers, and the values that it takes as C ints.
 TRIM_THRESHOLD, TOP_PAD, MMAP_THRESHOLD = -1, -2, -3
 SETTINGS = {TRIM_THRESHOLD: 2**31 - 1, TOP_PAD: 256 * 2**20, MMAP_THRESHOLD: 2**30}
+
+MOST_IDLE = 2 * 2**30  # bytes that a process may hold while it waits
 
 
 def keep_large_blocks() -> bool:
@@ -26,9 +30,28 @@ def keep_large_blocks() -> bool:
     ----------
     mallopt(3): M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD.
     """
+    library = _glibc()
+    return library is not None and all(library.mallopt(n, value) == 1 for n, value in SETTINGS.items())
+
+
+def give_back_blocks() -> None:
+    """Give free memory back to the system, where this process holds much of it: before it waits for others.
+
+    References
+    ----------
+    malloc_trim(3).
+    """
+    library = _glibc()
+    if library is None:
+        return
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    if pages * resource.getpagesize() > MOST_IDLE:
+        library.malloc_trim(0)
+
+
+def _glibc() -> ctypes.CDLL | None:
+    """The C library, if it is glibc."""
     if not sys.platform.startswith("linux"):
-        return False
-    library = ctypes.CDLL(None)
-    if not hasattr(library, "gnu_get_libc_version"):  # musl has a mallopt that does nothing
-        return False
-    return all(library.mallopt(number, value) == 1 for number, value in SETTINGS.items())
+        return None
+    library = ctypes.CDLL(None)  # musl has a mallopt that does nothing
+    return library if hasattr(library, "gnu_get_libc_version") else None

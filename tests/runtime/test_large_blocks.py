@@ -37,3 +37,27 @@ def test_large_temporaries_are_faulted_in_once() -> None:
         for how in ("given_back", "kept")
     }
     assert faults["kept"] < 0.2 * faults["given_back"], faults
+
+
+HELD = """
+from pathlib import Path
+import numpy as np
+from runtime.program.large_blocks import give_back_blocks, keep_large_blocks
+keep_large_blocks()
+blocks = [np.ones(2**24) for _ in range(20)]  # 128 MiB each
+last = np.ones(2**20)  # below which the C library keeps what is free
+del blocks
+def held() -> float:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 2**30
+before = held()
+give_back_blocks()
+print(before, held())
+"""
+
+
+@pytest.mark.skipif(not keep_large_blocks(), reason="the C library is not glibc")
+def test_a_process_that_waits_gives_back_what_it_does_not_use() -> None:
+    run = subprocess.run([sys.executable, "-c", HELD], cwd=ROOT, check=True, capture_output=True, text=True)
+    before, after = map(float, run.stdout.split())
+    assert before > 2
+    assert after < 0.5

@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from threadpoolctl import threadpool_limits
 
 from firmware_iface.errors import InputError
-from runtime.program.large_blocks import keep_large_blocks
+from runtime.program.large_blocks import give_back_blocks, keep_large_blocks
 from runtime.program.threads import cores
 from trainer.captures.kept_pictures import keep_pictures
 
@@ -103,6 +103,7 @@ class Pool:
     def submit(self, function: Callable[..., Any], task: tuple[Any, ...]) -> Future[Any]:
         """The future of `function(*task)`, for `result`."""
         if self.elsewhere:
+            give_back_blocks()  # what this process has free, tasks may need
             return self.executor.submit(_packed, pickle.dumps((function, task)))
         return self.executor.submit(function, *task)
 
@@ -288,7 +289,9 @@ def _packed(task: bytes) -> bytes:
     keep_pictures()  # tasks carry paths, and the next one is often of the same captures
     function, arguments = pickle.loads(task)
     threadpool_limits(1, user_api="blas")  # what the task needs is loaded now
-    return pickle.dumps(function(*arguments))
+    result = pickle.dumps(function(*arguments))
+    give_back_blocks()
+    return result
 
 
 def _beginning() -> BaseContext:
