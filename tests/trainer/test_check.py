@@ -138,6 +138,27 @@ def test_left_justified_counts(copy: Path, up: object) -> None:
     assert "by 16" in check_captures(copy, flat_prediction)[0].message
 
 
+def test_the_mosaic_of_a_colour_camera_is_noticed(copy: Path) -> None:
+    filters = np.array([[0.15, 1.0], [1.0, 0.35]])  # of green light: red, green; green, blue
+
+    def mosaic(counts: np.ndarray) -> np.ndarray:
+        tiled = np.tile(filters, [(n + 1) // 2 for n in counts.shape])[: counts.shape[0], : counts.shape[1]]
+        return np.rint(64 + tiled * (counts.astype(float) - 64)).astype(np.uint16)
+
+    repaint(copy, mosaic)
+    assert found(copy)[0] == ("error", "mosaic", "")
+    (text,) = [p.message for p in check_captures(copy, flat_prediction) if p.kind == "mosaic"]
+    assert "0.15, 1.00, 1.00, 0.3" in text
+
+
+def test_one_picture_with_a_pattern_of_two_pixels_is_no_mosaic(copy: Path) -> None:
+    def striped(counts: np.ndarray) -> np.ndarray:
+        return np.where(np.arange(counts.shape[1]) % 2, counts, 64 + (counts - 64) // 2).astype(np.uint16)
+
+    repaint(copy, striped, "0002")
+    assert not [p for p in found(copy) if p[1] == "mosaic"]
+
+
 def test_left_justified_counts_of_a_dim_picture(tmp_path: Path) -> None:
     make_set(tmp_path / "set", brightness=0.003)
     repaint(tmp_path / "set", lambda a: a << 4, "0002")

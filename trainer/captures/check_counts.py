@@ -13,6 +13,7 @@ from trainer.captures.signal_present import DARK, fault_of
 
 SATURATED_SHARE = 0.03  # of the pixels at the top count
 PILE_FACTOR, PILE_LEAST = 10, 8  # pixels at a top count: times those at each count just below, and at least
+DULL = 0.75  # of the brightest quarter's light: what less is, in every capture, has a colour filter before it
 DARK_SHARE = 1e-3  # of the pixels that lie well below the stated black level
 
 
@@ -102,6 +103,38 @@ def check_top(camera: Camera, counts: np.ndarray) -> list[Problem]:
             "",
             f"{counts[top]} pixels pile up at {top}, the top count of {bits} bits, and none is above, but "
             f"camera.bit_depth = {camera.bit_depth}: write bit_depth = {bits}",
+        )
+    ]
+
+
+def quarters(counts: np.ndarray, camera: Camera) -> np.ndarray:
+    """Mean light of the four pixels of each 2 x 2, as shares of the brightest of them: [2, 2]."""
+    if min(counts.shape) < 2:
+        return np.ones((2, 2))
+    light = [[counts[i::2, j::2].mean() - camera.black_level for j in (0, 1)] for i in (0, 1)]
+    return np.array(light) / max(float(np.max(light)), 1e-9)
+
+
+def check_mosaic(shares: Sequence[np.ndarray]) -> list[Problem]:
+    """Whether the pixels have colour filters, as of a colour camera whose raw counts were saved.
+
+    Parameters
+    ----------
+    shares : sequence of float arrays [2, 2]
+        Of each capture with light, as `quarters` gives them.
+    """
+    most = np.max(shares, axis=0) if shares else np.ones((2, 2))
+    if most.min() > DULL:
+        return []
+    text = ", ".join(f"{value:.2f}" for value in most.ravel())
+    return [
+        Problem(
+            "error",
+            "mosaic",
+            "",
+            f"of every 2 x 2 pixels, some are dull in all captures (in reading order at most {text} of the brightest): "
+            "these look like the raw counts of a colour camera. Use a monochrome one, or save every second row and "
+            "column, of the brightest pixels: width and height are then half, pixel_um twice, and registered is false",
         )
     ]
 

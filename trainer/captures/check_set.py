@@ -20,7 +20,14 @@ from trainer.captures.camera_noise import RepeatNoise, compare_repeats
 from trainer.captures.camera_numbers import MEASURED_PAIRS, MOST_PAIRS, camera_by_repeats, numbers_text
 from trainer.captures.capture_table import Capture, scan_rows
 from trainer.captures.check_brackets import bracket_problems, excused
-from trainer.captures.check_counts import check_bits, check_black_level, check_brightness, check_top
+from trainer.captures.check_counts import (
+    check_bits,
+    check_black_level,
+    check_brightness,
+    check_mosaic,
+    check_top,
+    quarters,
+)
 from trainer.captures.conventions import Predict, Sample, compare_conventions
 from trainer.captures.mismatches import mismatched
 from trainer.captures.png_reader import PictureError, read_picture
@@ -50,6 +57,8 @@ class _SetStatistics:
         How many unsaturated pixels have each count.
     good : list of Capture
         Those whose counts can be used, and show light.
+    quarters : list of float array [2, 2]
+        Light of the four pixels of each 2 x 2, of each capture in `good`.
     shift : dict
         By capture id: bits by which its counts are shifted down.
     """
@@ -59,6 +68,7 @@ class _SetStatistics:
     repeats: dict[tuple[str, float, str, float], list[Capture]] = field(default_factory=dict)
     dark: np.ndarray = field(default_factory=lambda: np.zeros(65536, np.int64))
     good: list[Capture] = field(default_factory=list)
+    quarters: list[np.ndarray] = field(default_factory=list)
     shift: dict[str, int] = field(default_factory=dict)
 
 
@@ -159,6 +169,7 @@ def _one(bench: Bench, capture: Capture, statistics: _SetStatistics) -> list[Pro
     if any(p.kind == "dark" for p in brightness):
         return problems
     statistics.good.append(capture)
+    statistics.quarters.append(quarters(counts, camera))
     key = (capture.channel, capture.plane_mm, digest, capture.exposure_ms)
     statistics.repeats.setdefault(key, []).append(capture)
     return problems
@@ -186,6 +197,7 @@ def _patterns(bench: Bench, statistics: _SetStatistics) -> list[Problem]:
 def _camera(bench: Bench, statistics: _SetStatistics) -> list[Problem]:
     """The stated camera against the darkest pixels of all captures, and against repeated patterns."""
     camera, problems = bench.camera, check_top(bench.camera, statistics.dark)
+    problems += check_mosaic(statistics.quarters)
     pairs = [pair for group in statistics.repeats.values() for pair in pairwise(group)][:MOST_PAIRS]
     measured: list[tuple[str, RepeatNoise]] = []
     for a, b in pairs:

@@ -8,6 +8,7 @@ MISREAD = (
     "convention",
     "left_justified",
     "bit_depth",
+    "mosaic",
     "mismatched",
     "no_correlation",
 )  # kinds of problem after which every number is wrong
@@ -24,7 +25,7 @@ class Problem:
     kind : str
         missing_file, wrong_size, saturated, left_justified, black_level, duplicate, too_few, unknown_channel,
         unreadable, bit_depth, not_a_number, noise, pattern, dark, no_signal, camera_numbers, convention,
-        mismatched, shifted, distance, no_correlation or bracket.
+        mismatched, shifted, distance, no_correlation, mosaic or bracket.
     capture : str
         The capture's id; "" for the whole set.
     message : str
