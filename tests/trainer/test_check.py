@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from tests.trainer.made_sets import bench_tables, counted, irradiance, make_set
+from trainer.captures.acquire import acquire_from
 from trainer.captures.bench_file import Bench, read_bench
 from trainer.captures.camera_noise import black_estimate, compare_repeats
 from trainer.captures.capture_set import CaptureSet
@@ -205,6 +206,11 @@ def test_repeats_point_to_the_black_level(tmp_path: Path) -> None:
     assert repeats is not None and repeats.ratio == pytest.approx(1, abs=0.05)
     estimate = black_estimate([repeats], camera)
     assert estimate is not None and abs(estimate.level - 64) < 4 * estimate.error < 40
+
+
+def test_repeats_that_differ_by_more_than_noise_do_not_point_to_a_black_level(tmp_path: Path) -> None:
+    acquire_from("virtual:slow_response", tmp_path / "captures", patterns=4)
+    assert [p[1] for p in found(tmp_path / "captures") if p[1] != "no_correlation"] == ["noise"]
 
 
 def test_too_few_patterns_say_what_is_enough(tmp_path: Path) -> None:
