@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from tests.trainer.made_sets import make_set
 from trainer.captures.capture_table import Capture
-from trainer.captures.held_out import sample
+from trainer.captures.held_out import capture_roles, sample, split, with_patterns
 
 
 def row(number: int, pattern: str, plane_mm: float = 30.0) -> Capture:
@@ -46,3 +47,14 @@ def test_each_plane_has_a_capture_and_patterns_are_spread() -> None:
         (30.0, "p4"),
         (40.0, "p4"),
     ]
+
+
+def test_a_fit_of_large_pictures_takes_further_patterns_where_one_would_not_do(tmp_path: Path) -> None:
+    captures = make_set(tmp_path / "set", patterns=8)
+    roles = capture_roles(captures)
+    large = replace(roles, fitted=roles.fitted[:1])  # as of pictures of a million pixels
+    more = with_patterns(large, 3)
+    assert len({c.pattern for c in more.fitted}) == len(more.fitted) == 3
+    assert set(more.fitted) <= set(split(captures).fitted)
+    assert with_patterns(more, 3) is more
+    assert len(with_patterns(large, 99).fitted) == len({c.pattern for c in split(captures).fitted})

@@ -7,7 +7,7 @@ side.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -221,3 +221,11 @@ def capture_roles(captures: CaptureSet) -> CaptureRoles:
         tuple(held_out),
         divided.is_held_out,
     )
+
+
+def with_patterns(roles: CaptureRoles, fewest: int) -> CaptureRoles:
+    """The roles with at least so many patterns for fits, where the set has them: of large pictures, one is the rule."""
+    if len({c.pattern for c in roles.fitted}) >= fewest:
+        return roles
+    rows = sample(split(roles.captures).fitted, 1, fewest, roles.captures.captures[0])
+    return replace(roles, fitted=tuple(rows))

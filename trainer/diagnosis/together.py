@@ -14,7 +14,7 @@ from runtime.program.progress import Progress, no_progress, part_of
 from trainer.captures.batches import load
 from trainer.captures.capture_set import chosen, opened
 from trainer.captures.capture_table import ids_of
-from trainer.captures.held_out import CaptureRoles
+from trainer.captures.held_out import CaptureRoles, with_patterns
 from trainer.diagnosis.addition import gone_on
 from trainer.diagnosis.another_start import from_another_start
 from trainer.diagnosis.screen import ScreenResult
@@ -39,6 +39,8 @@ HELPS_ELSEWHERE = 0.1
 OTHERS = 0.1
 # `tolerance` of the fit to all captures: what numbers take up slowly is for a map, which they would hide then.
 LOOSE = 0.02
+# One pattern alone, of a few bright spots or of rings, is predicted by wrong effects together as well as by the right.
+PATTERNS = 3
 MISSED_IN = 2  # captures of a colour and plane that say which effect is missed least
 NEARLY = 0.002  # excess below which effects are where they belong: what is left is for the ladder to explain
 
@@ -101,6 +103,7 @@ def explain_together(
         None where all together leave more than half of what is missing, or of what even light leaves.
     """
     report = progress or no_progress
+    roles = with_patterns(roles, PATTERNS)
     batches = load(roles.captures, roles.fitted)
     least = thresholds.least(errors.excess)
     joint = joint_start(model, known, batches, least, part_of(report, 0.0, 0.6))

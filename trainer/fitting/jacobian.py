@@ -172,7 +172,7 @@ def columns(
         moved = predictor.predict_nearby(stepped(model, key, step), effect.stage, point, near, own)
         return slope(moved, step, effect.parameter(key[1]).scale)
 
-    result = side_by_side(of_number, keys, base[0].numel())
+    result = side_by_side(of_number, keys, max(base[0].numel(), predictor.batch.gray[0].numel()))
     if own is not None:
         result.append(kept(torch.zeros_like(base)))
     else:
