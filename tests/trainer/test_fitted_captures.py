@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from tests.trainer.made_sets import make_set
-from trainer.captures.capture_table import Capture
+from trainer.captures.capture_table import Capture, ids_of
 from trainer.captures.held_out import capture_roles, sample, split, with_patterns
 
 
@@ -55,6 +55,6 @@ def test_a_fit_of_large_pictures_takes_further_patterns_where_one_would_not_do(t
     large = replace(roles, fitted=roles.fitted[:1])  # as of pictures of a million pixels
     more = with_patterns(large, 3)
     assert len({c.pattern for c in more.fitted}) == len(more.fitted) == 3
-    assert set(more.fitted) <= set(split(captures).fitted)
+    assert set(ids_of(more.fitted)) <= set(ids_of(split(captures).fitted))
     assert with_patterns(more, 3) is more
     assert len(with_patterns(large, 99).fitted) == len({c.pattern for c in split(captures).fitted})
