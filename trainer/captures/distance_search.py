@@ -34,6 +34,7 @@ from trainer.kept_results import forgotten_afterwards
 NEAREST, FARTHEST = 0.2, 5.0  # distances that are searched, as shares of the stated one
 RINGS = (1.25, 2.0, FARTHEST)  # so far at a time, until one distance stands out
 SHOULDER = 3.0  # steps from the best one within which others fit in part
+ELSEWHERE = 6  # distances beyond these that say how well pictures fit by chance
 MOST_STEPS = 64  # of the search, where pictures can be made as coarse as that takes
 SMALLEST = 64  # pixels a side that coarse pictures keep
 # Correlation from which the right distance is uphill. More than 70 pitch^2 / wavelength from it, 0.23 was the most in
@@ -197,7 +198,9 @@ def _likely(tiles: Tiles, steps: _Steps) -> list[float]:
         if best:
             near = SHOULDER * steps.coarse * steps.depth_of_focus(best[0])
             others = [tried[d] for d in tried if abs(d - best[0]) > near]
-            if others and tried[best[0]] > max(R_RATIO * max(others), steps.beyond_chance(joined)):
+            if len(others) >= ELSEWHERE and tried[best[0]] > max(
+                R_RATIO * max(others), steps.beyond_chance(joined)
+            ):
                 break
     return best
 
