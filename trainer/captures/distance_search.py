@@ -77,7 +77,7 @@ def best_distance(
         Of one colour and one stated plane. The whole range is searched on the first that has structure.
     predict : callable
         The ideal model: (bench, gray, channel, plane_mm) -> irradiance [h, w] on any scale.
-    finest : float, depths of focus
+    finest : float, depths of focus of the whole band
         How finely the best place is searched.
 
     Returns
@@ -107,7 +107,7 @@ def best_distance(
         likely = (best.distance_mm, *_likely(several[0], steps))
         best = max((score(distance, steps.joined(step)) for distance in likely), key=_correlation)
     step /= 2
-    while step >= finest:
+    while step * steps.depth_of_focus(best.distance_mm) >= finest * steps.of_whole_band:
         joined, aside = steps.joined(2 * step), step * steps.depth_of_focus(best.distance_mm)
         best = score(best.distance_mm, joined)
         beside = (score(best.distance_mm + sign * aside, joined) for sign in (-1, 1))
@@ -141,11 +141,17 @@ class _Steps:
     stated: float
     most: int
 
-    def depth_of_focus(self, distance: float) -> float:
-        """pitch^2 / wavelength of the light that reaches the picture, mm."""
+    @cached_property
+    def of_whole_band(self) -> float:
+        """pitch^2 / wavelength of all light that passes the iris, mm."""
         panel, wave = self.bench.panel, self.bench.channel(self.channel).wavelength
-        share = min(1.0, self.bench.iris.half_width, _arriving(self.bench, self.channel, distance))
-        return 1e3 * panel.pitch**2 / (wave * share**2)
+        return 1e3 * panel.pitch**2 / (wave * min(1.0, self.bench.iris.half_width) ** 2)
+
+    def depth_of_focus(self, distance: float) -> float:
+        """The same of the light that reaches the picture."""
+        passing = min(1.0, self.bench.iris.half_width)
+        share = min(passing, _arriving(self.bench, self.channel, distance))
+        return self.of_whole_band * (passing / share) ** 2
 
     def joined(self, step: float) -> int:
         """Pixels to join along each axis."""
