@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
 
 import torch
 
@@ -48,7 +49,9 @@ def fit_from(
             predictors = [Predictor(model.having(start), b) for b in few]
             points = [p.trace(model) for p in predictors]
             start = pattern_search(model, predictors, points, start)
-    fitted = fit(model.having(start), [start.effect.name], batches, iterations, ROUGH, enough=enough)
+    # With the gains of a model without the effect, a right start may look wrong, and the fit leaves it.
+    begun = replace(model.having(start), gain={})
+    fitted = fit(begun, [start.effect.name], batches, iterations, ROUGH, enough=enough)
     turns = RUGGED_TURNS if start.effect.rugged else 1
     before = math.inf
     while not fitted.settled and turns > 1 and fitted.errors.excess < min(RUGGED_LEFT * before, enough):
