@@ -7,7 +7,7 @@ by page, which can cost as much time as the arithmetic on it.
 from __future__ import annotations
 
 import ctypes
-import resource
+import os
 import sys
 from pathlib import Path
 
@@ -45,7 +45,7 @@ def give_back_blocks() -> None:
     if library is None:
         return
     pages = int(Path("/proc/self/statm").read_text().split()[1])
-    if pages * resource.getpagesize() > MOST_IDLE:
+    if pages * os.sysconf("SC_PAGE_SIZE") > MOST_IDLE:
         library.malloc_trim(0)
 
 

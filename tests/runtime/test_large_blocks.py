@@ -40,6 +40,7 @@ def test_large_temporaries_are_faulted_in_once() -> None:
 
 
 HELD = """
+import os
 from pathlib import Path
 import numpy as np
 from runtime.program.large_blocks import give_back_blocks, keep_large_blocks
@@ -48,7 +49,7 @@ blocks = [np.ones(2**24) for _ in range(20)]  # 128 MiB each
 last = np.ones(2**20)  # below which the C library keeps what is free
 del blocks
 def held() -> float:
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 2**30
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**30
 before = held()
 give_back_blocks()
 print(before, held())

@@ -111,8 +111,11 @@ def quarters(counts: np.ndarray, camera: Camera) -> np.ndarray:
     """Mean light of the four pixels of each 2 x 2, as shares of the brightest of them: [2, 2]."""
     if min(counts.shape) < 2:
         return np.ones((2, 2))
-    light = [[counts[i::2, j::2].mean() - camera.black_level for j in (0, 1)] for i in (0, 1)]
-    return np.array(light) / max(float(np.max(light)), 1e-9)
+    parts = [[counts[i::2, j::2] for j in (0, 1)] for i in (0, 1)]
+    sums = [[float(part[part < camera.saturation].sum()) for part in row] for row in parts]
+    used = [[max(int((part < camera.saturation).sum()), 1) for part in row] for row in parts]
+    light = np.array(sums) / np.array(used) - camera.black_level
+    return light / max(float(light.max()), 1e-9)
 
 
 def check_mosaic(shares: Sequence[np.ndarray]) -> list[Problem]:

@@ -9,9 +9,10 @@ far away, where depths of focus are many, coarse pictures are searched, and ever
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -32,7 +33,7 @@ from trainer.captures.conventions import (
 from trainer.kept_results import forgotten_afterwards
 
 NEAREST, FARTHEST = 0.2, 5.0  # distances that are searched, as shares of the stated one
-RINGS = (1.25, 2.0, FARTHEST)  # so far at a time, until one distance stands out
+RINGS = (1.25, 2.0)  # so far at a time, then all, until one distance stands out
 SHOULDER = 3.0  # steps from the best one within which others fit in part
 ELSEWHERE = 6  # distances beyond these that say how well pictures fit by chance
 MOST_STEPS = 64  # of the search, where pictures can be made as coarse as that takes
@@ -61,8 +62,8 @@ class DistanceFit:
     correlation: float
 
 
-# Correlations of a sample's tiles at a distance, mm, of pictures with so many pixels joined along each axis.
-Tiles = Callable[[float, int], NDArray]
+# Of a sample at a distance, mm, and of pictures with so many pixels joined along each axis.
+Correlation = Callable[[float, int], float]
 
 
 def best_distance(
@@ -87,16 +88,18 @@ def best_distance(
     """
     stated = samples[0].plane_mm
     several = [
-        one for one in (_tiles(bench, sample, stated, predict) for sample in samples) if one is not None
+        one
+        for one in (_correlation_of(bench, sample, stated, predict) for sample in samples)
+        if one is not None
     ]
     if not several:
         return None
-    steps = _Steps(bench, samples[0].channel, stated, min(samples[0].signal.shape) // SMALLEST)
+    near, _, image, _, _ = _part(bench, samples[0], stated)
+    steps = _Steps(near, samples[0].channel, stated, image.shape)
 
+    @cache
     def score(distance: float, joined: int = 1) -> DistanceFit:
-        with forgotten_afterwards():
-            found = [float(tiles(distance, joined).mean()) for tiles in several]
-        return DistanceFit(distance, float(np.mean(found)))
+        return DistanceFit(distance, float(np.mean([one(distance, joined) for one in several])))
 
     best, step = score(stated), STEP
     if best.correlation < GOOD:
@@ -132,14 +135,14 @@ class _Steps:
     bench : Bench
     channel : str
     stated : float, mm
-    most : int
-        Pixels of the camera that may be joined along each axis.
+    picture : (int, int), pixels
+        What is compared: rows, columns.
     """
 
     bench: Bench
     channel: str
     stated: float
-    most: int
+    picture: tuple[int, int]
 
     @cached_property
     def of_whole_band(self) -> float:
@@ -155,34 +158,35 @@ class _Steps:
 
     def joined(self, step: float) -> int:
         """Pixels to join along each axis."""
-        return max(1, min(round(step / STEP / self._pixel), self.most))
+        return max(1, min(round(step / STEP / self._pixel), min(self.picture) // SMALLEST))
 
     @cached_property
     def coarse(self) -> float:
         """The step with which the whole range is searched."""
-        low, high = (share * abs(self.stated) for share in (NEAREST, FARTHEST))
-        between = np.linspace(low, high, 257)
+        between = np.linspace(*self._range, 257)
         whole = float(np.trapezoid([1 / self.depth_of_focus(d) for d in between], between)) / STEP
-        return STEP * max(1.0, min(whole / MOST_STEPS, self.most * self._pixel))
-
-    def beyond_chance(self, joined: int) -> float:
-        """The correlation that a picture of joined pixels does not have by chance."""
-        height, width = self.bench.camera.shape
-        return beyond_chance(height * width / joined**2)
+        return STEP * max(1.0, min(whole / MOST_STEPS, min(self.picture) // SMALLEST * self._pixel))
 
     def rings(self) -> list[list[float]]:
         """The distances of the whole range, mm, the nearest to the stated one first."""
-        low, high = (share * abs(self.stated) for share in (NEAREST, FARTHEST))
+        low, high = self._range
         found = [low]
         while found[-1] < high:
             found.append(found[-1] + self.coarse * self.depth_of_focus(found[-1]))
-        shares = [max(d / abs(self.stated), abs(self.stated) / d) for d in found]
+        stated = max(abs(self.stated), 1e-9)
+        shares = [max(d, 1e-9) / stated for d in found]
+        shares = [max(share, 1 / share) for share in shares]
         signed = [float(np.copysign(d, self.stated)) for d in found]
         ends = (0.0, *RINGS, np.inf)
         return [
             [d for d, share in zip(signed, shares, strict=True) if inner < share <= outer]
             for inner, outer in pairwise(ends)
         ]
+
+    @property
+    def _range(self) -> tuple[float, float]:
+        """The nearest and the farthest distance, mm, without their sign."""
+        return NEAREST * abs(self.stated), FARTHEST * abs(self.stated)
 
     @cached_property
     def _pixel(self) -> float:
@@ -192,21 +196,19 @@ class _Steps:
         return float(np.linalg.norm(next_one - there))
 
 
-def _likely(tiles: Tiles, steps: _Steps) -> list[float]:
+def _likely(correlation: Correlation, steps: _Steps) -> list[float]:
     """The two distances, mm, at which a sample fits best, of all or of the nearer ones, where one stands out there."""
     joined, tried = steps.joined(steps.coarse), dict[float, float]()
+    chance = beyond_chance(math.prod(steps.picture) / joined**2)
     best: list[float] = []
     for ring in steps.rings():
         for distance in ring:
-            with forgotten_afterwards():
-                tried[distance] = float(tiles(distance, joined).mean())
+            tried[distance] = correlation(distance, joined)
         best = sorted(tried, key=lambda d: -tried[d])[:2]
         if best:
             near = SHOULDER * steps.coarse * steps.depth_of_focus(best[0])
             others = [tried[d] for d in tried if abs(d - best[0]) > near]
-            if len(others) >= ELSEWHERE and tried[best[0]] > max(
-                R_RATIO * max(others), steps.beyond_chance(joined)
-            ):
+            if len(others) >= ELSEWHERE and tried[best[0]] > max(R_RATIO * max(others), chance):
                 break
     return best
 
@@ -217,16 +219,24 @@ def _arriving(bench: Bench, channel: str, distance: float) -> float:
     return ACROSS * max(panel.shape) * 2 * panel.pitch**2 / (wave * max(abs(distance), 1e-9) * 1e-3)
 
 
-def _tiles(bench: Bench, sample: Sample, stated: float, predict: Predict) -> Tiles | None:
-    """The correlations of a sample's tiles by distance; None for a pattern that makes no structure."""
-    near, gray, image, valid, core = central_part(bench, replace(sample, plane_mm=FARTHEST * stated))
+def _part(
+    bench: Bench, sample: Sample, stated: float
+) -> tuple[Bench, NDArray, NDArray, NDArray, tuple[slice, slice]]:
+    """`central_part`, with what diffracts into it from the farthest distance."""
+    return central_part(bench, replace(sample, plane_mm=FARTHEST * stated))
 
-    @lru_cache(maxsize=4)  # a step asks for the best distance and the one before it again
+
+def _correlation_of(bench: Bench, sample: Sample, stated: float, predict: Predict) -> Correlation | None:
+    """The mean correlation of a sample's tiles; None for a pattern that makes no structure."""
+    near, gray, image, valid, core = _part(bench, sample, stated)
+
+    @lru_cache(maxsize=4)  # the best distances are compared again with fewer pixels joined
     def predicted(distance: float) -> NDArray:
         # Light at higher frequencies passes by the picture, and room for it would take many times the memory.
         half_width = min(near.iris.half_width, _arriving(near, sample.channel, distance))
         narrowed = replace(near, iris=replace(near.iris, half_width=half_width))
-        return np.asarray(predict(narrowed, gray, sample.channel, distance), dtype=np.float32)[core]
+        with forgotten_afterwards():
+            return np.asarray(predict(narrowed, gray, sample.channel, distance), dtype=np.float32)[core]
 
     @lru_cache(maxsize=2)
     def measured(joined: int) -> tuple[NDArray, NDArray]:
@@ -240,13 +250,13 @@ def _tiles(bench: Bench, sample: Sample, stated: float, predict: Predict) -> Til
     if not flat(stated, 1).any():
         return None
 
-    def tiles(distance: float, joined: int) -> NDArray:
-        picture, good = measured(joined)
+    def correlation(distance: float, joined: int) -> float:
         if distance * stated <= 0:
-            return np.full(1, -1.0)
+            return -1.0
+        picture, good = measured(joined)
         try:
-            return tile_correlations(picture, good, flat(distance, joined))[0]
+            return float(np.mean(tile_correlations(picture, good, flat(distance, joined))[0]))
         except InputError:  # the sampling does not reach this plane
-            return np.full(1, -1.0)
+            return -1.0
 
-    return tiles
+    return correlation
