@@ -160,6 +160,16 @@ def test_one_picture_with_a_pattern_of_two_pixels_is_no_mosaic(copy: Path) -> No
     assert not [p for p in found(copy) if p[1] == "mosaic"]
 
 
+def test_patterns_that_alternate_make_no_mosaic(copy: Path) -> None:
+    def alternating(counts: np.ndarray) -> np.ndarray:
+        return np.where(np.indices(counts.shape).sum(0) % 2, counts, 64 + (counts - 64) // 2).astype(
+            np.uint16
+        )
+
+    repaint(copy, alternating)
+    assert not [p for p in found(copy) if p[1] == "mosaic"]
+
+
 def test_left_justified_counts_of_a_dim_picture(tmp_path: Path) -> None:
     make_set(tmp_path / "set", brightness=0.003)
     repaint(tmp_path / "set", lambda a: a << 4, "0002")

@@ -14,6 +14,7 @@ from trainer.captures.signal_present import DARK, fault_of
 SATURATED_SHARE = 0.03  # of the pixels at the top count
 PILE_FACTOR, PILE_LEAST = 10, 8  # pixels at a top count: times those at each count just below, and at least
 DULL = 0.75  # of the brightest quarter's light: what less is, in every capture, has a colour filter before it
+ALIKE = 0.05  # difference of such shares
 DARK_SHARE = 1e-3  # of the pixels that lie well below the stated black level
 
 
@@ -127,7 +128,9 @@ def check_mosaic(shares: Sequence[np.ndarray]) -> list[Problem]:
         Of each capture with light, as `quarters` gives them.
     """
     most = np.max(shares, axis=0) if shares else np.ones((2, 2))
-    if most.min() > DULL:
+    least, lower, upper, top = np.sort(most, axis=None)
+    # Two dull and two bright ones alike are what patterns that alternate do, such as double phase.
+    if least > DULL or max(lower - least, top - upper) < ALIKE:
         return []
     text = ", ".join(f"{value:.2f}" for value in most.ravel())
     return [
