@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from torch import Tensor
 
 from runtime.lightpath.legendre import legendre_count
 from runtime.program.plain_values import plain
@@ -22,7 +24,10 @@ from trainer.effects import catalogue
 from trainer.effects.definition import Parameter, effect
 from trainer.effects.testing import captures_with
 from trainer.fitting import gauss_newton, jacobian
-from trainer.fitting.gauss_newton import fit, is_too_slow
+from trainer.fitting.further_numbers import with_numbers_that_pay
+from trainer.fitting.gauss_newton import ROUGH, fit, is_too_slow
+from trainer.fitting.jacobian import follow
+from trainer.fitting.predictor import Predictor
 from trainer.fitting.refit import least_for_order, raise_orders
 from trainer.model.model import EffectInstance, Model, absent, instance_with
 from trainer.model.parameters import describe, json_values
@@ -136,6 +141,80 @@ def test_orders_of_two_effects_are_raised_together(tmp_path: Path) -> None:
     best = raise_orders(fit(model, model.names, batches), model.names, batches, least_for_order).model
     assert best.instance("vignetting").order == 4
     assert best.instance("stray_light").order == 1  # nothing asks for more
+
+
+def test_derivatives_say_of_a_step_what_it_did_and_of_other_directions_what_they_said() -> None:
+    rng = np.random.default_rng(3)
+    table = torch.as_tensor(rng.normal(size=(4, 500)), dtype=torch.float64)
+    table[3] = 0  # of another colour
+    before, step = table.clone(), rng.normal(size=4)
+    taken = torch.as_tensor(step)
+    bent = torch.as_tensor(rng.normal(size=500))
+    change = taken @ table + 0.5 * bent
+    share = follow([table], [change], step)
+    assert share == pytest.approx(float(0.25 * bent @ bent / (change @ change)))
+    torch.testing.assert_close(taken @ table, change)
+    assert not table[3].any()
+    # A direction that the step has no part in, by what each number does, is as it was.
+    across = torch.tensor(
+        [float(before[1] @ before[1]) * step[1], -float(before[0] @ before[0]) * step[0], 0, 0]
+    )
+    torch.testing.assert_close(across.double() @ table, across.double() @ before)
+    assert follow([table], [taken @ table], step) == pytest.approx(0, abs=1e-12)
+
+
+def test_a_rough_fit_ends_where_a_fine_one_does_with_fewer_derivatives(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # What is left beside the leak lets no step remove half of the excess.
+    narrow = 'kind = "illumination"\nwaist_x_share = 0.8\nwaist_y_share = 0.9'
+    acquire_from(str(bench_file(tmp_path, narrow, 'kind = "zero_order"')), tmp_path / "captures", patterns=3)
+    captures = read_captures(tmp_path / "captures")
+    batches = batches_of(captures)
+    start = Model(captures.bench).having(absent(KNOWN["zero_order"], captures.bench, 0))
+    tables = 0
+
+    def counted(*given: Any) -> list[Tensor]:
+        nonlocal tables
+        tables += 1
+        return jacobian.slopes_of(*given)
+
+    monkeypatch.setattr(gauss_newton, "slopes_of", counted)
+    fine = fit(start, ["zero_order"], batches)
+    needed, tables = tables, 0
+    rough = fit(start, ["zero_order"], batches, tolerance=ROUGH)
+    assert tables < needed
+    assert fine.errors.excess > 0.01
+    assert rough.errors.excess < (1 + ROUGH) * fine.errors.excess
+
+
+def test_derivatives_of_further_numbers_are_those_that_their_fit_would_compute(tmp_path: Path) -> None:
+    effect = KNOWN["vignetting"]
+    terms = np.zeros(legendre_count(4))
+    terms[[0, 4, -1]] = 0.2, -0.15, 0.1
+    captures = captures_with(tmp_path, effect, {"log_gain": terms}, patterns=3, order=4)
+    (batch,) = batches_of(captures)
+    model = Model(captures.bench)
+    for name in ("vignetting", "zero_order", "stray_light"):
+        model = model.having(absent(KNOWN[name], captures.bench))
+    fixed = (("zero_order", "leak_wavefront"),)
+    rising = ("vignetting", "stray_light")
+    first = batch.only([0])
+    model = fit(model, model.names, [first], fixed=fixed).model
+    found = with_numbers_that_pay(model, model.names, rising, [first], 1e-4, fixed)
+    assert found is not None
+    raised, slopes = found
+    assert raised.instance("vignetting").order > model.instance("vignetting").order
+    assert raised.instance("stray_light").order == model.instance("stray_light").order
+    assert slopes is not None
+    keys = tuple(key for key in jacobian.keys_of(raised, raised.names) if key[:2] not in fixed)
+    predictor = Predictor(raised, first)
+    with torch.no_grad():
+        expected = jacobian.slopes_of(raised, keys, [batch.channel], [predictor], [predictor.trace(raised)])
+    torch.testing.assert_close(slopes, expected)
+    # Of several captures, a single one is looked at.
+    several = with_numbers_that_pay(model, model.names, rising, [batch], 1e-4, fixed)
+    assert several is not None and several[1] is None
 
 
 def test_dead_space_and_a_flat_first_surface_are_found_beside_a_bent_panel(tmp_path: Path) -> None:

@@ -111,13 +111,14 @@ def explain_together(
     after = evaluate_captures(roles.captures, roles.held_out, joint)
     if gets_nowhere(after.excess, errors):
         return None
-    report(0.6, "looking whether maps go on")
-    found, before_maps = joint, after
-    joint, after = _with_maps(roles, joint, after, thresholds)
 
     def there() -> bool:
         return after.excess < NEARLY or thresholds.complete(after.excess, errors.excess)
 
+    found, before_maps = joint, after
+    if not there():
+        report(0.6, "looking whether maps go on")
+        joint, after = _with_maps(roles, joint, after, thresholds)
     alike = [name for name in TAKEN_FOR_EACH_OTHER if name in found.names]
     if len(alike) > 1 and not there():
         report(0.7, f"looking whether {' and '.join(alike)} are taken for each other")

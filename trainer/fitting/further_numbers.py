@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import torch
+from torch import Tensor
 
 from trainer.captures.batches import Batch, signal_variance
-from trainer.fitting.jacobian import Key, keys_of, outside_span, stacked
+from trainer.fitting.jacobian import Key, keys_of, outside_span, slopes_of, weighted_residuals
 from trainer.fitting.many_numbers import has_many
 from trainer.fitting.predictor import Predictor, telling
 from trainer.model.colours_apart import come_apart, may_come_apart
@@ -33,8 +34,13 @@ def next_order(present: EffectInstance) -> int | None:
 
 @torch.no_grad()
 def with_numbers_that_pay(
-    model: Model, names: Sequence[str], rising: Sequence[str], batches: Sequence[Batch], least: float
-) -> Model | None:
+    model: Model,
+    names: Sequence[str],
+    rising: Sequence[str],
+    batches: Sequence[Batch],
+    least: float,
+    fixed: Collection[tuple[str, str]] = (),
+) -> tuple[Model, list[Tensor] | None] | None:
     """The model with further numbers, absent, of those effects that a straight-line step expects so much excess of.
 
     Further numbers are those of an effect's next order, and those that each colour has for itself. The step is that of
@@ -45,11 +51,14 @@ def with_numbers_that_pay(
     ----------
     least : float
         Excess that further numbers must be expected to remove, beside those that are taken already.
+    fixed : collection of (str, str)
+        Effects and those of their parameters that keep their values.
 
     Returns
     -------
-    Model or None
-        None where nothing pays.
+    (Model, list of Tensor or None) or None
+        The model, and the batches' derivatives there, as a fit of it needs them, where they are known: of one colour,
+        and of single captures. None where nothing pays.
     """
     every = _with_all(model, rising, batches)
     if every is model:
@@ -57,8 +66,11 @@ def with_numbers_that_pay(
     few = [telling(model, b, 1) for b in batches]
     predictors = [Predictor(every, b) for b in few]
     points = [p.trace(every) for p in predictors]
-    keys = keys_of(every, [n for n in names if not has_many(every.instance(n))])
-    residual, slopes = stacked(every, keys, predictors, points)
+    in_table = keys_of(every, [n for n in names if not has_many(every.instance(n))])
+    keys = tuple(key for key in in_table if key[:2] not in fixed)
+    channels = list(dict.fromkeys(b.channel for b in few))
+    tables = slopes_of(every, keys, channels, predictors, points)
+    residual, slopes = torch.cat(weighted_residuals(every, predictors, points)[0]), torch.cat(tables, dim=1)
     kinds: list[Further | None] = [None] * len(slopes)
     for k, key in enumerate(keys):
         kinds[k], first = _meaning(key, every, model)
@@ -83,11 +95,17 @@ def with_numbers_that_pay(
         least = max(least, RIVALS * (before - after[best]))
         taken.append(best)
         before = after[best]
+    if not taken:
+        return None
     for name, what in taken:
         present = model.instance(name)
         further = come_apart(present, model.bench) if what == APART else _raised(present, model)
         model = model.having(further)
-    return model if taken else None
+    whole = len(channels) == 1 and all(len(b.ids) == 1 for b in batches)
+    if not whole or any(p.has_own_gains(model) for p in predictors):
+        return model, None
+    kept = [k for k, kind in enumerate(kinds) if kind is None or kind in taken]
+    return model, [table[kept] for table in tables]
 
 
 def _with_all(model: Model, rising: Sequence[str], batches: Sequence[Batch]) -> Model:

@@ -28,6 +28,7 @@ from trainer.effects.own_effect import measured_by
 from trainer.fitting.jacobian import (
     Key,
     away_from_absent,
+    follow,
     keys_of,
     moved,
     reach_of,
@@ -49,6 +50,8 @@ FAR, SLOW, FASTER = 10.0, 0.5, 2.0
 # A step that lowers the excess by less than LITTLE is the last one. It is expected to do much where it may leave
 # PROMISING of the excess at most, and lower it by MUCH.
 LITTLE, PROMISING, MUCH = 2e-6, 0.8, 2e-5
+# Share of the squared change that a step was not expected to make, up to which derivatives are taken for constant.
+STRAIGHT = 0.1
 BLOCK = 1 << 18  # pixels
 
 
@@ -87,6 +90,7 @@ def fit(
     hold: float = 0.0,
     fixed: Collection[tuple[str, str]] = (),
     enough: float = math.inf,
+    slopes: list[Tensor] | None = None,
 ) -> FitResult:
     """Fit the named effects of a model, and the gains, to batches.
 
@@ -110,12 +114,14 @@ def fit(
         Effects and those of their parameters that keep their values.
     enough : float
         Excess at which the fit is of use: it is given up where it will hardly come there.
+    slopes : list of Tensor, optional
+        Derivatives of each batch's prediction by the model, as from `slopes_of`, where they are known. Overwritten.
     """
     with torch.no_grad():
         many = tuple(n for n in free if has_many(model.instance(n)))
         if many:
             return _fit_many(model, tuple(free), many, batches, iterations, tolerance, progress, enough)
-        return _fit(model, tuple(free), batches, iterations, tolerance, progress, hold, fixed, enough)
+        return _fit(model, tuple(free), batches, iterations, tolerance, progress, hold, fixed, enough, slopes)
 
 
 def _fit(
@@ -128,6 +134,7 @@ def _fit(
     hold: float,
     fixed: Collection[tuple[str, str]],
     enough: float,
+    slopes: list[Tensor] | None,
 ) -> FitResult:
     predictors = [Predictor(model, b) for b in batches]
     keys = tuple(key for key in keys_of(model, free) if key[:2] not in fixed)
@@ -137,7 +144,8 @@ def _fit(
     points = [p.trace(model) for p in predictors]
     model = _having_gains(model, predictors, points)
     channels = list(dict.fromkeys(b.channel for b in batches))
-    slopes = slopes_of(model, keys, channels, predictors, points)
+    if slopes is None:
+        slopes = slopes_of(model, keys, channels, predictors, points)
     residuals, errors = weighted_residuals(model, predictors, points)
     damping, fresh, settled = 1e-3, True, True
     for iteration in range(iterations):
@@ -158,7 +166,8 @@ def _fit(
             gradient[: len(keys)] -= pull * scale * away / ranges
         accepted, raised = False, False
         for _ in range(6 if fresh else 1):
-            trial = moved(model, keys, channels, step_within(normal, gradient, damping, reach))
+            step = step_within(normal, gradient, damping, reach)
+            trial = moved(model, keys, channels, step)
             trial_points = [p.trace(trial, first, t) for p, t in zip(predictors, points, strict=True)]
             trial_residuals, trial_errors = weighted_residuals(trial, predictors, trial_points)
             paid = pull * float((_away(trial, keys, ranges) ** 2 - away**2).sum()) if pull else 0.0
@@ -166,7 +175,10 @@ def _fit(
                 accepted = True
                 break
             damping, raised = max(damping, 1e-4) * 8, True
+        straight = False
         if accepted:
+            changes = [old - new for old, new in zip(residuals, trial_residuals, strict=True)]
+            straight = follow(slopes, changes, step) < STRAIGHT and tolerance >= ROUGH
             model, points = trial, trial_points
             residuals, errors = trial_residuals, trial_errors
             damping = max(damping / 10, 1e-7)
@@ -183,9 +195,10 @@ def _fit(
         if fresh and is_too_slow(removed_excess, iterations - iteration - 1, errors.excess, enough):
             settled = False
             break
-        # Secants are costly: they are used again while a step still removes more than half of what is left.
-        fresh = not removed_excess > 0.5 * before
-        if fresh and iteration + 1 < iterations:
+        # Secants are costly: they are used again while a step still removes more than half of what is left. Where a
+        # step did what they had expected, those of a rough fit are as good as new.
+        fresh = straight or not removed_excess > 0.5 * before
+        if fresh and not straight and iteration + 1 < iterations:
             slopes = slopes_of(model, keys, channels, predictors, points)
     else:
         settled = False

@@ -207,6 +207,36 @@ def slopes_of(
     return blocks
 
 
+def follow(slopes: Sequence[Tensor], changes: Sequence[Tensor], step: np.ndarray) -> float:
+    """Let derivatives [keys + colours, pixels] say of a step what it did (Broyden 1965, eq. 4.5), in place.
+
+    Each number's by its part of what the step was expected to do: so derivatives near where the step began serve where
+    it ended.
+
+    Parameters
+    ----------
+    changes : sequence of Tensor [pixels]
+        What the step did to each batch's prediction.
+    step : array [keys + colours]
+
+    Returns
+    -------
+    float
+        Share of the squared change that was not expected.
+    """
+    unexpected, whole = 0.0, 0.0
+    for table, change in zip(slopes, changes, strict=True):
+        taken = torch.as_tensor(step, dtype=table.dtype)
+        missed = change - taken @ table
+        unexpected += float(missed @ missed)
+        whole += float(change @ change)
+        parts = (table * table).sum(1) * taken  # 0 for what changes nothing here
+        along = float(parts @ taken)
+        if along > 0:
+            table += torch.outer(parts / along, missed)
+    return unexpected / whole if whole > 0 else 0.0
+
+
 def weighted_residuals(
     model: Model, predictors: Sequence[Predictor], points: Sequence[Trace]
 ) -> tuple[list[Tensor], PredictionErrors]:

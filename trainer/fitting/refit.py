@@ -105,11 +105,12 @@ def raise_orders(
         needed = gain_needed(fitted.errors.excess)
         if needed > fitted.errors.excess:
             return fitted
-        trial = with_numbers_that_pay(fitted.model, names, rising, batches, LEAST_EXPECTED * needed)
-        if trial is None:
+        further = with_numbers_that_pay(fitted.model, names, rising, batches, LEAST_EXPECTED * needed, fixed)
+        if further is None:
             return fitted
         enough = fitted.errors.excess - needed
-        better = fit(trial, names, batches, 8, ROUGH, hold=hold, fixed=fixed, enough=enough)
+        trial, slopes = further
+        better = fit(trial, names, batches, 8, ROUGH, hold=hold, fixed=fixed, enough=enough, slopes=slopes)
         if better.errors.excess > enough:
             return fitted
         fitted = better
