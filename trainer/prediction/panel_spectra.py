@@ -40,8 +40,13 @@ def panel_spectra(path: LightPath, phase: Tensor, scales: Sequence[float]) -> Te
     """
     found = []
     for state in states(path):
-        found.append(torch.stack([panel_spectrum(_driven(state, s), s * phase) for s in scales], 1))
-    return torch.stack(found, 1)
+        found.append(_stacked([panel_spectrum(_driven(state, s), s * phase) for s in scales]))
+    return _stacked(found)
+
+
+def _stacked(parts: Sequence[Tensor]) -> Tensor:
+    """Parts [B, ...] along a further axis after the first, a single one without a copy: it may be 100 MB."""
+    return parts[0][:, None] if len(parts) == 1 else torch.stack(list(parts), 1)
 
 
 def _driven(path: LightPath, scale: float) -> LightPath:

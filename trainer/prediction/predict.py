@@ -195,6 +195,8 @@ class Trace:
     @classmethod
     def joined(cls, parts: Sequence[Trace]) -> Trace:
         """The results of captures one after the other."""
+        if len(parts) == 1:
+            return parts[0]
         of_point = None
         if any(p.of_point is not None for p in parts):
             of_point = torch.cat([p.image if p.of_point is None else p.of_point for p in parts])
