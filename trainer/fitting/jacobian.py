@@ -230,10 +230,10 @@ def follow(slopes: Sequence[Tensor], changes: Sequence[Tensor], step: np.ndarray
         missed = change - taken @ table
         unexpected += float(missed @ missed)
         whole += float(change @ change)
-        parts = (table * table).sum(1) * taken  # 0 for what changes nothing here
+        parts = torch.linalg.vector_norm(table, dim=1) ** 2 * taken  # 0 for what changes nothing here
         along = float(parts @ taken)
         if along > 0:
-            table += torch.outer(parts / along, missed)
+            table.addr_(parts / along, missed)
     return unexpected / whole if whole > 0 else 0.0
 
 
