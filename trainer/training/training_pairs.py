@@ -26,7 +26,6 @@ from trainer.captures.capture_table import Capture
 from trainer.fitting.predictor import Predictor
 from trainer.model.bundle_export import acting_on_display
 from trainer.model.model import Model
-from trainer.model.model_stages import scene_for, stages_of
 from trainer.prediction.camera_light import counts
 from trainer.prediction.predict import light_path
 from trainer.prediction.scene import Scene, Stages
@@ -199,8 +198,7 @@ def expected_counts(model: Model, batch: Batch) -> tuple[Scene, Stages, Tensor, 
 def display_irradiance(model: Model, batch: Batch) -> Tensor:
     """Predicted irradiance of the display for the first pattern of a batch, on the panel's pixels [H, W]."""
     shown = acting_on_display(model)
-    scene = scene_for(shown, batch.channel, batch.plane_mm)
+    predictor = Predictor(shown, batch)
     with torch.no_grad():
-        moment = batch.moments[0] if batch.moments else None
-        path = light_path(scene, stages_of(scene, shown, moment=moment))
+        path = light_path(predictor.scene, predictor.stages(shown, 0))
         return pixel_irradiance(path, irradiance(path, panel_phase(path, batch.gray[:1])))[0]
