@@ -10,8 +10,9 @@ import torch
 
 from tests.trainer.made_sets import bench_tables, make_set
 from trainer.captures.bench_file import read_bench
-from trainer.commands import workers
-from trainer.commands.workers import process_bytes, workers_of
+from trainer.commands.workers import workers_of
+from trainer.fitting import process_memory
+from trainer.fitting.process_memory import process_bytes
 
 GB = 10**9
 
@@ -34,8 +35,8 @@ def test_processes_are_as_many_as_memory_is_there_for(
     make_set(tmp_path / "captures", patterns=1)
     a_process = process_bytes(read_bench(tmp_path / "captures" / "bench.toml"))
     assert 0.4 * GB < a_process < 0.53 * GB
-    monkeypatch.setattr(workers, "cores", lambda: 8)
-    monkeypatch.setattr(workers, "available_bytes", lambda: None if free is None else int(free * GB))
+    monkeypatch.setattr(process_memory, "cores", lambda: 8)
+    monkeypatch.setattr(process_memory, "available_bytes", lambda: None if free is None else int(free * GB))
     threads = torch.get_num_threads()
     try:
         assert workers_of(args(tmp_path / "captures")) == expected
