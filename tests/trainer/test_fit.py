@@ -180,9 +180,9 @@ def test_a_rough_fit_ends_where_a_fine_one_does_with_fewer_derivatives(
         return jacobian.slopes_of(*given)
 
     monkeypatch.setattr(gauss_newton, "slopes_of", counted)
-    fine = fit(start, ["zero_order"], batches)
+    fine = fit(start, ["zero_order"], batches, hold=1e-6)
     needed, tables = tables, 0
-    rough = fit(start, ["zero_order"], batches, tolerance=ROUGH)
+    rough = fit(start, ["zero_order"], batches, tolerance=ROUGH, hold=1e-6)
     assert tables < needed
     assert fine.errors.excess > 0.01
     assert rough.errors.excess < (1 + ROUGH) * fine.errors.excess

@@ -178,7 +178,7 @@ def _fit(
         straight = False
         if accepted:
             changes = [old - new for old, new in zip(residuals, trial_residuals, strict=True)]
-            straight = follow(slopes, changes, step) < STRAIGHT and tolerance >= ROUGH
+            straight = hold > 0 and follow(slopes, changes, step) < STRAIGHT and tolerance >= ROUGH
             model, points = trial, trial_points
             residuals, errors = trial_residuals, trial_errors
             damping = max(damping / 10, 1e-7)
@@ -196,7 +196,8 @@ def _fit(
             settled = False
             break
         # Secants are costly: they are used again while a step still removes more than half of what is left. Where a
-        # step did what they had expected, those of a rough fit are as good as new.
+        # step did what they had expected, those of a rough fit far from the truth are as good as new. (Where candidates
+        # are compared, what such a fit leaves over decides which is first.)
         fresh = straight or not removed_excess > 0.5 * before
         if fresh and not straight and iteration + 1 < iterations:
             slopes = slopes_of(model, keys, channels, predictors, points)
