@@ -177,8 +177,9 @@ def _fit(
             damping, raised = max(damping, 1e-4) * 8, True
         straight = False
         if accepted:
-            changes = [old - new for old, new in zip(residuals, trial_residuals, strict=True)]
-            straight = hold > 0 and follow(slopes, changes, step) < STRAIGHT and tolerance >= ROUGH
+            if hold > 0 and tolerance >= ROUGH:
+                changes = [old - new for old, new in zip(residuals, trial_residuals, strict=True)]
+                straight = follow(slopes, changes, step) < STRAIGHT
             model, points = trial, trial_points
             residuals, errors = trial_residuals, trial_errors
             damping = max(damping / 10, 1e-7)
