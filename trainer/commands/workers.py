@@ -14,8 +14,8 @@ def worker_options(parser: ArgumentParser, cluster: bool = True) -> None:
     """--workers and --cluster."""
     workers_option(
         parser,
-        "processes that fit candidates at the same time (default: one a core, and on a given capture set no more than memory is there for; "
-        "1: this process alone)",
+        "processes that fit candidates at the same time (default: one a core, and on a given capture set "
+        "no more than memory is there for; 1: this process alone)",
     )
     if cluster:
         parser.add_argument(
