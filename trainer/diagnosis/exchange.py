@@ -115,15 +115,15 @@ def preferred(
 ) -> tuple[str, str, Model, PredictionErrors] | None:
     """The model with one effect exchanged for a rival that captures prefer now that nothing else is missing.
 
-    A plainer rival is preferred unless it does worse, a less plain one only where it is worth it. Where too little is
-    left for that, the less plain one is not tried.
+    A plainer rival is preferred unless it does worse, even with its orders raised. A less plain one is preferred only
+    where it is worth it; where too little is left for that, it is not tried.
 
     Parameters
     ----------
     errors : PredictionErrors
         Of `model` on the held-out captures.
     rivals : mapping
-        As of `exchanged`, of those alone that captures could not tell from the effect.
+        By effect, what may do as well in its place: where its fit begins.
 
     Returns
     -------
@@ -138,18 +138,24 @@ def preferred(
     ]
     trials = [(model.without(old), fitted) for old, _, fitted in pairs]
     found = _promising(roles, model, trials, lambda left: left + thresholds.least(ideal_excess), pool)
+
+    def does_worse(after: PredictionErrors) -> bool:
+        return removed_excess(after, errors).interval(1 - thresholds.level)[0] > 0
+
     for which, together, after in found:
         old, new, _ = pairs[which]
-        present, rival = model.instance(old), together.model.instance(new)
-        gained, lost = removed_excess(errors, after), removed_excess(after, errors)
-        if present.is_plainer_than(rival):
+        present, other = model.instance(old), together.model
+        gained = removed_excess(errors, after)
+        if present.is_plainer_than(other.instance(new)):
             prefers = thresholds.worth_adding(gained, ideal_excess, len(pairs))
-        elif rival.is_plainer_than(present):
-            prefers = lost.interval(1 - thresholds.level)[0] <= 0
+        elif other.instance(new).is_plainer_than(present):
+            if does_worse(after):  # it may lack no more than an order
+                other, after = all_raised(roles.folder, roles.ids, together, after)
+            prefers = not does_worse(after) and other.instance(new).is_plainer_than(present)
         else:
             prefers = gained.interval(1 - thresholds.level, len(pairs))[0] > 0
         if prefers:
-            return old, new, together.model, after
+            return old, new, other, after
     return None
 
 

@@ -18,6 +18,7 @@ from trainer.diagnosis.colours_in_common import one_in_common
 from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors, screen_candidates
 from trainer.diagnosis.exchange import CLEARLY, exchanged, one_for_two, preferred
 from trainer.diagnosis.fitted_ranking import expects_the_rest
+from trainer.diagnosis.plainer import plainer_rivals
 from trainer.diagnosis.ranking import RankedEffect
 from trainer.diagnosis.screen import ScreenResult
 from trainer.diagnosis.second_way import Fork, fork_at, is_hopeless
@@ -362,6 +363,8 @@ class Way:
         }
         if self.is_doubtful:  # enough is left for any rival in place of an effect to be worth it
             alike = dict(self._rivals)
+        for name, plainer in plainer_rivals(self._roles, self.model, self._known, self._pool).items():
+            alike[name] = {**plainer, **alike.get(name, {})}
         while better := preferred(self._roles, self.model, self.errors, alike, *judged):
             old, new, model, errors = better
             del alike[old]
