@@ -276,3 +276,24 @@ def test_effects_behind_an_unregistered_camera_are_found_whole(more: tuple[str, 
     assert set(found.model.names) == expected | set(more)
     assert found.diagnosis.verdict == "complete"
     assert float(found.model.instance("distance").values["offset"]) == pytest.approx(0.6, abs=0.02)
+
+
+@pytest.mark.slow
+def test_what_no_effect_explains_is_not_given_to_effects_that_are_not_there(tmp_path: Path) -> None:
+    """Specks stay, and a slow panel and vibration are not among the effects that are tried together."""
+    hidden = {
+        "distance": "offset_mm = 0.33",
+        "misregistration": "shift_x_px = -0.27\nshift_y_px = 0.15\nrotation_mrad = -1.5\nscale = 1.001",
+        "slow_response": "share = 0.127",
+        "vibration": "rms_px = 0.52",
+        "specks": "",
+    }
+    defects = [f'kind = "{kind}"\n{values}' for kind, values in hidden.items()]
+    bench = bench_file(tmp_path, *defects, width=320, height=240, distance_mm=30, iris=("circle", 1.0))
+    acquire_from(str(bench), tmp_path / "captures", patterns=12)
+    captures = read_captures(tmp_path / "captures")
+    with open_pool(1) as pool:
+        found = explain(captures, Model(captures.bench), catalogue(), pool)
+    assert set(found.model.names) == {"distance", "misregistration", "slow_response", "vibration"}
+    assert found.diagnosis.verdict == "outside_catalogue"
+    assert found.diagnosis.stage == "panel"

@@ -37,6 +37,8 @@ HELPS, EVEN = 0.5, 1.0
 HELPS_ELSEWHERE = 0.1
 # Excess from which other effects are missing: before these are there, to fit each one anew costs much and says little.
 OTHERS = 0.1
+# Of the excess while other effects are missing: an effect that removes less may only do a part of their work.
+LITTLE = 0.05
 # `tolerance` of the fit to all captures: what numbers take up slowly is for a map, which they would hide then.
 LOOSE = 0.02
 # One pattern alone, of a few bright spots or of rings, is predicted by wrong effects together as well as by the right.
@@ -135,6 +137,8 @@ def explain_together(
             joint, after = _with_maps(roles, joint, after, thresholds)
     report(0.8, "leaving out effects that are not needed")
     names = joint.names
+    if after.excess >= OTHERS:
+        thresholds = replace(thresholds, excess=max(thresholds.excess, LITTLE * after.excess))
     while smaller := without_one(roles, joint, after, names, thresholds, errors.excess, pool, thorough=False):
         dropped, joint, after = smaller
         names = names[names.index(dropped) + 1 :]
