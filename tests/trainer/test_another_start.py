@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from tests.trainer.hidden import bench_file
@@ -9,16 +11,20 @@ from trainer.captures.acquire import acquire_from
 from trainer.captures.batches import load
 from trainer.captures.capture_set import CaptureSet, read_captures
 from trainer.captures.held_out import capture_roles
+from trainer.diagnosis.another_start import fewer_from_another_start
 from trainer.diagnosis.candidate_fits import CandidateFit, try_again
 from trainer.diagnosis.explanation import explain
+from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.effect_catalogue import catalogue
 from trainer.fitting.gains import with_gains
 from trainer.fitting.gauss_newton import fit
 from trainer.fitting.pool import open_pool
+from trainer.fitting.predictor import evaluate_captures
 from trainer.model.history import ANEW
-from trainer.model.model import Model, instance_with
+from trainer.model.model import Model, absent, instance_with
 
 GAIN = 1.1
+SLIGHT_RESPONSE = 'kind = "phase_response"\ngain = 0.94\ns_curvature = 0.1\nlopsidedness = 0.01'
 
 
 @pytest.fixture(scope="module")
@@ -65,3 +71,38 @@ def test_an_explanation_leaves_a_wrong_place_where_no_other_effect_is_expected_t
     assert found.model.history[-1]["form"] == ANEW["form"]
     assert found.model.names == ("phase_response",) and found.diagnosis.verdict == "complete"
     assert float(found.model.instance("phase_response").values["gain"][0]) == pytest.approx(GAIN, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("hidden", "goes"),
+    [
+        (('kind = "polarisation_leak"\namplitude = 0.13', SLIGHT_RESPONSE), True),
+        (('kind = "polarisation_leak"', 'kind = "amplitude_modulation"\nfall = 0.3'), False),
+    ],
+)
+def test_an_effect_goes_that_another_one_in_a_wrong_place_needed(
+    hidden: tuple[str, str], goes: bool, tmp_path: Path
+) -> None:
+    """A strong leak that follows the pattern is a panel that absorbs less; so one of these makes up for the other."""
+    acquire_from(str(bench_file(tmp_path, *hidden)), tmp_path / "captures", patterns=6)
+    captures = read_captures(tmp_path / "captures")
+    roles = capture_roles(captures)
+    known, batches = catalogue(), load(captures, roles.fitted)
+    wrong = {"real": [-0.62], "imaginary": [-0.44], "gain": [0.9]}
+    right = {"real": [0.1], "imaginary": [0.1], "gain": [0.35]}
+    leak = instance_with(known["polarisation_leak"], captures.bench, wrong if goes else right)
+    model = with_gains(captures, Model(captures.bench), roles.fitted).having(leak)
+    for name, order in (("phase_response", 4), ("amplitude_modulation", 2)):
+        model = model.having(absent(known[name], captures.bench, order))
+    model = fit(model, model.names, batches, 30).model
+    errors = evaluate_captures(captures, roles.held_out, model)
+    assert errors.excess < 1e-3
+    with open_pool(1) as pool:
+        found = fewer_from_another_start(roles, model, errors, Thresholds(), 0.3, pool)
+    if not goes:
+        assert found is None or found[0] != "amplitude_modulation"
+        return
+    assert found is not None and found[0] == "amplitude_modulation"
+    assert found[1].names == ("polarisation_leak", "phase_response")
+    assert found[2].excess < errors.excess
+    assert float(found[1].instance("polarisation_leak").values["gain"]) < 0.5

@@ -6,13 +6,16 @@ the leak of a panel that is bent, say, what the panel's wavefront still lacked, 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 from runtime.excess import PredictionErrors, removed_excess
 from trainer.captures.capture_table import ids_of
 from trainer.captures.held_out import CaptureRoles
-from trainer.diagnosis.candidate_fits import try_again
+from trainer.diagnosis.candidate_fits import try_again, try_without
 from trainer.diagnosis.screen import ScreenResult
+from trainer.diagnosis.telling import telling_captures
+from trainer.diagnosis.verdict import Thresholds
 from trainer.fitting.pool import Pool
 from trainer.model.model import Model
 
@@ -45,5 +48,41 @@ def from_another_start(
     found = pool.map(try_again, [(roles.folder, ids, held, model, name) for name in names])
     best = min((f for f in found if f is not None), key=lambda f: f.held_out.excess, default=None)
     if best is None or removed_excess(errors, best.held_out).interval()[0] <= 0:
+        return None
+    return best.effect, best.model, best.held_out
+
+
+def fewer_from_another_start(
+    roles: CaptureRoles,
+    model: Model,
+    errors: PredictionErrors,
+    thresholds: Thresholds,
+    ideal_excess: float,
+    pool: Pool,
+) -> tuple[str, Model, PredictionErrors] | None:
+    """The model without one effect, the others all fitted anew, if there is one that it then does as well without.
+
+    Where an effect ended in a wrong place, another one of its stage may have been added for what it lacks there.
+
+    Parameters
+    ----------
+    errors : PredictionErrors
+        Of `model` on the held-out captures.
+
+    Returns
+    -------
+    (str, Model, PredictionErrors) or None
+        The effect that goes, the model, and its errors.
+    """
+    several = Counter(p.effect.stage for p in model.present)
+    names = [p.effect.name for p in model.present if several[p.effect.stage] > 1]
+    ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
+    few = ids_of(telling_captures(roles.captures, roles.fitted, model))
+    least = thresholds.least(ideal_excess)
+    found = pool.map_here_if_one(
+        try_without, [(roles.folder, few, ids, held, model, name, least) for name in names]
+    )
+    best = min((f for f in found if f is not None), key=lambda f: f.held_out.excess, default=None)
+    if best is None or thresholds.worth_adding(removed_excess(best.held_out, errors), ideal_excess, 1):
         return None
     return best.effect, best.model, best.held_out

@@ -17,6 +17,8 @@ from trainer.model.model import EffectInstance, Model, absent
 # An effect that starts anew is back where it was where it leaves the excess that there was, up to the first of these
 # factors, and nowhere near where it leaves more than the second times as much.
 BACK, NOWHERE = 1.1, 10.0
+# Of what a model leaves of a few captures: more is left where an effect is missed.
+FEW_MISS = 3.0
 THERE = 0.5  # of what there is: what a fit to few captures leaves of all at most where a fit to all may begin at once
 
 
@@ -156,6 +158,43 @@ def try_again(
     if was / BACK < alone.errors.excess < was * BACK or alone.errors.excess > NOWHERE * was:
         return None
     return _judged(name, settled(alone.model, batches).model, captures, held_ids)
+
+
+def try_without(
+    folder: Path,
+    few: tuple[str, ...],
+    ids: tuple[str, ...],
+    held_ids: tuple[str, ...],
+    model: Model,
+    name: str,
+    least: float,
+) -> CandidateFit | None:
+    """Fit a model without effect `name`, all others from where they do nothing; maps and measured effects stay.
+
+    Parameters
+    ----------
+    few : tuple of str
+        Captures to fit first: what is left of these must be of interest.
+    least : float
+        Excess that makes no difference.
+
+    Returns
+    -------
+    CandidateFit or None
+        Of the effect that is left out. None where the few captures miss it.
+    """
+    captures = opened(folder)
+    first = load(captures, chosen(captures, few))
+    most = max(FEW_MISS * excess_on(model, first), 2 * least)
+    rest = model.without(name)
+    for present in rest.present:
+        if present.nodes is None and present.effect.measure is None:
+            rest = rest.having(absent(present.effect, model.bench, present.order))
+    started = fit(rest, rest.names, first, 16, ROUGH, enough=most)
+    if started.errors.excess > most:
+        return None
+    fitted = settled(started.model, load(captures, chosen(captures, ids)))
+    return _judged(name, fitted.model, captures, held_ids)
 
 
 def try_together(

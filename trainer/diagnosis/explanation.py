@@ -11,10 +11,11 @@ from runtime.program.progress import Progress, forward_only, no_progress, part_o
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import capture_roles
 from trainer.diagnosis.diagnosis import Diagnosis
+from trainer.diagnosis.explanation_step import ExplanationStep
 from trainer.diagnosis.learned_rest import LearnedRest, learn_rest
 from trainer.diagnosis.second_way import doubtful, is_better
 from trainer.diagnosis.verdict import Thresholds, below_the_noise
-from trainer.diagnosis.way import ExplanationStep, Way
+from trainer.diagnosis.way import Way
 from trainer.effects.effect_catalogue import Catalogue
 from trainer.fitting.pool import Pool
 from trainer.model.model import Model

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import replace
 
 from runtime.excess import PredictionErrors, removed_excess
 from runtime.program.progress import Progress, part_of
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.held_out import CaptureRoles, capture_roles
 from trainer.diagnosis.addition import gone_on, with_maps_again
-from trainer.diagnosis.another_start import from_another_start, nothing_expects_much
+from trainer.diagnosis.another_start import (
+    fewer_from_another_start,
+    from_another_start,
+    nothing_expects_much,
+)
 from trainer.diagnosis.chosen_addition import chosen_addition
 from trainer.diagnosis.colours_in_common import one_in_common
 from trainer.diagnosis.diagnosis import Diagnosis, diagnose, ideal_errors, screen_candidates
 from trainer.diagnosis.exchange import CLEARLY, exchanged, one_for_two, preferred
+from trainer.diagnosis.explanation_step import ExplanationStep
 from trainer.diagnosis.fitted_ranking import expects_the_rest
 from trainer.diagnosis.plainer import plainer_rivals
 from trainer.diagnosis.ranking import RankedEffect
@@ -36,55 +40,6 @@ from trainer.model.history import ANEW, IN_COMMON, form_of, recorded
 from trainer.model.model import EffectInstance, Model
 
 MOST_EFFECTS = 8  # an explanation longer than this explains nothing
-
-
-@dataclass(frozen=True)
-class ExplanationStep:
-    """One step of an explanation.
-
-    Attributes
-    ----------
-    added : str or None
-        The effect that was added; None for the first model, and where one was only taken out.
-    held_out : PredictionErrors
-        Errors of the model after the step.
-    indistinguishable_from : tuple of str
-        Effects that the captures cannot tell the added one from.
-    removed : str or None
-        The effect that was taken out; with `added`, exchanged for that one.
-    refined : str or None
-        The effect of an earlier step whose map or curve went on in free form, whose colours were put together again, or
-        that was fitted anew.
-    form : mapping
-        The key `form`, where it is a curve, the colours' values are in common again, or the start is another one.
-    """
-
-    added: str | None
-    held_out: PredictionErrors
-    indistinguishable_from: tuple[str, ...] = ()
-    removed: str | None = None
-    refined: str | None = None
-    form: Mapping[str, str] = field(default_factory=dict)
-
-    def as_json(self) -> dict[str, Any]:
-        """A row of the key `steps` of `explain --json`.
-
-        Keys `added`, `nrmse`, `excess` and `indistinguishable_from`; `removed` only where an effect was taken out,
-        `refined` only where the map or curve of an earlier one went on in free form, its colours were put together, or
-        it was fitted anew, and `form` where it is no map.
-        """
-        record: dict[str, Any] = {
-            "added": self.added,
-            "nrmse": self.held_out.nrmse,
-            "excess": self.held_out.excess,
-            "indistinguishable_from": list(self.indistinguishable_from),
-        }
-        if self.removed:
-            record["removed"] = self.removed
-        if self.refined:
-            record["refined"] = self.refined
-            record.update(self.form)
-        return record
 
 
 class Way:
@@ -374,6 +329,9 @@ class Way:
         if len(self.model.names) > 1:
             progress(0.9, "looking which effects are needed no longer")
             self._leave_out([newest] if newest else [])
+            progress(0.95, "looking whether the others do without one from another start")
+            while fewer := fewer_from_another_start(self._roles, self.model, self.errors, *judged):
+                self._become(*fewer[1:], removed=fewer[0])
         # After that pass: one that is needed and one that is not are no reason to put a third in the place of both.
         simpler = one_for_two(self._roles, self.model, self.errors, self._rivals, *judged)
         if simpler is not None:
