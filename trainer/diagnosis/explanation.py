@@ -41,6 +41,16 @@ class Explanation:
     diagnoses: tuple[Diagnosis, ...] = field(default=())
     learned: LearnedRest | None = None
 
+    @property
+    def suggested_captures(self) -> list[str]:
+        """Captures that would tell more: of the last diagnosis, and of those whose effect is still there; sentences."""
+        open_ones = [
+            d
+            for d in self.diagnoses
+            if d is self.diagnosis or d.best is None or d.best.effect.name in self.model.names
+        ]
+        return list(dict.fromkeys(s for d in open_ones for s in d.suggested_captures))
+
     def as_json(self, model_path: Path) -> dict[str, Any]:
         """The object that `explain --json` prints.
 
@@ -56,9 +66,7 @@ class Explanation:
             "model": str(model_path),
             "sentence": self.diagnosis.sentence,
             "held_out": self.diagnosis.is_held_out,
-            "suggested_captures": list(
-                dict.fromkeys(s for d in self.diagnoses for s in d.suggested_captures)
-            ),
+            "suggested_captures": self.suggested_captures,
             "equal_facts": [f.as_json() for f in self.diagnosis.equal_facts.facts],
             "table_facts": [f.as_json() for f in self.diagnosis.table_facts],
             "camera_facts": [f.as_json() for f in self.diagnosis.camera_facts],
