@@ -54,7 +54,7 @@ def test_captures_say_whether_a_plainer_effect_does_as_well(
     model = fitted(captures, roles, found)
     errors = evaluate_captures(captures, roles.held_out, model)
     with open_pool(1) as pool:
-        rivals = plainer_rivals(roles, model, catalogue(), pool)
+        rivals = plainer_rivals(roles, model, [found], catalogue(), pool)
         better = preferred(roles, model, errors, rivals, Thresholds(), 1.0, pool)
     assert (plainer in rivals[found]) or not exchanged
     assert (None if better is None else better[:2]) == ((found, plainer) if exchanged else None)
@@ -65,5 +65,6 @@ def test_captures_say_whether_a_plainer_effect_does_as_well(
 def test_nothing_is_plainer_than_an_effect_of_one_number(tmp_path: Path) -> None:
     captures = captured(tmp_path, 'kind = "distance"')
     roles = capture_roles(captures)
+    model = fitted(captures, roles, "distance")
     with open_pool(1) as pool:
-        assert plainer_rivals(roles, fitted(captures, roles, "distance"), catalogue(), pool) == {}
+        assert plainer_rivals(roles, model, model.names, catalogue(), pool) == {}

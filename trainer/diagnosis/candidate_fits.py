@@ -17,7 +17,7 @@ from trainer.model.model import EffectInstance, Model, absent
 # An effect that starts anew is back where it was where it leaves the excess that there was, up to the first of these
 # factors, and nowhere near where it leaves more than the second times as much.
 BACK, NOWHERE = 1.1, 10.0
-# Of what a model leaves of a few captures: more is left where an effect is missed.
+# Times what a model leaves of a few captures: where one effect less leaves more, it is missed.
 FEW_MISS = 3.0
 THERE = 0.5  # of what there is: what a fit to few captures leaves of all at most where a fit to all may begin at once
 
@@ -185,7 +185,7 @@ def try_without(
     """
     captures = opened(folder)
     first = load(captures, chosen(captures, few))
-    most = max(FEW_MISS * excess_on(model, first), 2 * least)
+    most = max(FEW_MISS * excess_on(model, first), least)
     rest = model.without(name)
     for present in rest.present:
         if present.nodes is None and present.effect.measure is None:

@@ -6,6 +6,8 @@ While other effects are missing, it may fit a little better than the plainer one
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from runtime.program.progress import no_progress
 from trainer.captures.held_out import CaptureRoles
 from trainer.diagnosis.screening import screen_candidates, screened_whole
@@ -21,29 +23,28 @@ TRIED = 2  # plainer effects in the place of one
 
 
 def plainer_rivals(
-    roles: CaptureRoles, model: Model, known: Catalogue, pool: Pool
+    roles: CaptureRoles, model: Model, names: Sequence[str], known: Catalogue, pool: Pool
 ) -> dict[str, dict[str, EffectInstance]]:
-    """By each effect of a model, plainer ones that it lacks and that may do as well in its place: where these start.
+    """By named effects of a model, plainer ones that it lacks and that may do as well in the place: where these start.
 
     Parameters
     ----------
+    names : sequence of str
+        Effects of the model, each of which is taken out in turn.
     known : mapping of str to Effect
         Effects to look among.
     """
     found: dict[str, dict[str, EffectInstance]] = {}
-    for present in model.present:
-        name = present.effect.name
+    for name in names:
         plainer = {
             n: effect
             for n, effect in known.items()
-            if n not in model.names and absent(effect, model.bench).is_plainer_than(present)
+            if n not in model.names and absent(effect, model.bench).is_plainer_than(model.instance(name))
         }
         if not plainer:
             continue
         rest = with_gains(roles.captures, model.without(name), roles.fitted)
         screened = screen_candidates(roles, rest, plainer, pool, no_progress)
-        likely = sorted((s for s in screened if s.after <= EXPECTED * s.before), key=lambda s: s.after)[
-            :TRIED
-        ]
-        found[name] = {s.effect: s.start for s in screened_whole(roles, rest, likely, pool)}
+        likely = sorted((s for s in screened if s.after <= EXPECTED * s.before), key=lambda s: s.after)
+        found[name] = {s.effect: s.start for s in screened_whole(roles, rest, likely[:TRIED], pool)}
     return found

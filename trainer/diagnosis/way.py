@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 from runtime.excess import PredictionErrors, removed_excess
 from runtime.program.progress import Progress, part_of
@@ -40,6 +41,8 @@ from trainer.model.history import ANEW, IN_COMMON, form_of, recorded
 from trainer.model.model import EffectInstance, Model
 
 MOST_EFFECTS = 8  # an explanation longer than this explains nothing
+# Of what there was: where an effect left more when it was added, others were missing that could make it look right.
+UNSURE = 0.25
 
 
 class Way:
@@ -297,6 +300,15 @@ class Way:
         }
         return True
 
+    def _alike(self, name: str, step: ExplanationStep) -> dict[str, EffectInstance]:
+        """Rivals of the effect that a step added: those that captures could not tell from it then, and plainer ones."""
+        present = self.model.instance(name)
+        return {
+            n: rival
+            for n, rival in self._rivals[name].items()
+            if n in step.indistinguishable_from or rival.is_plainer_than(present)
+        }
+
     def _leave_out(self, names: Sequence[str]) -> None:
         """Take out those of the named effects that the model does as well without, each in a step."""
         while smaller := without_one(
@@ -312,13 +324,20 @@ class Way:
         progress(0.8, "comparing effects with what could stand in their place")
         judged = self._limits, self.ideal.excess, self._pool
         alike = {
-            s.added: {n: r for n, r in self._rivals[s.added].items() if n in s.indistinguishable_from}
+            s.added: self._alike(s.added, s)
             for s in self.steps
-            if s.added in self._rivals
+            if s.added in kept and s.added in self._rivals
         }
         if self.is_doubtful:  # enough is left for any rival in place of an effect to be worth it
             alike = dict(self._rivals)
-        for name, plainer in plainer_rivals(self._roles, self.model, self._known, self._pool).items():
+        unsure = [
+            after.added
+            for before, after in pairwise(self.steps)
+            if after.added is not None
+            and after.added in kept
+            and after.held_out.excess > UNSURE * before.held_out.excess
+        ]
+        for name, plainer in plainer_rivals(self._roles, self.model, unsure, self._known, self._pool).items():
             alike[name] = {**plainer, **alike.get(name, {})}
         while better := preferred(self._roles, self.model, self.errors, alike, *judged):
             old, new, model, errors = better
