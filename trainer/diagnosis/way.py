@@ -330,11 +330,12 @@ class Way:
         }
         if self.is_doubtful:  # enough is left for any rival in place of an effect to be worth it
             alike = dict(self._rivals)
+        # Effects of a joint start have no rivals: they were fitted together, and their order says nothing.
         unsure = [
             after.added
             for before, after in pairwise(self.steps)
-            if after.added is not None
-            and after.added in kept
+            if after.added in kept
+            and after.added in self._rivals
             and after.held_out.excess > UNSURE * before.held_out.excess
         ]
         for name, plainer in plainer_rivals(self._roles, self.model, unsure, self._known, self._pool).items():
