@@ -5,6 +5,7 @@ hardware must do. Have a test house classify the product.
 """
 
 from firmware_iface.lasers.channels import VIRTUAL_CHANNELS, LaserChannel
-from firmware_iface.lasers.lasers import Lasers, open_lasers
+from firmware_iface.lasers.lasers import Lasers
+from firmware_iface.lasers.open_board import open_lasers
 
 __all__ = ["VIRTUAL_CHANNELS", "LaserChannel", "Lasers", "open_lasers"]

@@ -18,7 +18,8 @@ from firmware_iface.errors import DeviceError, InputError
 from firmware_iface.lasers.channels import LaserChannel
 from firmware_iface.lasers.eye_safety import GatedLight
 from firmware_iface.lasers.guarded_lasers import PACKET, STEP_S, TICK_S
-from firmware_iface.lasers.lasers import Lasers, open_lasers
+from firmware_iface.lasers.lasers import Lasers
+from firmware_iface.lasers.open_board import open_lasers
 
 LEASE_S = 0.100
 

@@ -14,7 +14,6 @@ switches off after 100 ms.
 from __future__ import annotations
 
 import atexit
-import math
 import time
 import weakref
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -27,7 +26,7 @@ import numpy as np
 from firmware_iface.errors import DeviceError, InputError
 from firmware_iface.lasers.channels import LaserChannel
 from firmware_iface.lasers.eye_safety import GatedLight
-from firmware_iface.lasers.i2c_transfers import open_bus
+from firmware_iface.lasers.heartbeat import Heartbeat
 from firmware_iface.lasers.laser_board import LaserBoard
 from firmware_iface.lasers.pattern_power import LightBudget
 from firmware_iface.lasers.photodiode_watch import PhotodiodeWatch
@@ -36,7 +35,6 @@ from firmware_iface.lasers.safety_controller import Command, Input, State
 if TYPE_CHECKING:
     from smbus2 import SMBus
 
-BEAT_S, SOONEST_BEAT_S = 0.025, 0.006
 UNKNOWN = "the safety controller gives no reason; try again"
 RAMP_S, RAMP_STEPS = 0.100, 20  # a rise of 5 ms a step is twice as slow as the safety controller's limiter
 
@@ -82,7 +80,7 @@ class Lasers:
             raise InputError(
                 "a board has one to three lasers with names of their own; correct the list of lasers."
             )
-        self._bus, self._clock, self._wait = bus, clock, wait
+        self._bus, self._wait = bus, wait
         self._lasers = tuple(channels)
         self.channels = tuple(c.name for c in channels)
         self._budget = LightBudget(channels, gated)
@@ -92,11 +90,10 @@ class Lasers:
         self._watch = PhotodiodeWatch(
             self.board.converter, channels, clock, held_s=0.0 if gated is None else gated.frame_s
         )
-        self._token, self._beat_at = 0, -math.inf
         self._ramping = self._closed = False
         with self._dark_on_failure():
             self.board.set_up(self._lasers)
-            self._token = self.board.controller.token()
+            self._heartbeat = Heartbeat(self.board.controller, clock)
             self._watch.select(0)
         _open.add(self)
 
@@ -177,7 +174,7 @@ class Lasers:
                 self._forget()
                 self.board.dac.dark()
                 self.board.expander.enable((1 << len(self._lasers)) - 1)
-                self._beat()
+                self._heartbeat.beat()
                 self.board.controller.command(Command.ARM_FIRST)
                 self.board.controller.command(Command.ARM_SECOND)
                 state = self.board.controller.state()
@@ -209,7 +206,7 @@ class Lasers:
         """
         self._unlit = frozenset(unlit)
         with self._dark_on_failure():
-            self._beat()
+            self._heartbeat.beat()
             self._raise_latched()
             self._check_photodiode()
             if not self._ramping:
@@ -254,8 +251,8 @@ class Lasers:
                     self._put(k, min(start + (end - start) * step // RAMP_STEPS, allowed))
                 yield
                 with self._dark_on_failure():
-                    if self._clock() - self._beat_at >= BEAT_S:
-                        self._beat()
+                    if self._heartbeat.is_due:
+                        self._heartbeat.beat()
                     self._check_photodiode()
         finally:
             self._ramping = False
@@ -342,13 +339,6 @@ class Lasers:
             raise InputError(f"there is no laser '{channel}'; use one of {', '.join(self.channels)}.")
         return self.channels.index(channel)
 
-    def _beat(self) -> None:
-        if self._clock() - self._beat_at < SOONEST_BEAT_S:
-            return
-        self._token = (self._token + 1) % 256
-        self.board.controller.beat(self._token)
-        self._beat_at = self._clock()
-
     def _put(self, k: int, code: int) -> None:
         self._watch.expect(k, code)
         self.board.dac.set_code(k, code)
@@ -407,39 +397,3 @@ _open: weakref.WeakSet[Lasers] = weakref.WeakSet()
 def _close_all() -> None:
     for lasers in list(_open):
         lasers.close()
-
-
-def open_lasers(bus: str, channels: Sequence[LaserChannel], gated: GatedLight | None = None) -> Lasers:
-    """Open the lasers on a bus.
-
-    Parameters
-    ----------
-    bus : str
-        See `i2c_transfers.open_bus`.
-    channels : sequence of LaserChannel
-        One to three, in the order of the DAC's outputs.
-    gated : GatedLight or None
-        As `Lasers` takes it.
-
-    Returns
-    -------
-    Lasers
-
-    Raises
-    ------
-    InputError
-        Where the bus cannot be opened or the channels do not fit the board.
-    DeviceError
-        Where a part of the board fails.
-    """
-    try:
-        opened = open_bus(bus)
-    except OSError as error:
-        raise InputError(
-            f"the bus {bus} cannot be opened ({error.strerror or error}); give another one."
-        ) from error
-    try:
-        return Lasers(opened, channels, gated=gated)
-    except BaseException:
-        opened.close()
-        raise

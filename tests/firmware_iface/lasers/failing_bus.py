@@ -39,7 +39,7 @@ class FailingBus(RuleBasedStateMachine):
         if any(power_uw.values()):
             assert board.key and board.interlock and board.celsius <= 45
             assert self.lasers is not None, "no program, no light"
-            assert time_s - self.lasers._beat_at < WINDOW_S + 0.3, "no heartbeat was even tried"
+            assert time_s - self.lasers._heartbeat.at < WINDOW_S + 0.3, "no heartbeat was even tried"
             for c in VIRTUAL_CHANNELS:
                 assert power_uw[c.name] <= c.full_power_uw + 1e-6
             used = sum(power_uw.values()) / 390

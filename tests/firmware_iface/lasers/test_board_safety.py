@@ -37,7 +37,7 @@ def test_the_same_token_again_is_no_heartbeat(bench: Bench) -> None:
     lasers = bench.armed()
     lasers.set_power("green", 1.0)
     bench.pass_time(0.02)
-    lasers.board.controller.beat(lasers._token)
+    lasers.board.controller.beat(lasers._heartbeat.token)
     assert bench.light_uw == 0
     with pytest.raises(DeviceError, match="heartbeat"):
         lasers.heartbeat()
@@ -51,7 +51,7 @@ def test_a_token_too_soon_is_a_loop_run_wild(bench: Bench) -> None:
     bench.pass_time(0.003)
     lasers.heartbeat()  # the driver itself never does it
     assert bench.light_uw > 0
-    lasers.board.controller.beat(lasers._token + 1)
+    lasers.board.controller.beat(lasers._heartbeat.token + 1)
     assert bench.light_uw == 0
 
 

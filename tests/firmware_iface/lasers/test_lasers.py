@@ -64,8 +64,8 @@ def test_no_code_of_the_dac_passes_the_ceiling(bench: Bench) -> None:
             bench.bus.i2c_rdwr(smbus2.i2c_msg.write(0x60, [0x40 | k << 1, vref | 0x0F, 0xFF]))
         for _ in range(4):
             bench.pass_time(0.03)
-            lasers.board.controller.beat(lasers._token + 1)
-            lasers._token += 1
+            lasers.board.controller.beat(lasers._heartbeat.token + 1)
+            lasers._heartbeat.token += 1
     for channel in VIRTUAL_CHANNELS:
         assert max(p[channel.name] for _, p in bench.seen) == pytest.approx(channel.full_power_uw)
 
@@ -314,9 +314,9 @@ def test_two_boards_are_two_boards(bench: Bench) -> None:
 
 def test_a_new_host_goes_on_where_the_last_token_was(bench: Bench) -> None:
     first = bench.armed()
-    first._token = 0
+    first._heartbeat.token = 0
     bench.pass_time(0.02)
-    first._beat()  # token 1, as a new host's first one would be
+    first._heartbeat.beat()  # token 1, as a new host's first one would be
     first._closed = True  # the process was killed
     bench.pass_time(0.2)
     second = bench.open()
