@@ -93,27 +93,42 @@ def fitted_ranking(
     if complete or any(r.worth_adding for r in ranking):
         return ranking, fits
 
+    together: dict[str, CandidateFit] = {}
+
     def jointly(with_candidate: Mapping[str, Model]) -> list[RankedEffect]:
         report(0.7, TOGETHER)
-        without, together = try_together_with_present(roles, model, with_candidate, pool)
-        return rank(without, together, known, thresholds, ideal_excess, len(order))
-
-    def before_others(found: Sequence[RankedEffect]) -> list[RankedEffect]:
-        names = {r.effect.name for r in found}
-        return [*found, *(r for r in ranking if r.effect.name not in names)]
+        for fit in try_together_with_present(roles, with_candidate, pool):
+            known_fit = together.get(fit.effect, fit)
+            together[fit.effect] = min(known_fit, fit, key=lambda f: f.held_out.excess)
+        without, *others = together.values()
+        found = rank(without.held_out, others, known, thresholds, ideal_excess, len(order))
+        return [*found, *(r for r in ranking if r.effect.name not in together)]
 
     if model.present:  # the screen lets them move, and sees what they hide
         first = screened_whole(roles, model, order[:FITTED_TOGETHER], pool)
-        found = jointly({s.effect: model.having(s.start) for s in first})
+        found = jointly({"": model, **{s.effect: model.having(s.start) for s in first}})
         if found[0].worth_adding and found[0].held_out.excess < CLEARLY * before.excess:
-            return before_others(found), fits
+            return found, fits
     rest = [s for s in order if s.effect not in {f.effect for f in fits}]
     fits += raised(try_all(roles, model, rest, pool, report, 0.6, 0.7))
     ranking = ranked(fits)
     if model.present and not any(r.worth_adding for r in ranking):
         closest = sorted(fits, key=lambda f: f.held_out.excess)[:FITTED_TOGETHER]
-        ranking = before_others(jointly({f.effect: f.model for f in closest}))
+        together = {name: together[name] for name in ("", *(f.effect for f in closest)) if name in together}
+        ranking = jointly({f.effect: f.model for f in closest if _leads_farther(f, together)})
     return ranking, fits
+
+
+def _leads_farther(alone: CandidateFit, together: Mapping[str, CandidateFit]) -> bool:
+    """Whether a fit of all effects may end better where it begins at this fit of a candidate alone.
+
+    Parameters
+    ----------
+    together : mapping of str to CandidateFit
+        Fits of all effects so far, by candidate.
+    """
+    known = together.get(alone.effect)
+    return known is None or alone.held_out.excess < known.held_out.excess
 
 
 def _first_fits(

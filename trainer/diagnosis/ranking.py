@@ -267,8 +267,8 @@ def fit_with_present(
 
 
 def try_together_with_present(
-    roles: CaptureRoles, model: Model, with_candidate: Mapping[str, Model], pool: Pool
-) -> tuple[PredictionErrors, list[CandidateFit]]:
+    roles: CaptureRoles, with_candidate: Mapping[str, Model], pool: Pool
+) -> list[CandidateFit]:
     """Fit candidates, each together with the effects that are present, and raise orders.
 
     An effect that was added alone may have taken up a part of one that is still missing, and then hides it.
@@ -276,19 +276,11 @@ def try_together_with_present(
     Parameters
     ----------
     with_candidate : mapping of str to Model
-        By candidate: `model` with it.
-
-    Returns
-    -------
-    PredictionErrors
-        Held-out errors of the present effects alone, all fitted together.
-    list of CandidateFit
+        By candidate: the model with it. By an empty name: the present effects alone.
     """
     ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
-    tasks = [(roles.folder, ids, held, model, "")]
-    tasks += [(roles.folder, ids, held, one, name) for name, one in with_candidate.items()]
-    without, *together = pool.map(try_together, tasks)
-    return without.held_out, together
+    tasks = [(roles.folder, ids, held, one, name) for name, one in with_candidate.items()]
+    return pool.map(try_together, tasks)
 
 
 def rank(
