@@ -76,6 +76,8 @@ def fewer_from_another_start(
     """
     several = Counter(p.effect.stage for p in model.present)
     names = [p.effect.name for p in model.present if several[p.effect.stage] > 1]
+    if not names:
+        return None
     ids, held = ids_of(roles.fitted), ids_of(roles.held_out)
     few = ids_of(telling_captures(roles.captures, roles.fitted, model))
     least = thresholds.least(ideal_excess)
