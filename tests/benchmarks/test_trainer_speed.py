@@ -1,4 +1,4 @@
-"""How fast the trainer is: `pytest tests/benchmarks -s` prints the table of trainer/README.md.
+"""How fast the trainer is: `pytest tests/benchmarks -s` prints the table of trainer/larger_work.md.
 
 Nothing here fails for being slow.
 
