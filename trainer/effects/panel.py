@@ -123,8 +123,8 @@ def _brightened(panel: Panel, log_amplitude: Tensor) -> Panel:
             "log_amplitude",
             "1",
             scale=0.03,
-            low=-4,
-            high=4,
+            low=-12,  # a beam that is dark in the corners
+            high=12,
             count=legendre_count,
             about="Legendre terms of the logarithm of the beam's amplitude",
             typical=(-0.8, 0.8),

@@ -7,7 +7,7 @@ other numbers. Captures that the gradient does not use say when to stop and how 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +15,7 @@ import numpy as np
 from runtime.lightpath.spline_maps import nodes_over, on_other_nodes
 from trainer.captures.batches import Batch, signal_variance
 from trainer.device import array_of
+from trainer.effects.definition import STAGES
 from trainer.effects.free_form import grid_of, on_other_curve_nodes
 from trainer.fitting.free_form_maps import FreeFormBatch, descend
 from trainer.fitting.gauss_newton import fit
@@ -73,7 +74,7 @@ def with_free_form(
     shapes = _node_shapes(model, name, fitted[0])
     for level, shape in enumerate(shapes):
         needed = (FIRST_GAIN if level == 0 else FINER_GAIN) * abs(least)
-        trial, excess = _turn(best, name, shape, fitted, stopping, needed)
+        trial, excess = _turn(best, {name: shape}, fitted, stopping, needed)
         if least - excess < needed:
             break
         best, least = trial, excess
@@ -81,30 +82,80 @@ def with_free_form(
             break
     if best is model:
         return None
+    best, least = _settled(best, least, [name], fitted, stopping, enough)
+    return best if least < enough else _together(best, least, fitted, stopping, enough)
+
+
+def _settled(
+    model: Model,
+    least: float,
+    names: Sequence[str],
+    fitted: Sequence[Batch],
+    stopping: Sequence[Batch],
+    enough: float,
+) -> tuple[Model, float]:
+    """The model, and its excess on `stopping`, after further turns of some maps' nodes and all other numbers."""
     for _ in range(TURNS):
         if least < enough:
             break
-        trial, excess = _turn(best, name, None, fitted, stopping)
-        if excess > UNSETTLED * least:
+        trial, excess = _turn(model, dict.fromkeys(names), fitted, stopping)
+        before = least
+        if excess < least:
+            model, least = trial, excess
+        if excess > UNSETTLED * before:
             break
-        best, least = trial, excess
-    return best
+    return model, least
+
+
+def _together(
+    model: Model, least: float, fitted: Sequence[Batch], stopping: Sequence[Batch], enough: float
+) -> Model:
+    """The model with all its maps fitted together, on finer nodes while that pays.
+
+    A map that was fitted while another one was still polynomials has taken up some of its work, or ended too coarse
+    beside what that one left.
+    """
+    names = _maps(model)
+    if len(names) < 2:
+        return model
+    while finer := _finer(model, names, fitted[0]):
+        trial, excess = _turn(model, finer, fitted, stopping)
+        if least - excess < FINER_GAIN * abs(least):
+            break
+        model, least = trial, excess
+    return _settled(model, least, names, fitted, stopping, enough)[0]
+
+
+def _maps(model: Model) -> list[str]:
+    """Names of effects whose maps have gone on in free form."""
+    forms = [(p.effect.name, p.effect.free_form) for p in model.present if p.nodes is not None]
+    return [name for name, form in forms if form is not None and not form.curve]
+
+
+def _finer(model: Model, names: Sequence[str], batch: Batch) -> dict[str, tuple[int, int] | None]:
+    """The next finer nodes of each map, None for one that has the finest; empty where all have."""
+    found: dict[str, tuple[int, int] | None] = {}
+    for name in names:
+        nodes = model.instance(name).nodes
+        assert nodes is not None
+        finer = [s for s in _node_shapes(model, name, batch) if s[0] > nodes.shape[-2]]
+        found[name] = finer[0] if finer else None
+    return found if any(found.values()) else {}
 
 
 def _turn(
     model: Model,
-    name: str,
-    shape: tuple[int, int] | None,
+    nodes: Mapping[str, tuple[int, int] | None],
     fitted: Sequence[Batch],
     stopping: Sequence[Batch],
     needed: float = 0.0,
 ) -> tuple[Model, float]:
-    """The model with one effect's nodes fitted, then all other numbers, and its excess on `stopping`.
+    """The model with some effects' nodes fitted, then all other numbers, and its excess on `stopping`.
 
     Where the nodes alone remove less than DESCENT of the excess that is needed, other numbers stay as they are, and
     where these then leave more on `stopping`: few captures may say too little of a response, say, where it saturates.
     """
-    trial = _descended(model, name, shape, fitted, stopping, DESCENT * needed)
+    trial = _descended(model, nodes, fitted, stopping, DESCENT * needed)
     excess = excess_on(trial, stopping)
     if needed and excess_on(model, stopping) - excess < DESCENT * needed:
         return trial, excess
@@ -114,37 +165,41 @@ def _turn(
 
 
 def refined(model: Model, fitted: Sequence[Batch], stopping: Sequence[Batch]) -> Model:
-    """The model with its free-form maps and curves fitted again, each on the nodes that it has."""
-    for present in model.present:
-        if present.nodes is not None:
-            model = _descended(model, present.effect.name, None, fitted, stopping)
+    """The model with its free-form maps fitted again, together, and each of its curves, on the nodes that they have."""
+    maps = _maps(model)
+    curves = [p.effect.name for p in model.present if p.nodes is not None and p.effect.name not in maps]
+    for names in (maps, *([name] for name in curves)):
+        if names:
+            model = _descended(model, dict.fromkeys(names), fitted, stopping)
     return model
 
 
 def _descended(
     model: Model,
-    name: str,
-    shape: tuple[int, int] | None,
+    nodes: Mapping[str, tuple[int, int] | None],
     fitted: Sequence[Batch],
     stopping: Sequence[Batch],
     needed: float | None = None,
 ) -> Model:
-    """The model with one effect's nodes fitted, on as many nodes as are given or on those that it has."""
-    present = model.instance(name)
-    if shape is not None:
-        present = replace(
-            present, nodes=_on_nodes(present, shape, _grid(model, name, fitted[0]), len(model.bench.channels))
-        )
-        model = model.having(present)
-    assert present.nodes is not None
+    """The model with some effects' nodes fitted, on as many as are given for each or on those that it has."""
+    for name, shape in nodes.items():
+        if shape is not None:
+            grid, colours = _grid(model, name, fitted[0]), len(model.bench.channels)
+            present = model.instance(name)
+            model = model.having(replace(present, nodes=_on_nodes(present, shape, grid, colours)))
+    those = [model.instance(name) for name in nodes]
     parts = [[FreeFormBatch(model, b) for b in batches] for batches in (fitted, stopping)]
     scale = signal_variance(fitted)
-    curve = present.effect.free_form is not None and present.effect.free_form.curve
+    curve = all(p.effect.free_form is not None and p.effect.free_form.curve for p in those)
     iterations, rounds = (CURVE_ITERATIONS, CURVE_ROUNDS) if curve else (ITERATIONS, ROUNDS)
     error = -math.inf if needed is None else needed * signal_variance(stopping)
-    stage = _stage_of(model, present)
+    stage = _stage_of(model, those)
     found = descend(stage, parts[0], parts[1], scale, iterations, rounds, needed=error)
-    return model.having(replace(present, nodes=present.nodes + array_of(found["nodes"].double())))
+    for present in those:
+        assert present.nodes is not None
+        more = array_of(found[present.effect.name].double())
+        model = model.having(replace(present, nodes=present.nodes + more))
+    return model
 
 
 def _node_shapes(model: Model, name: str, batch: Batch) -> list[tuple[int, int]]:
@@ -177,16 +232,22 @@ def _grid(model: Model, name: str, batch: Batch) -> tuple[int, int]:
     return grid_of(getattr(stages, model.instance(name).effect.stage))
 
 
-def _stage_of(model: Model, present: EffectInstance) -> FreeFormStage:
-    """The stage at which an effect's nodes are free."""
-    form, stage, nodes = present.effect.free_form, present.effect.stage, present.nodes
-    assert form is not None and nodes is not None
+def _stage_of(model: Model, those: Sequence[EffectInstance]) -> FreeFormStage:
+    """What some effects' nodes change, where these are free."""
     colours = [c.name for c in model.bench.channels]
+    forms, shapes = {}, {}
+    for present in those:
+        effect, nodes = present.effect, present.nodes
+        assert effect.free_form is not None and nodes is not None
+        forms[effect.name] = effect.stage, effect.free_form
+        # A step of the optimiser's variables is one of many nodes at once.
+        shapes[effect.name] = nodes.shape, 5 * effect.free_form.scale * float(np.sqrt(nodes.size))
 
     def apply(stages: Stages, maps: Tensors) -> Stages:
-        one = getattr(stages, stage)
-        return replace(stages, **{stage: form.added(one, maps["nodes"], colours.index(one.channel))})
+        for name, (stage, form) in forms.items():
+            one = getattr(stages, stage)
+            stages = replace(stages, **{stage: form.added(one, maps[name], colours.index(one.channel))})
+        return stages
 
-    # A step of the optimiser's variables is one of many nodes at once.
-    unit = 5 * form.scale * float(np.sqrt(nodes.size))
-    return FreeFormStage(stage, {"nodes": (nodes.shape, unit)}, apply, lambda maps: [])
+    first = min((stage for stage, _ in forms.values()), key=STAGES.index)
+    return FreeFormStage(first, shapes, apply, lambda maps: [])
