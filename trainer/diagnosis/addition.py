@@ -8,7 +8,7 @@ from typing import Any
 
 from runtime.excess import PredictionErrors, removed_excess
 from runtime.program.progress import Progress, no_progress
-from trainer.captures.batches import load
+from trainer.captures.batches import Batch, load
 from trainer.captures.capture_set import CaptureSet, chosen, opened
 from trainer.captures.capture_table import Capture
 from trainer.captures.held_out import FIT_CAPTURES, CaptureRoles, capture_roles, scenes, with_stopping
@@ -16,7 +16,13 @@ from trainer.diagnosis.screen import ScreenResult, screen_batches
 from trainer.diagnosis.telling import screened_captures
 from trainer.diagnosis.verdict import Thresholds
 from trainer.effects.definition import Effect
-from trainer.fitting.free_form_effects import refined, with_free_form
+from trainer.fitting.free_form_effects import (
+    begun_in_free_form,
+    free_maps,
+    refined,
+    settled,
+    with_free_form,
+)
 from trainer.fitting.gains import with_gains
 from trainer.fitting.gauss_newton import FitResult, fit
 from trainer.fitting.pixel_values import with_pixel_values
@@ -173,15 +179,49 @@ def gone_on(
         return None
     if thresholds.complete(errors.excess, errors.excess):
         return None
-    first, last = with_stopping(_worst_first(roles, model), FIT_CAPTURES)
     # A finer map costs much, and says nothing where no more is left than is worth adding; a finer curve costs little.
     enough = 0.0 if present.effect.free_form.curve else thresholds.excess
-    further = with_free_form(model, name, load(roles.captures, first), load(roles.captures, last), enough)
+    further = with_free_form(model, name, *_for_maps(roles, model), enough)
     if further is None:
         return None
     after = evaluate_captures(roles.captures, roles.held_out, further)
     worth = thresholds.worth_adding(removed_excess(errors, after), errors.excess, 1)
     return (further, after) if worth else None
+
+
+def maps_gone_on(
+    roles: CaptureRoles, model: Model, errors: PredictionErrors, thresholds: Thresholds
+) -> tuple[Model, PredictionErrors]:
+    """The model with those of its maps gone on in free form that pay, and its held-out errors.
+
+    All begin before any goes finer: what one hides, the next may show.
+    """
+    while roles.is_held_out and not thresholds.complete(errors.excess, errors.excess):
+        first, last = _for_maps(roles, model)
+        begun, tried = model, list[str]()
+        while names := [n for n in _polynomial_maps(begun) if n not in tried]:
+            found = begun_in_free_form(begun, names[0], first, last)
+            begun, tried = (begun, [*tried, names[0]]) if found is None else (found, [])
+        if begun is model:
+            break
+        further = settled(begun, free_maps(begun), first, last, thresholds.excess)
+        after = evaluate_captures(roles.captures, roles.held_out, further)
+        if not thresholds.worth_adding(removed_excess(errors, after), errors.excess, 1):
+            break
+        model, errors = further, after
+    return model, errors
+
+
+def _polynomial_maps(model: Model) -> list[str]:
+    """Names of effects whose maps are polynomials alone and have a free form."""
+    forms = [(p.effect.name, p.effect.free_form) for p in model.present if p.nodes is None]
+    return [name for name, form in forms if form is not None and not form.curve]
+
+
+def _for_maps(roles: CaptureRoles, model: Model) -> tuple[list[Batch], list[Batch]]:
+    """Captures that maps are fitted to, and those that say when to stop."""
+    first, last = with_stopping(_worst_first(roles, model), FIT_CAPTURES)
+    return load(roles.captures, first), load(roles.captures, last)
 
 
 def _worst_first(roles: CaptureRoles, model: Model) -> list[Capture]:
@@ -204,7 +244,6 @@ def with_maps_again(
     """The model with the maps that it has fitted again, next to a new effect: they give back what was not theirs."""
     if all(p.nodes is None for p in model.present):
         return model, errors
-    first, last = with_stopping(_worst_first(roles, model), FIT_CAPTURES)
-    again = refined(model, load(roles.captures, first), load(roles.captures, last))
+    again = refined(model, *_for_maps(roles, model))
     after = evaluate_captures(roles.captures, roles.held_out, again)
     return (again, after) if after.excess < errors.excess else (model, errors)

@@ -15,7 +15,7 @@ from trainer.captures.batches import load
 from trainer.captures.capture_set import chosen, opened
 from trainer.captures.capture_table import ids_of
 from trainer.captures.held_out import CaptureRoles, with_patterns
-from trainer.diagnosis.addition import gone_on
+from trainer.diagnosis.addition import maps_gone_on
 from trainer.diagnosis.another_start import from_another_start
 from trainer.diagnosis.screen import ScreenResult
 from trainer.diagnosis.unnecessary import without_one
@@ -120,7 +120,7 @@ def explain_together(
     found, before_maps = joint, after
     if not there():
         report(0.6, "looking whether maps go on")
-        joint, after = _with_maps(roles, joint, after, thresholds)
+        joint, after = maps_gone_on(roles, joint, after, thresholds)
     alike = [name for name in TAKEN_FOR_EACH_OTHER if name in found.names]
     if len(alike) > 1 and not there():
         report(0.7, f"looking whether {' and '.join(alike)} are taken for each other")
@@ -128,13 +128,13 @@ def explain_together(
         others = pool.map(_without, [(roles.folder, ids, held, found, name, known) for name in alike])
         still, left = min(others, key=lambda one: one[1].excess)
         if left.excess < before_maps.excess:
-            joint, after = _with_maps(roles, still, left, thresholds)
+            joint, after = maps_gone_on(roles, still, left, thresholds)
     if after.excess < OTHERS and not there():
         report(0.75, "looking whether an effect ends better from another start")
         better = from_another_start(roles, joint, after, pool)
         if better is not None:
             _, joint, after = better
-            joint, after = _with_maps(roles, joint, after, thresholds)
+            joint, after = maps_gone_on(roles, joint, after, thresholds)
     report(0.8, "leaving out effects that are not needed")
     names = joint.names
     if after.excess >= OTHERS:
@@ -152,24 +152,6 @@ def _without(
     captures = opened(folder)
     rest = without_effect(model, name, known, load(captures, chosen(captures, ids)))
     return rest, evaluate_captures(captures, chosen(captures, held_ids), rest)
-
-
-def _with_maps(
-    roles: CaptureRoles, model: Model, errors: PredictionErrors, thresholds: Thresholds
-) -> tuple[Model, PredictionErrors]:
-    """The model with those of its maps gone on in free form that pay: what one hides, the next may show."""
-    tried: list[str] = []
-    while rest := [n for n in _maps_to_go_on(model) if n not in tried]:
-        further = gone_on(roles, model, rest[0], errors, thresholds)
-        tried = [*tried, rest[0]] if further is None else []
-        model, errors = further or (model, errors)
-    return model, errors
-
-
-def _maps_to_go_on(model: Model) -> list[str]:
-    """Names of effects whose maps are polynomials alone and have a free form."""
-    forms = [(p.effect.name, p.effect.free_form) for p in model.present if p.nodes is None]
-    return [name for name, form in forms if form is not None and not form.curve]
 
 
 @torch.no_grad()

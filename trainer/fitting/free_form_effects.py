@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -70,31 +71,47 @@ def with_free_form(
     Model or None
         None where coarse nodes do not remove a quarter of the error: the polynomials have not ended.
     """
-    best, least = model, excess_on(model, stopping)
-    shapes = _node_shapes(model, name, fitted[0])
-    for level, shape in enumerate(shapes):
-        needed = (FIRST_GAIN if level == 0 else FINER_GAIN) * abs(least)
-        trial, excess = _turn(best, {name: shape}, fitted, stopping, needed)
-        if least - excess < needed:
-            break
-        best, least = trial, excess
-        if least < enough:
-            break
-    if best is model:
+    begun = begun_in_free_form(model, name, fitted, stopping)
+    if begun is None:
         return None
-    best, least = _settled(best, least, [name], fitted, stopping, enough)
-    return best if least < enough else _together(best, least, fitted, stopping, enough)
+    maps = free_maps(begun)
+    return settled(begun, maps if name in maps else [name], fitted, stopping, enough)
 
 
-def _settled(
+def begun_in_free_form(
+    model: Model, name: str, fitted: Sequence[Batch], stopping: Sequence[Batch]
+) -> Model | None:
+    """The model with an effect's map or curve on the coarsest nodes; None where these remove less than a quarter."""
+    least = excess_on(model, stopping)
+    needed = FIRST_GAIN * abs(least)
+    shape = _node_shapes(model, name, fitted[0])[0]
+    trial, excess = _turn(model, {name: shape}, fitted, stopping, needed)
+    return None if least - excess < needed else trial
+
+
+def settled(
     model: Model,
-    least: float,
     names: Sequence[str],
     fitted: Sequence[Batch],
     stopping: Sequence[Batch],
     enough: float,
-) -> tuple[Model, float]:
-    """The model, and its excess on `stopping`, after further turns of some maps' nodes and all other numbers."""
+) -> Model:
+    """The model with some maps, or a curve, fitted together on finer nodes while that pays, in turns with all else.
+
+    Together, because a map that is fitted while another one is coarse or still polynomials takes up some of its work.
+
+    Parameters
+    ----------
+    enough : float
+        Excess on `stopping` that ends it.
+    """
+    least = excess_on(model, stopping)
+    while least >= enough and (finer := _finer(model, names, fitted[0])):
+        needed = FINER_GAIN * abs(least)
+        trial, excess = _turn(model, finer, fitted, stopping, needed)
+        if least - excess < needed:
+            break
+        model, least = trial, excess
     for _ in range(TURNS):
         if least < enough:
             break
@@ -104,43 +121,24 @@ def _settled(
             model, least = trial, excess
         if excess > UNSETTLED * before:
             break
-    return model, least
-
-
-def _together(
-    model: Model, least: float, fitted: Sequence[Batch], stopping: Sequence[Batch], enough: float
-) -> Model:
-    """The model with all its maps fitted together, on finer nodes while that pays.
-
-    A map that was fitted while another one was still polynomials has taken up some of its work, or ended too coarse
-    beside what that one left.
-    """
-    names = _maps(model)
-    if len(names) < 2:
-        return model
-    while finer := _finer(model, names, fitted[0]):
-        trial, excess = _turn(model, finer, fitted, stopping)
-        if least - excess < FINER_GAIN * abs(least):
-            break
-        model, least = trial, excess
-    return _settled(model, least, names, fitted, stopping, enough)[0]
-
-
-def _maps(model: Model) -> list[str]:
-    """Names of effects whose maps have gone on in free form."""
-    forms = [(p.effect.name, p.effect.free_form) for p in model.present if p.nodes is not None]
-    return [name for name, form in forms if form is not None and not form.curve]
+    return model
 
 
 def _finer(model: Model, names: Sequence[str], batch: Batch) -> dict[str, tuple[int, int] | None]:
-    """The next finer nodes of each map, None for one that has the finest; empty where all have."""
+    """The next finer nodes of each map or curve, None for one that has the finest; empty where all have."""
     found: dict[str, tuple[int, int] | None] = {}
     for name in names:
         nodes = model.instance(name).nodes
         assert nodes is not None
-        finer = [s for s in _node_shapes(model, name, batch) if s[0] > nodes.shape[-2]]
+        finer = [s for s in _node_shapes(model, name, batch) if s[1] > nodes.shape[-1]]
         found[name] = finer[0] if finer else None
     return found if any(found.values()) else {}
+
+
+def free_maps(model: Model) -> list[str]:
+    """Names of effects whose maps have gone on in free form."""
+    forms = [(p.effect.name, p.effect.free_form) for p in model.present if p.nodes is not None]
+    return [name for name, form in forms if form is not None and not form.curve]
 
 
 def _turn(
@@ -166,7 +164,7 @@ def _turn(
 
 def refined(model: Model, fitted: Sequence[Batch], stopping: Sequence[Batch]) -> Model:
     """The model with its free-form maps fitted again, together, and each of its curves, on the nodes that they have."""
-    maps = _maps(model)
+    maps = free_maps(model)
     curves = [p.effect.name for p in model.present if p.nodes is not None and p.effect.name not in maps]
     for names in (maps, *([name] for name in curves)):
         if names:
@@ -209,8 +207,10 @@ def _node_shapes(model: Model, name: str, batch: Batch) -> list[tuple[int, int]]
         rows = len(model.bench.channels) if any(p.per_channel for p in effect.parameters) else 1
         return [(rows, count) for count in CURVE_NODES]
     grid = _grid(model, name, batch)
-    spacings = sorted({max(min(grid) / parts, LEAST_SPACING) for parts in PARTS}, reverse=True)
-    return [nodes_over(grid, spacing) for spacing in spacings]
+    spacings = [max(min(grid) / parts, LEAST_SPACING) for parts in PARTS]
+    # One that is hardly coarser than the next costs as much and shows nothing else.
+    kept = [s for s, finer in pairwise(spacings) if s > 1.5 * finer]
+    return [nodes_over(grid, spacing) for spacing in (*kept, spacings[-1])]
 
 
 def _on_nodes(
