@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from firmware_iface.virtual import BenchDescription, VirtualHeadset, make_defect
 from trainer.captures.acquire import acquire_captures
@@ -17,7 +18,7 @@ from trainer.effects.effect_catalogue import catalogue
 from trainer.fitting.free_form_effects import refined, with_free_form
 from trainer.fitting.gains import with_gains
 from trainer.fitting.gauss_newton import fit
-from trainer.fitting.predictor import excess_on
+from trainer.fitting.predictor import Predictor, excess_on
 from trainer.model.model import Model, absent
 
 NODES = {"rough_nodes_y": 6, "rough_nodes_x": 8}
@@ -50,6 +51,15 @@ def test_a_rough_beam_that_is_dark_in_the_corners_and_a_rough_wavefront_end_at_t
     assert waved is not None and excess_on(waved, last) > 0.02
     both = with_free_form(waved, "illumination", first, last, 0.0002)
     assert both is not None and excess_on(both, last) < 0.0004  # one after the other: 0.006
+
+
+def test_the_counts_of_a_beam_at_its_limits_can_be_squared_in_single_precision(tmp_path: Path) -> None:
+    """Fits try such beams on their way, and judge them by their squared errors."""
+    model, first, _ = fitted(tmp_path, BEAM)
+    limit = {"log_amplitude": np.full_like(model.instance("illumination").values["log_amplitude"], 12.0)}
+    model = model.having(model.instance("illumination").with_values(limit))
+    with torch.no_grad():
+        assert bool(torch.isfinite(Predictor(model, first[0]).predict(model) ** 2).all())
 
 
 def test_maps_of_different_stages_are_fitted_again_together(tmp_path: Path) -> None:

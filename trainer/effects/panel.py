@@ -15,6 +15,10 @@ from trainer.effects.starts import coherent_ghost_starts, wavefront_starts
 from trainer.effects.term_names import surface_terms
 from trainer.prediction.stages import Panel
 
+BRIGHTEST = (
+    12.0  # logarithm of the amplitude: no beam is brighter, and counts of single precision would overflow
+)
+
 
 @effect(
     stage="panel",
@@ -109,7 +113,7 @@ def zero_order(
 
 
 def _brightened(panel: Panel, log_amplitude: Tensor) -> Panel:
-    return panel.multiplied(torch.exp(log_amplitude))
+    return panel.multiplied(torch.exp(torch.clamp(log_amplitude, max=BRIGHTEST)))
 
 
 @effect(
