@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from firmware_iface.virtual import BenchDescription, VirtualHeadset, make_defect
+from firmware_iface.virtual.defect_kind import Defect
 from trainer.captures.acquire import acquire_captures
 from trainer.captures.batches import Batch, load
 from trainer.captures.capture_set import read_captures
@@ -27,7 +28,7 @@ WAVEFRONT = make_defect("panel_wavefront", peak_to_valley_nm=800.0, rough_rms_ra
 FALL_OFF = make_defect("vignetting", corner_angle_deg=45.0)
 
 
-def fitted(folder: Path, *defects: object) -> tuple[Model, list[Batch], list[Batch]]:
+def fitted(folder: Path, *defects: Defect) -> tuple[Model, list[Batch], list[Batch]]:
     """The model of a simulated bench with the hidden effects as lowest polynomials, and captures to go on with."""
     bench = BenchDescription("rough", defects=defects).resized(72, 96, 8.0)
     headset = VirtualHeadset(bench, seed=3)

@@ -19,6 +19,7 @@ from trainer.effects.definition import Effect
 from trainer.fitting.free_form_effects import (
     begun_in_free_form,
     free_maps,
+    polynomial_maps,
     refined,
     settled,
     with_free_form,
@@ -199,7 +200,7 @@ def maps_gone_on(
     while roles.is_held_out and not thresholds.complete(errors.excess, errors.excess):
         first, last = _for_maps(roles, model)
         begun, tried = model, list[str]()
-        while names := [n for n in _polynomial_maps(begun) if n not in tried]:
+        while names := [n for n in polynomial_maps(begun) if n not in tried]:
             found = begun_in_free_form(begun, names[0], first, last)
             begun, tried = (begun, [*tried, names[0]]) if found is None else (found, [])
         if begun is model:
@@ -210,12 +211,6 @@ def maps_gone_on(
             break
         model, errors = further, after
     return model, errors
-
-
-def _polynomial_maps(model: Model) -> list[str]:
-    """Names of effects whose maps are polynomials alone and have a free form."""
-    forms = [(p.effect.name, p.effect.free_form) for p in model.present if p.nodes is None]
-    return [name for name, form in forms if form is not None and not form.curve]
 
 
 def _for_maps(roles: CaptureRoles, model: Model) -> tuple[list[Batch], list[Batch]]:

@@ -15,9 +15,7 @@ from trainer.effects.starts import coherent_ghost_starts, wavefront_starts
 from trainer.effects.term_names import surface_terms
 from trainer.prediction.stages import Panel
 
-BRIGHTEST = (
-    12.0  # logarithm of the amplitude: no beam is brighter, and counts of single precision would overflow
-)
+BRIGHTEST = 12.0  # logarithm of the amplitude: brighter than any beam, and counts of single precision hold it
 
 
 @effect(

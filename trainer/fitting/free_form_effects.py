@@ -55,6 +55,8 @@ def with_free_form(
 ) -> Model | None:
     """The model with an effect's map or curve gone on in free form, and everything else refitted with it.
 
+    Maps that had gone on before are fitted together with a new one, on finer nodes, too, where that pays.
+
     Parameters
     ----------
     model : Model
@@ -137,8 +139,18 @@ def _finer(model: Model, names: Sequence[str], batch: Batch) -> dict[str, tuple[
 
 def free_maps(model: Model) -> list[str]:
     """Names of effects whose maps have gone on in free form."""
-    forms = [(p.effect.name, p.effect.free_form) for p in model.present if p.nodes is not None]
-    return [name for name, form in forms if form is not None and not form.curve]
+    return [p.effect.name for p in _with_a_map(model) if p.nodes is not None]
+
+
+def polynomial_maps(model: Model) -> list[str]:
+    """Names of effects whose maps are polynomials alone and may go on in free form."""
+    return [p.effect.name for p in _with_a_map(model) if p.nodes is None]
+
+
+def _with_a_map(model: Model) -> list[EffectInstance]:
+    """A model's effects whose free form is a map."""
+    forms = [(p, p.effect.free_form) for p in model.present]
+    return [p for p, form in forms if form is not None and not form.curve]
 
 
 def _turn(
