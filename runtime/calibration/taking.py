@@ -14,6 +14,7 @@ import numpy as np
 
 from firmware_iface.errors import InputError
 from runtime.calibration.estimate import Shot, shot_of
+from runtime.headset.exposure_growth import while_growing
 from runtime.headset.open_devices import Devices
 
 AIM, BRIGHTEST = 0.7, 0.999  # this share of full scale for this quantile of a picture
@@ -97,7 +98,7 @@ class Taker:
         self.devices.light(channel)
 
     def expose(self, gray: np.ndarray, black: float) -> float:
-        """Set the exposure to one at which a pattern just does not saturate.
+        """Set the exposure to one at which a pattern just does not saturate, and its brightest pixels are not full.
 
         Parameters
         ----------
@@ -138,7 +139,13 @@ class Taker:
                 f"the camera sees no light at {camera.exposure_ms:g} ms: check that the laser's interlock is closed, "
                 "the panel is on, and nothing stands in the way"
             )
-        camera.exposure_ms = exposure
+
+        def brightness(exposure_ms: float) -> float:
+            camera.exposure_ms = exposure_ms
+            self._show(gray)
+            return (float(np.quantile(self._picture(), BRIGHTEST)) - black) / room
+
+        camera.exposure_ms = while_growing(exposure, SHORTEST_MS, brightness)
         return float(camera.exposure_ms)
 
     def noise(self, gray: np.ndarray, black: float, floor: float) -> Noise:

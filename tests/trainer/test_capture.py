@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -87,14 +88,54 @@ def test_each_colour_and_plane_has_its_patterns_and_its_exposure(tmp_path: Path)
 
 
 def test_a_bright_bench_gets_a_short_exposure(tmp_path: Path) -> None:
-    from dataclasses import replace
-
     description = load_bench("virtual:ideal").resized(ROWS, COLUMNS, DISTANCE)
     description = replace(description, simulation=replace(description.simulation, signal_share=5.0))
     _, bench = small("ideal")
     taken = acquire_captures(VirtualHeadset(description), bench, tmp_path / "set", 3)
     assert taken.exposure_ms["green"] < 1.0
     assert 0 < taken.saturated < 0.003
+
+
+@pytest.mark.parametrize("knee_share", [0.42, 0.1])
+def test_pixels_that_are_full_below_the_top_count_get_a_shorter_exposure(
+    knee_share: float, tmp_path: Path
+) -> None:
+    straight = take(tmp_path / "straight", "ideal", patterns=3).exposure_ms["green"]
+    description = load_bench("virtual:sensor_response").resized(ROWS, COLUMNS, DISTANCE)
+    (response,) = description.defects
+    description = replace(description, defects=(replace(response, knee_share=knee_share),))
+    _, bench = small("ideal")
+    taken = acquire_captures(VirtualHeadset(description), bench, tmp_path / "bent", 3)
+    # From where the curve bends to where twice the light gives a quarter more: s / knee from about 1 to 2.2.
+    assert knee_share * straight < taken.exposure_ms["green"] < 3 * knee_share * straight
+
+
+def test_a_curve_that_bends_everywhere_gets_the_usual_exposure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    headset, bench = small("ideal")
+    full = bench.camera.full_scale
+    straight = headset.camera.capture
+
+    def gamma() -> np.ndarray:
+        light = np.clip(straight().astype(float) - bench.camera.black_level, 0, None) / full
+        return np.rint(bench.camera.black_level + full * light ** (1 / 2.2)).astype(np.uint16)
+
+    monkeypatch.setattr(headset.camera, "capture", gamma)
+    acquire_captures(headset, bench, tmp_path / "set", 3)
+    captures = read_captures(tmp_path / "set")
+    assert max(float(np.quantile(captures.counts(c), 0.999)) for c in captures.captures) > 0.7 * full
+
+
+def test_a_camera_that_sets_its_exposure_itself_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    headset, bench = small("ideal")
+    full = np.full(headset.camera.shape, round(0.6 * bench.camera.full_scale), np.uint16)
+    monkeypatch.setattr(headset.camera, "capture", lambda: full)
+    with pytest.raises(InputError, match="switch off its automatic exposure"):
+        acquire_captures(headset, bench, tmp_path / "set", 3)
+    assert not (tmp_path / "set").exists()
 
 
 @pytest.mark.parametrize(

@@ -80,11 +80,13 @@ def whole_model(on: Bench, seed: int = 0) -> Model:
             "nested": {"a b": 1e-30},
         },
     )
-    return Model(on, present, {c.name: 1 / (k + 3) for k, c in enumerate(on.channels)}, "fresnel", history)
+    gain = {c.name: 1 / (k + 3) for k, c in enumerate(on.channels)}
+    return Model(on, present, gain, "fresnel", history, response_known_to=1 / 7)
 
 
 def assert_same(a: Model, b: Model) -> None:
     assert (a.bench, a.gain, a.method, a.history, a.names) == (b.bench, b.gain, b.method, b.history, b.names)
+    assert a.response_known_to == b.response_known_to
     for one, other in zip(a.present, b.present, strict=True):
         assert one.order == other.order
         assert (one.nodes is None) == (other.nodes is None)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.errors import InputError, nearest
+from runtime.headset.exposure_growth import while_growing
 from runtime.headset.open_devices import configuration_of
 from runtime.program.progress import Progress
 from trainer.captures.bench_file import Bench, Camera, read_bench
@@ -28,6 +29,7 @@ PatternChooser = Callable[[str, float], list[Pattern]]
 SATURATED = 0.002  # of all pixels of a colour
 SATURATED_IN_ONE = 0.01  # of the pixels of one capture
 AIM = 0.93  # of full scale, for the brightest pixels that count
+ALIKE = 1.15  # brightest pixel over that of SATURATED where pixels may be full: of speckle, it is about 1.5
 EXPOSURES_MS = (0.02, 2000.0)
 # From one exposure of a bracket to the next. Each pixel is then above a quarter of full scale in one frame, where shot
 # noise is at most twice that of a full pixel. Smaller steps need more frames for the same range; larger ones lose more.
@@ -294,7 +296,10 @@ def _expose(
     longer: float,
     report: Callable[[str], None],
 ) -> float:
-    """Set and return the exposure, ms, at which few pixels of these patterns saturate; the camera has one `longer`."""
+    """Set and return the exposure, ms, at which few pixels of these patterns saturate; the camera has one `longer`.
+
+    It is shorter where pixels are full before: brighter light then gives hardly more counts.
+    """
     exposure = 10.0
     headset.camera.exposure_ms = exposure
     pictures: list[NDArray[np.uint16]] = []
@@ -310,8 +315,8 @@ def _expose(
                 counts = _capture(headset, pattern)
             pictures.append(counts)
     every = float(np.quantile(np.concatenate([c.reshape(-1) for c in pictures]), 1 - SATURATED))
-    single = max(float(np.quantile(c, 1 - SATURATED_IN_ONE)) for c in pictures)
-    bright = max(every, single) - camera.black_level
+    single = [float(np.quantile(c, 1 - SATURATED_IN_ONE)) for c in pictures]
+    bright = max(every, *single) - camera.black_level
     if bright <= 3 * camera.read_noise_e * camera.counts_per_electron + 1:
         raise InputError(
             f"the camera sees nothing at {exposure:g} ms: check that the laser is on and the light path open, "
@@ -320,9 +325,27 @@ def _expose(
     factor = AIM * camera.full_scale / bright
     longest = min(EXPOSURES_MS[1], headset.camera.longest_exposure_ms / longer)
     needed = min(max(exposure * factor, EXPOSURES_MS[0]), longest)
+    brightest = int(np.argmax(single))
+    if _may_be_full(pictures[brightest], camera):
+        plane, pattern = [(plane, p) for plane, several in shown for p in several][brightest]
+        headset.move_to_plane(plane)
+        needed = while_growing(needed, EXPOSURES_MS[0], partial(_brightness, headset, camera, pattern))
     exposure = float(f"{needed:.3g}")
     headset.camera.exposure_ms = exposure
     return exposure
+
+
+def _may_be_full(counts: NDArray[np.uint16], camera: Camera) -> bool:
+    """Whether a picture's brightest pixels are all alike below the top count, as full ones may be."""
+    bright, top = np.quantile(counts, [1 - SATURATED, 1 - SATURATED / 20]) - camera.black_level
+    return bool(top < min(ALIKE * bright, AIM * camera.full_scale))
+
+
+def _brightness(headset: Headset, camera: Camera, pattern: Pattern, exposure_ms: float) -> float:
+    """Counts above black of a pattern's brightest pixels at an exposure, share of full scale."""
+    headset.camera.exposure_ms = exposure_ms
+    bright = float(np.quantile(_capture(headset, pattern), 1 - SATURATED))
+    return (bright - camera.black_level) / camera.full_scale
 
 
 def _too_bright(counts: NDArray[np.uint16], camera: Camera) -> bool:

@@ -118,6 +118,8 @@ def fit(
         Derivatives of each batch's prediction by the model, as from `slopes_of`, where they are known. Overwritten.
     """
     with torch.no_grad():
+        if _fits_response(model, free):
+            model = replace(model, response_known_to=None)
         many = tuple(n for n in free if has_many(model.instance(n)))
         if many:
             return _fit_many(model, tuple(free), many, batches, iterations, tolerance, progress, enough)
@@ -208,6 +210,7 @@ def _fit(
     inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
     covariance = inverse @ scatter @ inverse
     spread = _spread(keys, covariance, normal)
+    model = _known_as_far_as_seen(model, free, predictors, points)
     model = with_measured_values(_with_errors(model, keys, spread), free, batches)
     return FitResult(model, errors, covariance, keys, settled)
 
@@ -274,8 +277,23 @@ def _fit_many(
     inner = np.arange(len(keys), len(every))
     whole[inner, inner] = spread_of_many**2
     spread = np.concatenate([_spread(keys, covariance, normal), spread_of_many])
+    model = _known_as_far_as_seen(model, free, predictors, points)
     model = with_measured_values(_with_errors(model, every, spread), free, batches)
     return FitResult(model, errors, whole, every, settled)
+
+
+def _fits_response(model: Model, free: Sequence[str]) -> bool:
+    return any(model.instance(n).effect.stage == "sensor" for n in free)
+
+
+def _known_as_far_as_seen(
+    model: Model, free: Sequence[str], predictors: Sequence[Predictor], points: Sequence[Trace]
+) -> Model:
+    """The model whose camera's response is known up to the brightest light in the pictures that it was fitted to."""
+    if not _fits_response(model, free):
+        return model
+    found = [p.brightest(model, p.light(model, t)) for p, t in zip(predictors, points, strict=True)]
+    return replace(model, response_known_to=max((share for share in found if share), default=None))
 
 
 def _having_gains(model: Model, predictors: Sequence[Predictor], points: Sequence[Trace]) -> Model:

@@ -207,6 +207,20 @@ class Predictor:
         ]
         return found[0] if len(found) == 1 else torch.cat(found)
 
+    def brightest(self, model: Model, light: Tensor) -> float | None:
+        """Light of the brightest pixel that counts, as a share of full scale; None where the response is straight."""
+        if self.stages(model).sensor.response is None:
+            return None
+        own, gain = self.own_gains(model, light), self.gain(model)
+        seen = self.batch.mask if self.batch.seen is None else self.batch.seen
+        found = 0.0
+        for part, stages in self.parts(model):
+            straight = replace(stages, sensor=replace(stages.sensor, response=None))
+            of_part = None if own is None else own[part]
+            signal = counts(self.scene, straight, light[part], gain[part], None, of_part)
+            found = max(found, float((seen[part] * signal).max()) / stages.sensor.full_scale)
+        return found
+
     def gain(self, model: Model) -> Tensor:
         """Counts [B, 1, 1] for one unit of light, before the captures' own gains."""
         return model.gain[self.batch.channel] * self.batch.exposure[:, None, None]

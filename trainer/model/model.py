@@ -78,6 +78,8 @@ class Model:
         Maps of the panel's learned field by name, float32 [m, n]; None where nothing was learned.
     learned : mapping
         What was learned at other stages, by stage and name (`trainer.prediction.free_stages`); float32 arrays.
+    response_known_to : float or None
+        Where the camera's response is bent: the brightest light that it was fitted to, as a share of full scale.
     """
 
     bench: Bench
@@ -87,6 +89,7 @@ class Model:
     history: tuple[dict[str, Any], ...] = ()
     panel_field: Mapping[str, np.ndarray] | None = None
     learned: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
+    response_known_to: float | None = None
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -144,6 +144,8 @@ def stages_of(scene: Scene, model: Model, tensors: Any = None, moment: Moment | 
     field = {} if model.panel_field is None else {"panel": model.panel_field}
     for stage, maps in {**field, **model.learned}.items():
         stages = with_learned(stages, model.bench, stage, maps)
+    if stages.sensor.response is not None and model.response_known_to is not None:
+        stages = replace(stages, sensor=replace(stages.sensor, response_known_to=model.response_known_to))
     return stages
 
 

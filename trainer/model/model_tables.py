@@ -15,12 +15,24 @@ from trainer.captures.bench_file import Bench, read_bench
 from trainer.effects.definition import Effect, Parameter, apart
 from trainer.effects.effect_catalogue import Catalogue, find_effect
 from trainer.model.model import EffectInstance, Model
-from trainer.model.model_text import APART, CURVE, MAP, allowed
+from trainer.model.model_text import APART, CURVE, MAP, RESPONSE, allowed
 from trainer.prediction.free_stages import LEARNED, LEARNED_STAGES, learned_stage
 from trainer.prediction.panel_field import NAME, UNITS
 
 SCHEMA = 1
-_TOP = ("schema", "about", "arrays", "bench", "propagation", "gain", "effect", NAME, LEARNED, "history")
+_TOP = (
+    "schema",
+    "about",
+    "arrays",
+    "bench",
+    "propagation",
+    "gain",
+    RESPONSE,
+    "effect",
+    NAME,
+    LEARNED,
+    "history",
+)
 
 Arrays = Mapping[str, np.ndarray]
 
@@ -62,7 +74,8 @@ def model_of(tables: Mapping[str, Any], known: Catalogue, read_arrays: Callable[
     learned = _panel_field(tables[NAME], bench, arrays) if NAME in tables else None
     gain = _gain(tables.get("gain", {}), bench)
     others = _learned(tables.get(LEARNED, {}), bench, arrays)
-    return Model(bench, tuple(present), gain, _method(tables), tuple(history), learned, others)
+    known_to = _response_known_to(tables[RESPONSE]) if RESPONSE in tables else None
+    return Model(bench, tuple(present), gain, _method(tables), tuple(history), learned, others, known_to)
 
 
 def _panel_field(given: Any, bench: Bench, arrays: Arrays) -> dict[str, np.ndarray]:
@@ -142,10 +155,21 @@ def _gain(given: Any, bench: Bench) -> dict[str, float]:
     only_keys(table, [c.name for c in bench.channels], "gain.")
     gain = {}
     for channel, value in table.items():
-        gain[channel] = _number(value, f"gain.{channel}", "a finite number above 0")
-        if not 0 < gain[channel] < math.inf:
-            raise InputError(f"gain.{channel} is {shown(value)}: write a finite number above 0")
+        gain[channel] = _above_0(value, f"gain.{channel}")
     return gain
+
+
+def _response_known_to(given: Any) -> float:
+    table = table_at(given, RESPONSE)
+    only_keys(table, ["known_to"], f"{RESPONSE}.")
+    return _above_0(table.get("known_to"), f"{RESPONSE}.known_to")
+
+
+def _above_0(value: Any, where: str) -> float:
+    found = _number(value, where, "a finite number above 0")
+    if not 0 < found < math.inf:
+        raise InputError(f"{where} is {shown(value)}: write a finite number above 0")
+    return found
 
 
 def _effect(

@@ -27,6 +27,7 @@ LONGEST = 128  # numbers of an array that stay in the text: every built-in map a
 WIDTH = 110
 APART = "apart"  # key of an effect whose values each colour has for itself
 MAP, CURVE = "map", "curve"  # keys of an effect's free form
+RESPONSE = "camera_response"  # the table that says how far it is known
 
 Store = Callable[[str, np.ndarray], str]
 
@@ -52,6 +53,11 @@ def model_text(model: Model, about: Mapping[str, Any] | None, store: Store) -> s
                     *(f"{key(c)} = {literal(float(g))}" for c, g in model.gain.items()),
                 ]
             )
+        )
+    if model.response_known_to is not None:
+        parts.append(
+            "# The camera's response was fitted up to this share of full scale; for more light, it goes straight on.\n"
+            f"[{RESPONSE}]\nknown_to = {literal(float(model.response_known_to))}"
         )
     parts += [_effect(p, model.bench, store) for p in model.present]
     if model.panel_field is not None:

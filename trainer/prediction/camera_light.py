@@ -167,9 +167,7 @@ def counts(
         signal = signal * own
     if (always := sensor.added_always) is not None:
         signal = signal + always
-    if sensor.response is not None:
-        signal = sensor.response(signal / sensor.full_scale) * sensor.full_scale
-    return signal
+    return sensor.responded(signal)
 
 
 def laser_counts(sensor: Sensor, light: Tensor, gain: Tensor) -> Tensor:

@@ -86,9 +86,8 @@ def brightness_step(along: Tensor, power: Tensor) -> Tensor:
 
 
 def _counts(sensor: Sensor, light: Tensor, some: slice) -> Tensor:
-    assert sensor.response is not None
     counts = light if (always := sensor.added_always) is None else light + always[..., some, some]
-    return sensor.response(counts / sensor.full_scale) * sensor.full_scale
+    return sensor.responded(counts)
 
 
 def _sum(values: Tensor) -> Tensor:

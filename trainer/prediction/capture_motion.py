@@ -263,7 +263,7 @@ def straight_signal(sensor: Sensor, observed: Tensor, weight: Tensor) -> tuple[T
     """Counts and weight as of a camera that adds nothing and responds in proportion to light, [B, h, w]."""
     if sensor.response is not None:
         shares = torch.linspace(*RESPONSE, dtype=observed.dtype)
-        curve = sensor.response(shares).cummax(0).values
+        curve = (sensor.responded(shares * sensor.full_scale) / sensor.full_scale).cummax(0).values
         seen = (observed / sensor.full_scale).contiguous()
         k = torch.searchsorted(curve, seen).clamp(1, len(curve) - 1)
         step = shares[1] - shares[0]

@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+LAST = 0.2  # of the light up to which a response is known: as it goes there, it goes on
+
 
 @dataclass(frozen=True)
 class Drive:
@@ -280,6 +282,8 @@ class Sensor:
         Each capture's exposure over the usual one; None where all have that.
     response : callable or None
         A function of the signal as a share of full scale.
+    response_known_to : float or None
+        The share of full scale up to which `response` is known; None: everywhere.
     free_capture_gain : bool
         Each capture has its own gain.
     free_capture_shift : bool
@@ -304,6 +308,7 @@ class Sensor:
     constant: Tensor | None = None
     exposure: Tensor | None = None
     response: Callable[[Tensor], Tensor] | None = None
+    response_known_to: float | None = None
     free_capture_gain: bool = False
     free_capture_shift: bool = False
     capture_blur: Callable[[Tensor], Tensor] | None = None
@@ -374,3 +379,18 @@ class Sensor:
         """The sensor with a further response curve, of the signal as a share of full scale."""
         before = self.response
         return replace(self, response=curve if before is None else lambda share: curve(before(share)))
+
+    def responded(self, signal: Tensor) -> Tensor:
+        """Counts where a straight response would give `signal`, counts; beyond what is known, straight on.
+
+        A polynomial or a spline that is fitted to the pictures says nothing of brighter light: full pixels stay full.
+        """
+        if self.response is None:
+            return signal
+        share, known = signal / self.full_scale, self.response_known_to
+        if known is None:
+            return self.response(share) * self.full_scale
+        ends = self.response(torch.tensor([1 - LAST, 1.0], dtype=share.dtype) * known)
+        slope = (ends[1] - ends[0]).clamp(min=0) / (LAST * known)
+        inside = share.clamp(max=known)
+        return (self.response(inside) + slope * (share - inside)) * self.full_scale

@@ -198,6 +198,21 @@ def test_the_cameras_noise_is_measured_without_its_data_sheet() -> None:
     assert top.mean() < 0.005 and 1 < exposure < 100
 
 
+def test_pixels_that_are_full_below_the_top_count_get_a_shorter_exposure() -> None:
+    shape, knee_share = (64, 80), 0.1
+    gray = grains(shape, 4, 0)
+
+    def exposure(*defects: str, **parameters: float) -> float:
+        taker = Taker(devices(headset(drifted_bench(*defects, shape=shape, **parameters))), lambda what: None)
+        black, _ = taker.darkness()
+        taker.light("green")
+        return taker.expose(gray, black)
+
+    bent, straight = exposure("sensor_response", knee_share=knee_share), exposure()
+    # From where the curve bends to where twice the light gives a quarter more: s / knee from about 1 to 2.2.
+    assert knee_share * straight / 0.7 < bent < 2.5 * knee_share * straight / 0.7
+
+
 def test_power_of_gratings_gives_the_phase_that_made_it() -> None:
     gray = np.arange(256)
     true = 12.0 * (gray / 255) ** 1.4
