@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 
 from firmware_iface.errors import InputError
 from firmware_iface.virtual import VirtualHeadset, load_bench
+from trainer.captures import acquire
 from trainer.captures.acquire import CaptureSummary, acquire_captures, acquire_from
 from trainer.captures.bench_file import Bench, read_bench
 from trainer.captures.capture_set import read_captures
@@ -96,7 +98,7 @@ def test_a_bright_bench_gets_a_short_exposure(tmp_path: Path) -> None:
     assert 0 < taken.saturated < 0.003
 
 
-@pytest.mark.parametrize("knee_share", [0.42, 0.1])
+@pytest.mark.parametrize("knee_share", [0.42, 0.2])
 def test_pixels_that_are_full_below_the_top_count_get_a_shorter_exposure(
     knee_share: float, tmp_path: Path
 ) -> None:
@@ -106,8 +108,23 @@ def test_pixels_that_are_full_below_the_top_count_get_a_shorter_exposure(
     description = replace(description, defects=(replace(response, knee_share=knee_share),))
     _, bench = small("ideal")
     taken = acquire_captures(VirtualHeadset(description), bench, tmp_path / "bent", 3)
+    assert not [p for p in check_captures(tmp_path / "bent", ideal_irradiance) if p.kind == "saturated"]
     # From where the curve bends to where twice the light gives a quarter more: s / knee from about 1 to 2.2.
     assert knee_share * straight < taken.exposure_ms["green"] < 3 * knee_share * straight
+
+
+def test_pixels_that_are_full_below_the_top_count_are_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of captures whose exposure was chosen by the top count alone."""
+    monkeypatch.setattr(acquire, "may_be_full", lambda *_: False)
+    description = load_bench("virtual:sensor_response").resized(ROWS, COLUMNS, DISTANCE)
+    (response,) = description.defects
+    description = replace(description, defects=(replace(response, knee_share=0.1),))
+    acquire_captures(VirtualHeadset(description), small("ideal")[1], tmp_path / "set", 4)
+    (found,) = (p for p in check_captures(tmp_path / "set", ideal_irradiance) if p.kind == "saturated")
+    assert (found.severity, found.capture) == ("warning", "")
+    assert re.search(r"4 of 4 patterns all count 1[01] % of full scale: they seem", found.message)
 
 
 def test_a_curve_that_bends_everywhere_gets_the_usual_exposure(

@@ -47,7 +47,7 @@ def described(kind: str) -> BenchDescription:
 @pytest.fixture
 def exposed_to_the_top(monkeypatch: pytest.MonkeyPatch) -> None:
     """Captures are exposed as if pixels were full at the top count alone: the kink lies below the brightest light."""
-    monkeypatch.setattr(acquire, "_may_be_full", lambda *_: False)
+    monkeypatch.setattr(acquire, "may_be_full", lambda *_: False)
 
 
 def captured(kind: str, folder: Path) -> CaptureSet:

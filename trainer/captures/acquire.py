@@ -21,6 +21,7 @@ from runtime.headset.open_devices import configuration_of
 from runtime.program.progress import Progress
 from trainer.captures.bench_file import Bench, Camera, read_bench
 from trainer.captures.capture_writer import CaptureWriter
+from trainer.captures.full_pixels import brightest, may_be_full
 from trainer.captures.open_bench import open_bench
 from trainer.captures.patterns import Pattern, choose_patterns, default_count
 
@@ -29,7 +30,6 @@ PatternChooser = Callable[[str, float], list[Pattern]]
 SATURATED = 0.002  # of all pixels of a colour
 SATURATED_IN_ONE = 0.01  # of the pixels of one capture
 AIM = 0.93  # of full scale, for the brightest pixels that count
-ALIKE = 1.15  # brightest pixel over that of SATURATED where pixels may be full: of speckle, it is about 1.5
 EXPOSURES_MS = (0.02, 2000.0)
 # From one exposure of a bracket to the next. Each pixel is then above a quarter of full scale in one frame, where shot
 # noise is at most twice that of a full pixel. Smaller steps need more frames for the same range; larger ones lose more.
@@ -326,7 +326,7 @@ def _expose(
     longest = min(EXPOSURES_MS[1], headset.camera.longest_exposure_ms / longer)
     needed = min(max(exposure * factor, EXPOSURES_MS[0]), longest)
     brightest = int(np.argmax(single))
-    if _may_be_full(pictures[brightest], camera):
+    if may_be_full(pictures[brightest], camera):
         plane, pattern = [(plane, p) for plane, several in shown for p in several][brightest]
         headset.move_to_plane(plane)
         needed = while_growing(needed, EXPOSURES_MS[0], partial(_brightness, headset, camera, pattern))
@@ -335,17 +335,10 @@ def _expose(
     return exposure
 
 
-def _may_be_full(counts: NDArray[np.uint16], camera: Camera) -> bool:
-    """Whether a picture's brightest pixels are all alike below the top count, as full ones may be."""
-    bright, top = np.quantile(counts, [1 - SATURATED, 1 - SATURATED / 20]) - camera.black_level
-    return bool(top < min(ALIKE * bright, AIM * camera.full_scale))
-
-
 def _brightness(headset: Headset, camera: Camera, pattern: Pattern, exposure_ms: float) -> float:
-    """Counts above black of a pattern's brightest pixels at an exposure, share of full scale."""
+    """How bright a pattern's brightest pixels are at an exposure, share of full scale."""
     headset.camera.exposure_ms = exposure_ms
-    bright = float(np.quantile(_capture(headset, pattern), 1 - SATURATED))
-    return (bright - camera.black_level) / camera.full_scale
+    return brightest(_capture(headset, pattern), camera)
 
 
 def _too_bright(counts: NDArray[np.uint16], camera: Camera) -> bool:

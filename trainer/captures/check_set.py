@@ -29,6 +29,7 @@ from trainer.captures.check_counts import (
     quarters,
 )
 from trainer.captures.conventions import Predict, Sample, compare_conventions
+from trainer.captures.full_pixels import SURELY, brightest, check_full, may_be_full
 from trainer.captures.mismatches import mismatched
 from trainer.captures.png_reader import PictureError, read_picture
 from trainer.captures.problems import MISREAD, Problem
@@ -59,6 +60,8 @@ class _SetStatistics:
         Those whose counts can be used, and show light.
     quarters : list of float array [2, 2]
         Light of the four pixels of each 2 x 2, of each capture in `good`.
+    full : dict
+        By channel and digest of a pattern: how bright its full pixels are, share of full scale; None where it has none.
     shift : dict
         By capture id: bits by which its counts are shifted down.
     """
@@ -69,6 +72,7 @@ class _SetStatistics:
     dark: np.ndarray = field(default_factory=lambda: np.zeros(65536, np.int64))
     good: list[Capture] = field(default_factory=list)
     quarters: list[np.ndarray] = field(default_factory=list)
+    full: dict[tuple[str, str], float | None] = field(default_factory=dict)
     shift: dict[str, int] = field(default_factory=dict)
 
 
@@ -170,6 +174,8 @@ def _one(bench: Bench, capture: Capture, statistics: _SetStatistics) -> list[Pro
         return problems
     statistics.good.append(capture)
     statistics.quarters.append(quarters(counts, camera))
+    full = brightest(counts, camera) if may_be_full(counts, camera, SURELY) else None
+    statistics.full[capture.channel, digest] = full
     key = (capture.channel, capture.plane_mm, digest, capture.exposure_ms)
     statistics.repeats.setdefault(key, []).append(capture)
     return problems
@@ -198,6 +204,7 @@ def _camera(bench: Bench, statistics: _SetStatistics) -> list[Problem]:
     """The stated camera against the darkest pixels of all captures, and against repeated patterns."""
     camera, problems = bench.camera, check_top(bench.camera, statistics.dark)
     problems += check_mosaic(statistics.quarters)
+    problems += check_full([f for f in statistics.full.values() if f is not None], len(statistics.full))
     pairs = [pair for group in statistics.repeats.values() for pair in pairwise(group)][:MOST_PAIRS]
     measured: list[tuple[str, RepeatNoise]] = []
     for a, b in pairs:
