@@ -77,9 +77,12 @@ def pixel_pattern(evidence: Sequence[Evidence]) -> dict[str, Any]:
     sums = np.zeros((5, *evidence[0].batch.signal.shape[-2:]))
     for one in evidence:
         weight = array_of((one.batch.mask / one.batch.noise).double())
-        expected = array_of(one.prediction.double())
-        beyond = array_of(one.batch.signal.double()) - expected
-        terms = (expected**2, expected, np.ones_like(expected), expected * beyond, beyond)
+        beyond = array_of((one.batch.signal - one.prediction).double())
+        # What a count more, and so many times the light, do to the counts.
+        straight = one.prediction if one.straight is None else one.straight
+        more = np.ones_like(beyond) if one.slope is None else array_of(one.slope.double())
+        louder = more * array_of(straight.double())
+        terms = (louder**2, louder * more, more**2, louder * beyond, more * beyond)
         sums += np.stack([(weight * t).sum(0) for t in terms])
     # First what neighbours tell goes, again and again, because each time it is drawn towards zero.
     for _ in range(ROUNDS):

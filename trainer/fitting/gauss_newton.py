@@ -23,7 +23,6 @@ from runtime.program.progress import Progress
 from trainer.captures.batches import Batch, signal_variance
 from trainer.device import array_of
 from trainer.effects.definition import STAGES
-from trainer.effects.evidence import Evidence
 from trainer.effects.own_effect import measured_by
 from trainer.fitting.jacobian import (
     Key,
@@ -323,9 +322,7 @@ def with_measured_values(model: Model, free: Sequence[str], batches: Sequence[Ba
         if present.effect.measure is None:
             continue
         without = model.without(name)
-        evidence = [
-            Evidence(p.scene, p.batch, p.predict(without)) for p in (Predictor(without, b) for b in batches)
-        ]
+        evidence = [Predictor(without, b).evidence(without) for b in batches]
         read = measured_by(present.effect, evidence, present.order)
         values = {n: np.full_like(v, read[n]) if n in read else v for n, v in present.values.items()}
         errors = {n: np.full_like(v, np.nan) if n in read else v for n, v in (present.errors or {}).items()}

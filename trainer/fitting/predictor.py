@@ -15,6 +15,7 @@ from runtime.excess import PredictionErrors, joined
 from trainer.captures.batches import Batch, load_batch
 from trainer.captures.capture_set import CaptureSet
 from trainer.captures.capture_table import Capture
+from trainer.effects.evidence import Evidence
 from trainer.fitting.side_by_side import side_by_side
 from trainer.kept_results import kept_for_same
 from trainer.model.model import Model
@@ -31,6 +32,8 @@ from trainer.prediction.capture_motion import Motion, MotionNearby
 from trainer.prediction.predict import Trace, trace
 from trainer.prediction.scene import Scene, Stages
 from trainer.prediction.stages import Sensor
+
+SMALL = 1e-3  # share of full scale: a step along a bent response for its slope
 
 
 @kept_for_same(2)  # what is kept for a sensor is found again where all captures share it
@@ -209,17 +212,34 @@ class Predictor:
 
     def brightest(self, model: Model, light: Tensor) -> float | None:
         """Light of the brightest pixel that counts, as a share of full scale; None where the response is straight."""
+        straight = self.straight(model, light)
+        if straight is None:
+            return None
+        seen = self.batch.mask if self.batch.seen is None else self.batch.seen
+        return float((seen * straight).max()) / self.stages(model).sensor.full_scale
+
+    def straight(self, model: Model, light: Tensor) -> Tensor | None:
+        """Counts [B, h, w] that a straight response would give; None where it is straight."""
         if self.stages(model).sensor.response is None:
             return None
         own, gain = self.own_gains(model, light), self.gain(model)
-        seen = self.batch.mask if self.batch.seen is None else self.batch.seen
-        found = 0.0
+        found = []
         for part, stages in self.parts(model):
-            straight = replace(stages, sensor=replace(stages.sensor, response=None))
+            unbent = replace(stages, sensor=replace(stages.sensor, response=None))
             of_part = None if own is None else own[part]
-            signal = counts(self.scene, straight, light[part], gain[part], None, of_part)
-            found = max(found, float((seen[part] * signal).max()) / stages.sensor.full_scale)
-        return found
+            found.append(counts(self.scene, unbent, light[part], gain[part], None, of_part))
+        return torch.cat(found)
+
+    def evidence(self, model: Model) -> Evidence:
+        """The batch beside its prediction, as effects read values off it."""
+        light = self.light(model, self.trace(model))
+        predicted, straight = self.counts(model, light), self.straight(model, light)
+        if straight is None or self.batch.seen is not None:
+            return Evidence(self.scene, self.batch, predicted)
+        sensor = self.stages(model).sensor
+        step = SMALL * sensor.full_scale
+        slope = (sensor.responded(straight + step) - sensor.responded(straight - step)) / (2 * step)
+        return Evidence(self.scene, self.batch, predicted, straight, slope)
 
     def gain(self, model: Model) -> Tensor:
         """Counts [B, 1, 1] for one unit of light, before the captures' own gains."""
