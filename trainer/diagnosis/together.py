@@ -15,7 +15,7 @@ from trainer.captures.batches import load
 from trainer.captures.capture_set import chosen, opened
 from trainer.captures.capture_table import ids_of
 from trainer.captures.held_out import CaptureRoles, with_patterns
-from trainer.diagnosis.addition import maps_gone_on
+from trainer.diagnosis.addition import maps_gone_on, with_orders_raised
 from trainer.diagnosis.another_start import from_another_start
 from trainer.diagnosis.screen import ScreenResult
 from trainer.diagnosis.unnecessary import without_one
@@ -142,6 +142,12 @@ def explain_together(
     while smaller := without_one(roles, joint, after, names, thresholds, errors.excess, pool, thorough=False):
         dropped, joint, after = smaller
         names = names[names.index(dropped) + 1 :]
+    if after.excess < OTHERS and not thresholds.complete(after.excess, errors.excess):
+        report(0.9, "raising orders")  # so far, only a few of the captures have said how high they need be
+        raised = with_orders_raised(roles, fit(joint, joint.names, batches, tolerance=LOOSE))
+        left = evaluate_captures(roles.captures, roles.held_out, raised)
+        if left.excess < after.excess:
+            joint, after = raised, left
     return JointExplanation(joint, _ladder(roles, joint, after))
 
 

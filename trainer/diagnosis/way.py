@@ -40,7 +40,9 @@ from trainer.fitting.predictor import evaluate_captures
 from trainer.model.history import ANEW, IN_COMMON, form_of, recorded
 from trainer.model.model import EffectInstance, Model
 
-MOST_EFFECTS = 8  # an explanation longer than this explains nothing
+# An explanation longer than this explains nothing: one more must remove so much of what is left. So it can complete one
+# that began with many effects together, of which some may then not be needed.
+MOST_EFFECTS, MUCH = 8, 0.5
 # Of what there was: where an effect left more when it was added, others were missing that could make it look right.
 UNSURE = 0.25
 
@@ -121,7 +123,7 @@ class Way:
             screened = self._look_again(diagnosing) if self.model.present else None
             found = first or self._diagnosed(diagnosing, screened)
             first = None
-            if found.best is None or len(self.model.names) >= MOST_EFFECTS:
+            if found.best is None or self._is_long_enough(found.best):
                 if not self._go_on_outside(found, part_of(report, 0.8, 0.9)):
                     break
             elif not self._add(found.best, found, report):
@@ -138,6 +140,12 @@ class Way:
         return last.verdict == "complete" and enough
 
     # --- what is known of the model
+
+    def _is_long_enough(self, best: RankedEffect) -> bool:
+        """Whether there are many effects, and the best of the others does not remove most of what is left."""
+        return (
+            len(self.model.names) >= MOST_EFFECTS and best.held_out.excess > (1 - MUCH) * self.errors.excess
+        )
 
     @property
     def _limits(self) -> Thresholds:
