@@ -28,6 +28,8 @@ class Pictures:
 class Seen:
     batch: Pictures
     prediction: torch.Tensor
+    straight: torch.Tensor | None = None
+    slope: torch.Tensor | None = None
 
 
 def seen(gain: np.ndarray, offset: np.ndarray, pictures: int = 12, noise: float = 1.0) -> Any:
