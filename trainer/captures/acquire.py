@@ -325,9 +325,9 @@ def _expose(
     factor = AIM * camera.full_scale / bright
     longest = min(EXPOSURES_MS[1], headset.camera.longest_exposure_ms / longer)
     needed = min(max(exposure * factor, EXPOSURES_MS[0]), longest)
-    brightest = int(np.argmax(single))
-    if may_be_full(pictures[brightest], camera):
-        plane, pattern = [(plane, p) for plane, several in shown for p in several][brightest]
+    first = int(np.argmax(single))
+    if may_be_full(pictures[first], camera):
+        plane, pattern = [(plane, p) for plane, several in shown for p in several][first]
         headset.move_to_plane(plane)
         needed = while_growing(needed, EXPOSURES_MS[0], partial(_brightness, headset, camera, pattern))
     exposure = float(f"{needed:.3g}")

@@ -390,7 +390,7 @@ class Sensor:
         share, known = signal / self.full_scale, self.response_known_to
         if known is None:
             return self.response(share) * self.full_scale
-        ends = self.response(torch.tensor([1 - LAST, 1.0], dtype=share.dtype) * known)
+        ends = self.response(share.new_tensor([1 - LAST, 1.0]) * known)
         slope = (ends[1] - ends[0]).clamp(min=0) / (LAST * known)
         inside = share.clamp(max=known)
         return (self.response(inside) + slope * (share - inside)) * self.full_scale
