@@ -17,7 +17,7 @@ SOME, FEW = 2e-3, 1e-4  # shares of the pixels: brighter than all others, and of
 # Counts of the FEW over those of SOME below which pixels may be full, and below which they are: of speckle, about 1.5.
 MAYBE, SURELY = 1.15, 1.05
 TOP = 0.93  # share of full scale beyond which it is the top count that they may have reached
-# In a set with full pixels, so many of the captures have them, and of their brightest counts the least is this share.
+# In a set with full pixels, so many of the patterns have them, and of their brightest counts the least is this share.
 MOST, SAME = 0.75, 0.95
 
 
@@ -32,24 +32,24 @@ def may_be_full(counts: NDArray[np.uint16], camera: Camera, alike: float = MAYBE
     return top < min(alike * brightest(counts, camera), TOP)
 
 
-def check_full(full: Sequence[float], captures: int) -> list[Problem]:
+def check_full(full: Sequence[float], patterns: int) -> list[Problem]:
     """Whether pixels of a set are full below the top count.
 
     Parameters
     ----------
     full : sequence of float
         `brightest` of each pattern with pixels that are SURELY alike.
-    captures : int
-        How many captures, of different patterns, there are.
+    patterns : int
+        How many there are.
     """
-    if len(full) < max(3, MOST * captures) or min(full) < SAME * max(full):
+    if len(full) < max(3, MOST * patterns) or min(full) < SAME * max(full):
         return []
     return [
         Problem(
             "warning",
             "saturated",
             "",
-            f"the brightest pixels of {len(full)} of {captures} patterns all count {100 * max(full):.0f} % of full "
+            f"the brightest pixels of {len(full)} of {patterns} patterns all count {100 * max(full):.0f} % of full "
             "scale: they seem to be full, or a curve in the camera's software ends there. Take the captures again with "
             "less light",
         )

@@ -282,6 +282,7 @@ def _fit_many(
 
 
 def _fits_response(model: Model, free: Sequence[str]) -> bool:
+    """Whether a fit may bend the camera's response."""
     return any(model.instance(n).effect.stage == "sensor" for n in free)
 
 
@@ -291,7 +292,7 @@ def _known_as_far_as_seen(
     """The model whose camera's response is known up to the brightest light in the pictures that it was fitted to."""
     if not _fits_response(model, free):
         return model
-    found = [p.brightest(model, p.light(model, t)) for p, t in zip(predictors, points, strict=True)]
+    found = [p.brightest(model, t) for p, t in zip(predictors, points, strict=True)]
     return replace(model, response_known_to=max((share for share in found if share), default=None))
 
 

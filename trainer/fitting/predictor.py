@@ -185,6 +185,12 @@ class Predictor:
         own : Tensor [B, 1, 1], optional
             The captures' own gains, as `own_gains` gives them; without it they are found anew.
         """
+        return self.batch.as_compared(self._counts(model, light, own, self.parts(model)))
+
+    def _counts(
+        self, model: Model, light: Tensor, own: Tensor | None, parts: Sequence[tuple[slice, Stages]]
+    ) -> Tensor:
+        """Counts [B, h, w] of the stages of `parts`, as the camera counts them."""
         gain = self.gain(model)
         found = [
             counts(
@@ -195,9 +201,9 @@ class Predictor:
                 self._seen(part),
                 None if own is None else own[part],
             )
-            for part, stages in self.parts(model)
+            for part, stages in parts
         ]
-        return self.batch.as_compared(found[0] if len(found) == 1 else torch.cat(found))
+        return found[0] if len(found) == 1 else torch.cat(found)
 
     def own_gains(self, model: Model, light: Tensor) -> Tensor | None:
         """Each capture's own gain [B, 1, 1], from the irradiance on the camera [B, h, w]; None where it has none."""
@@ -210,33 +216,32 @@ class Predictor:
         ]
         return found[0] if len(found) == 1 else torch.cat(found)
 
-    def brightest(self, model: Model, light: Tensor) -> float | None:
+    def brightest(self, model: Model, point: Trace) -> float | None:
         """Light of the brightest pixel that counts, as a share of full scale; None where the response is straight."""
-        straight = self.straight(model, light)
-        if straight is None:
+        sensor = self.stages(model).sensor
+        if sensor.response is None:
             return None
+        light = self.light(model, point)
         seen = self.batch.mask if self.batch.seen is None else self.batch.seen
-        return float((seen * straight).max()) / self.stages(model).sensor.full_scale
+        straight = self._straight(model, light, self.own_gains(model, light))
+        return float((seen * straight).max()) / sensor.full_scale
 
-    def straight(self, model: Model, light: Tensor) -> Tensor | None:
-        """Counts [B, h, w] that a straight response would give; None where it is straight."""
-        if self.stages(model).sensor.response is None:
-            return None
-        own, gain = self.own_gains(model, light), self.gain(model)
-        found = []
-        for part, stages in self.parts(model):
-            unbent = replace(stages, sensor=replace(stages.sensor, response=None))
-            of_part = None if own is None else own[part]
-            found.append(counts(self.scene, unbent, light[part], gain[part], None, of_part))
-        return torch.cat(found)
+    def _straight(self, model: Model, light: Tensor, own: Tensor | None) -> Tensor:
+        """Counts [B, h, w] that a straight response would give, with the captures' own gains behind the bent one."""
+        parts = [
+            (part, replace(stages, sensor=replace(stages.sensor, response=None)))
+            for part, stages in self.parts(model)
+        ]
+        return self._counts(model, light, own, parts)
 
     def evidence(self, model: Model) -> Evidence:
         """The batch beside its prediction, as effects read values off it."""
-        light = self.light(model, self.trace(model))
-        predicted, straight = self.counts(model, light), self.straight(model, light)
-        if straight is None or self.batch.seen is not None:
+        light, sensor = self.light(model, self.trace(model)), self.stages(model).sensor
+        own = self.own_gains(model, light)
+        predicted = self.counts(model, light, own)
+        if sensor.response is None or self.batch.seen is not None:
             return Evidence(self.scene, self.batch, predicted)
-        sensor = self.stages(model).sensor
+        straight = self._straight(model, light, own)
         step = SMALL * sensor.full_scale
         slope = (sensor.responded(straight + step) - sensor.responded(straight - step)) / (2 * step)
         return Evidence(self.scene, self.batch, predicted, straight, slope)
